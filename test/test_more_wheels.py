@@ -13,8 +13,7 @@ import pytest
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.wheels.wheel_slips import of_axles, WheelSlips
 from odocal_ros.data.inputs import WHEELS
-from odocal_ros.estimator.result.wheel_result import wheel_estimates
-from odocal_ros.estimator.result.wheels import Wheel
+from odocal_ros.estimator.result.wheel_result import Wheel, wheel_estimates
 from odocal_ros.output.summary import screen as printed
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
@@ -55,7 +54,7 @@ def codes(reasons):
 def with_dead(one, dead):
     """Return the leg of a drive on which some wheels do not count."""
     return one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
-                                 for k in dead})
+                                  for k in dead})
 
 
 @pytest.mark.parametrize('options', [

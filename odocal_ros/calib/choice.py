@@ -10,8 +10,8 @@ The methods on one leg are compared: differences beyond the sigmas, with their l
 from collections.abc import Iterable, Mapping
 import math
 
-from odocal_ros.calib.judge import share
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
+from odocal_ros.calib.value_limits import format_relative
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
@@ -122,7 +122,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
         sigma = math.hypot(a.sigma, b.sigma)
         apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
         if abs(apart) > REMARK_SIGMAS * sigma:
-            off = (share(apart / a.value, '+') if name == 'scale_factor' else
+            off = (format_relative(apart / a.value, '+') if name == 'scale_factor' else
                    f'{math.degrees(apart):+z.3f} deg')
             found.append(Reason(
                 Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by {off}, '

@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.calib import budget
-from odocal_ros.calib.judge import share
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
 from odocal_ros.calib.slip import slip_source
+from odocal_ros.calib.value_limits import format_relative
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
@@ -35,6 +35,8 @@ from odocal_ros.settings.nominal import nominal_yaw
 PITCH_PRIOR = 0.05
 # rad: a pitch above 15 deg is due to wrong heights, not to a mounting. Physical, judgement
 PITCH_LIMIT = 0.26
+# judgement: of the path length; on a shorter chord the errors of its ends dominate
+LEAST_CHORD_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,8 @@ class Chord:
     lever_b: Floats     # (3,) antenna from the odometer's point, m, in v
     velocity_change: Floats  # (3, 3) end minus start: times f gives m/s in n
     alignment: Alignment
-    doubt: tuple[Floats, Floats] = (np.empty(0), np.empty(0))    # of travel: s, scale units
+    # travel lost in gaps and resets: times, s, and sigmas, scale units
+    lost_travel: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
     # wheel slips: times, s, and sizes, m
     slips: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
 
@@ -94,7 +97,7 @@ def _C_bv(yaw: float, pitch: float) -> Floats:
     return np.stack([x, y, np.cross(x, y)], -1)
 
 
-def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
+def refusal_reasons(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     """Return the reasons against the method on the leg's chord, empty if there are none."""
     between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
     path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
@@ -102,7 +105,7 @@ def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     # the length of the track's own chord, independent of yaw: M is a rotation times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
-        if chord_length <= path / 5:
+        if chord_length <= LEAST_CHORD_SHARE * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
                            f'{chord_length:.1f} m, less than a fifth of the path length of about '
                            f'{path:.0f} m'),)
@@ -114,7 +117,7 @@ def _unknown(scale_unit: str) -> dict[str, Estimate]:
         f'gyro_bias_{axis}': Estimate(None, None, 'rad/s') for axis in 'xyz'}
 
 
-def unsolved(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
+def refused_result(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     return MethodResult('two_point', tuple(reasons), _unknown(scale_unit), budget.PARAMETERS)
 
@@ -130,12 +133,12 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     """
     f, vertical_known = solve(chord, fix_scale[2])
     sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),
-               *_doubt(chord, f))
+               *_travel_sources(chord, f))
     covariance = budget.total_covariance(sources)
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
-    reasons = _judge_angles(chord.alignment, yaw, sources, config)
+    reasons = _yaw_reasons(chord.alignment, yaw, sources, config)
     reasons += () if vertical_known else (_without_heights(chord, fix_scale[2]),)
     estimates = _unknown(scale_unit)
     estimates['scale_factor'] = Estimate(K, K * float(sigma[0]), scale_unit)
@@ -151,7 +154,7 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
                                    chord.alignment.gyro_bias_sigma, strict=True):
             estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(own), 'rad/s')
     check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
-    reasons += _planes_agree(check, K, sigma[0])
+    reasons += _plane_reasons(check, K, sigma[0])
     return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
         'budget': budget.budget_table(sources, budget.PARAMETERS, (K, 1.0, 1.0)),
         'correlation': budget.correlations(covariance, budget.PARAMETERS), 'cross_check': check,
@@ -173,22 +176,23 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
         start, end = _blind_height(start), _blind_height(end, rise)
     K = float(np.linalg.norm(f))
     return budget.budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
-                  quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
-                  velocity_change=chord.velocity_change @ f,
-                  lever_arm_sigma=config.gnss.lever_arm_sigma,
-                  odometer_time_sigma=config.odometer.time_sigma)
+                         quantum=quantum * K, fix_scale=fix_scale,
+                         time_sigma=config.gnss.time_sigma,
+                         velocity_change=chord.velocity_change @ f,
+                         lever_arm_sigma=config.gnss.lever_arm_sigma,
+                         odometer_time_sigma=config.odometer.time_sigma)
 
 
-def _doubt(chord: Chord, f: Floats) -> tuple[Source, ...]:
+def _travel_sources(chord: Chord, f: Floats) -> tuple[Source, ...]:
     """Return the sources of travel lost in gaps and resets, and of slip; empty if none."""
     gradient = budget.parameter_gradient(f) @ np.linalg.inv(chord.M)
     sources: tuple[Source, ...] = ()
     if len(chord.slips[0]):
         sources += (slip_source(chord.track, f, gradient, *chord.slips),)
-    t, size = chord.doubt
-    inside = (t >= chord.start.t) & (t <= chord.end.t) & (size > 0)
+    t, sigma = chord.lost_travel
+    inside = (t >= chord.start.t) & (t <= chord.end.t) & (sigma > 0)
     if inside.any():
-        along_n = chord.track.C_nb_at(t[inside]) @ f * size[inside, None]      # (k, 3) m
+        along_n = chord.track.C_nb_at(t[inside]) @ f * sigma[inside, None]      # (k, 3) m
         sources += (Source('odometer_gaps', gradient @ along_n.T),)
     return sources
 
@@ -216,21 +220,21 @@ def _without_heights(chord: Chord, up_scale: float) -> Reason:
                   f'0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is assumed')
 
 
-def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
-                  config: Config) -> tuple[Reason, ...]:
+def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
+                 config: Config) -> tuple[Reason, ...]:
     """Return the reasons about yaw (rad), from the heading."""
-    asked = config.verdict.max_yaw_sigma
+    limit = config.verdict.max_yaw_sigma
     by_heading = next(s for s in sources if s.name == 'initial_heading')
-    share = float(np.linalg.norm(by_heading.effects[1]))
+    heading_sigma = float(np.linalg.norm(by_heading.effects[1]))
     reasons: tuple[Reason, ...] = ()
     if not alignment.heading_separable:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, '
                            'which includes the mounting angle: the end points only constrain the '
                            'sum of heading and yaw'),)
-    elif share > asked:
+    elif heading_sigma > limit:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'heading uncertainty '
-                           f'({alignment.heading_source}) is {np.rad2deg(share):.3f} deg, the '
-                           f'yaw limit is {np.rad2deg(asked):.3f} deg: the end points only '
+                           f'({alignment.heading_source}) is {np.rad2deg(heading_sigma):.3f} deg, '
+                           f'the yaw limit is {np.rad2deg(limit):.3f} deg: the end points only '
                            'constrain the sum of heading and yaw'),)
     far = abs(float(wrap(yaw - nominal_yaw(config))))
     if alignment.heading_separable and far > BACKWARDS_YAW:
@@ -266,13 +270,14 @@ def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
     return results
 
 
-def _planes_agree(check: dict[str, dict[str, float]], K: float,
-                  sigma_relative: float) -> tuple[Reason, ...]:
+def _plane_reasons(check: dict[str, dict[str, float]], K: float,
+                   sigma_relative: float) -> tuple[Reason, ...]:
+    """Return PLANES_DISAGREE if the ratio of chords differs from the estimated scale."""
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
     # relative: a plane about the leg preserves ratios of chords far better
     limit = 3e-5 + 0.2 * sigma_relative
     if worst > limit:
         return (Reason(Code.PLANES_DISAGREE, 'the scale as ratio of chords, in a map plane or on '
-                       f'the ellipsoid, differs by {share(worst)} from the estimated '
-                       f'scale; the limit is {share(limit)}'),)
+                       f'the ellipsoid, differs by {format_relative(worst)} from the estimated '
+                       f'scale; the limit is {format_relative(limit)}'),)
     return ()

@@ -5,8 +5,13 @@
 The least-squares problem of a leg at one state: factors, normal equations, cost, components.
 
 An additional sensor or prior is one more class in ``FACTORS`` (``factor.Factor``).
+
+Constants that change within a leg are found by a score test of the converged fit: docs/method.md
+(S27c). A step of a constant at a time is one more column of the equations: that of the constant,
+from this time on. Its estimate with all other unknowns free needs no second fit.
 """
 
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -14,32 +19,27 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal, NotPositive, solve, Solved
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
-from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.gnss import Fixes, VelocityRows
 from odocal_ros.estimator.factors.heading import HeadingRows
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.odometer_filter import as_rolled
-from odocal_ros.estimator.factors.outside_rows import OutsideRows
-from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.factors.odometer import as_rolled, SpeedSteps, TravelError
+from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows
 from odocal_ros.estimator.factors.pressure import PressureRows
-from odocal_ros.estimator.factors.priors import PriorRows, SIZES
-from odocal_ros.estimator.factors.rests import Rests
+from odocal_ros.estimator.factors.pseudo_observations import PriorRows, Rests, SIZES
 from odocal_ros.estimator.factors.slow_error import SlowError
-from odocal_ros.estimator.factors.speed_steps import SpeedSteps
-from odocal_ros.estimator.factors.travel_error import TravelError
-from odocal_ros.estimator.factors.velocity import VelocityRows
 from odocal_ros.estimator.levels import LevelInformation, Levels, LevelSides
-from odocal_ros.estimator.preintegrate import preintegrate
+from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
-from odocal_ros.estimator.sums import Intervals, Points
+from odocal_ros.estimator.state import BARE, LN_K, PITCH, Priors, State, WITH_SLOW, YAW
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
-                                 SpeedSteps, TravelError, SlowError, Rests, PriorRows)
-OUTSIDE = tuple(part for part in FACTORS if issubclass(part, OutsideRows))
+                                     SpeedSteps, TravelError, SlowError, Rests, PriorRows)
+EXTERNAL_FACTORS = tuple(part for part in FACTORS if issubclass(part, ExternalRows))
 
 
-def sums(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:
+def preintegrate_at(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:
     """Return the sums over all intervals, and to the times of rows by their part."""
     leg, c = problem.leg, state.constants
     times = {part.name: part.times(problem, c) for part in FACTORS
@@ -62,8 +62,8 @@ class Equations:
                  priors: Priors | None = None, spread: Floats | None = None,
                  fitted: bool = False) -> None:
         self.state = state
-        point = LinearisationPoint(state, *sums(problem, state), priors or problem.priors, spread,
-                                   fitted)
+        point = LinearisationPoint(state, *preintegrate_at(problem, state),
+                                   priors or problem.priors, spread, fitted)
         self.constants_in_use = point.priors.in_use
         self.parts = {kind.name: kind(problem, point) for kind in FACTORS if kind.there(problem)}
 
@@ -142,3 +142,59 @@ class Weighted:
         """
         return {name: pair for part in self.parts.values()
                 for name, pair in part.components(marginals).items()}
+
+
+STEP_PLACES = 15       # judgement: times of a step, at equal distances along the path
+STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested, the scale first
+GRADUAL = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
+
+
+@dataclass(frozen=True)
+class ConstantStep:
+    """A change of a constant from a time, s, on: its size and sigma, relative or rad."""
+
+    constant: int
+    t: float
+    size: float
+    sigma: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Return True if noise does not explain the step."""
+        return abs(self.size) > FAULT_SIGMAS * self.sigma
+
+
+def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantStep, ...]:
+    """Return the most significant step of each constant that has any; before ``marginals``."""
+    rows = weighted[MotionRows]
+    path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
+    at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
+    chain, border, square, score = rows.step_sides(at, STEPPING)
+    left = 1 / solved.taken - 1      # of the step, if it was shortened: to the minimum
+    score -= left * (np.einsum('kil,ki->l', chain, solved.step)
+                     + border.T @ solved.step_border[:len(border)])
+    taken, _ = solved.products(chain, border)
+    of_rows, whole = np.diag(square), square - taken
+    information = np.diag(whole).copy()
+    scale = slice(STEP_PLACES)
+    score[scale], information[scale] = _beside_gradual(score[scale], whole[scale, scale])
+    information = information.reshape(len(STEPPING), STEP_PLACES)
+    # standing before or after a place, or a constant that no row depends on
+    known = information > 1e-9 * of_rows.reshape(information.shape)
+    sigma = 1 / np.sqrt(np.where(known, information, np.inf))
+    score, t = score.reshape(sigma.shape), weighted.state.t[at]
+    most = np.argmax(np.abs(score) * sigma, axis=1)
+    return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
+                              float(sigma[i, k]))
+                 for i, (constant, k) in enumerate(zip(STEPPING, most, strict=True))
+                 if sigma[i].any())
+
+
+def _beside_gradual(score: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """Return score and information of each step of the scale, beside a gradual change of it."""
+    # quadratic in the path, as a sum of steps at all places, with a prior
+    shares = GRADUAL / STEP_PLACES * np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
+    across = information @ shares
+    by = np.linalg.solve(np.eye(2) + shares.T @ across,
+                         np.column_stack([across.T, shares.T @ score]))
+    return score - across @ by[:, -1], np.diag(information) - (across * by[:, :-1].T).sum(axis=1)

@@ -18,14 +18,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Solved
-from odocal_ros.estimator.changes import changes, Step
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps, Weighted
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.point_rows import PointRows, rows_per_effective, TAIL_SIGMAS
 from odocal_ros.estimator.factors.slow_error import SlowError
-from odocal_ros.estimator.factors.speed_steps import SpeedSteps
 from odocal_ros.estimator.level_steps import prior_information, update
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
@@ -110,7 +109,7 @@ class Fit(FitSummary):
     weighted: Weighted
     solved: Solved
     by_levels: Floats        # (M, L) what unit errors of levels do to the constants, sizes last
-    steps: tuple[Step, ...] = ()     # of constants within the leg
+    steps: tuple[ConstantStep, ...] = ()     # of constants within the leg
 
     @property
     def covariance(self) -> Floats:
@@ -120,7 +119,7 @@ class Fit(FitSummary):
     def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
         return FitSummary(self.state, self.levels, self.priors, self.first, self.spread,
-                       self.settled, self.creeping, self.iterations, self.likelihood)
+                          self.settled, self.creeping, self.iterations, self.likelihood)
 
 
 class _Progress:
@@ -201,7 +200,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
-               likelihood, weighted, solved, by_levels, changes(weighted, solved))
+               likelihood, weighted, solved, by_levels, find_constant_steps(weighted, solved))
 
 
 def damped(solved: Solved, taken: Floats) -> Solved:
@@ -246,7 +245,7 @@ def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
     """Return rows per independent row, by residuals of other sensors and of speed steps."""
     # at constant acceleration errors of speed steps repeat
     return {name: rows_per_effective(part) for name, part in weighted.parts.items()
-            if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}
+            if name in (*problem.external, SpeedSteps.name) and isinstance(part, PointRows)}
 
 
 def relaxed(first: Priors, now: Priors, state: State, solved: Solved,

@@ -22,20 +22,20 @@ from odocal_ros.calib.result import MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive
+from odocal_ros.estimator.cold_start import speed_at, SPEED_WINDOW
 from odocal_ros.estimator.factors.factor import SPREAD, WANTED
 from odocal_ros.estimator.factors.motion import gravity_n
-from odocal_ros.estimator.factors.odometer_filter import as_rolled
+from odocal_ros.estimator.factors.odometer import as_rolled
 from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace, WarmStart
-from odocal_ros.estimator.imu_steps import ImuSteps, nearest, rows_of
+from odocal_ros.estimator.imu import imu_rows, ImuSteps, nearest_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import problem_of, SPACING
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.start import speed_at, SPEED_WINDOW
 from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, NO_ERROR, State
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
@@ -115,7 +115,7 @@ class GrowingFit:
                 best = self._fit(last, problem, config, trace)
                 if not best.settled:
                     raise BadData('the smoother has not converged on the data so far')
-                method = outcome(view, problem, best, config)
+                method = make_result(view, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = best.summary()
@@ -193,8 +193,8 @@ def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
 
     They lie at multiples of ``spacing``; first and last row are keyframes too.
     """
-    first, t = rows_of(view)
-    k = nearest(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
+    first, t = imu_rows(view)
+    k = nearest_samples(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
     key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
     return ImuSteps.between(view, key + first)

@@ -19,11 +19,11 @@ from odocal_ros.screening.inputs import Inputs
 # s: a standstill that ended longer before the start mark is another drive. Judgement
 BEFORE_MARK = 30.0
 # Hz: physical, errors of velocity and heading last longer than a fifth of a second
-OUTSIDE_RATE = 5.0
+EXTERNAL_RATE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Outside:
+class ExternalSamples:
     """Rows of a sensor in frame n: arrays of one length, times first."""
 
     t: Floats       # (m,) s
@@ -37,9 +37,9 @@ class Outside:
 
 
 def thinned(t: Floats) -> slice:
-    """Return an index that thins sorted times to about OUTSIDE_RATE."""
+    """Return an index that thins sorted times to about EXTERNAL_RATE."""
     rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-    return slice(None, None, max(1, round(rate / OUTSIDE_RATE)))
+    return slice(None, None, max(1, round(rate / EXTERNAL_RATE)))
 
 
 def from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
@@ -85,7 +85,8 @@ class SmootherLeg:
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
     doubt_t: Floats = _none()
     doubt_sigma: Floats = _none()        # scale units
-    outside: Mapping[str, Outside] = field(default_factory=dict)     # by the name of its factor
+    # by the name of the factor
+    external: Mapping[str, ExternalSamples] = field(default_factory=dict)
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
     has_accelerometer: bool = True      # False: f_b is constant gravity
     # (k, 3) or (1, 3) m^2, part of the variances of the fixes by rounding

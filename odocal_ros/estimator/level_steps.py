@@ -16,9 +16,9 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import Weighted
-from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
-from odocal_ros.estimator.factors.priors import PriorRows, SIZE_SPREADS, SIZES
+from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE_SPREADS, SIZES
 from odocal_ros.estimator.factors.slow_error import TIME_SPREAD
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem

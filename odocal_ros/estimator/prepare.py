@@ -9,17 +9,21 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.equations import FACTORS, OUTSIDE
+from odocal_ros.estimator.equations import EXTERNAL_FACTORS, FACTORS
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
-from odocal_ros.estimator.factors.fixes import whitener
-from odocal_ros.estimator.factors.priors import SHARED
-from odocal_ros.estimator.factors.slide import turned
-from odocal_ros.estimator.imu_noise import at_rest, of_samples, without_accelerometer
-from odocal_ros.estimator.imu_steps import ImuSteps
+from odocal_ros.estimator.factors.gnss import whitener
+from odocal_ros.estimator.factors.interval_noise import total_turn
+from odocal_ros.estimator.factors.pseudo_observations import SHARED
+from odocal_ros.estimator.imu import (
+    ImuSteps,
+    is_standing,
+    sample_noise,
+    white_noise_at_rest,
+    without_accelerometer,
+)
 from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.start import standing
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
@@ -60,8 +64,8 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
         doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
-        outside={part.name: sent for part in OUTSIDE
-                 if (sent := part.prepared(inputs, config, origin)) is not None},
+        external={part.name: sent for part in EXTERNAL_FACTORS
+                  if (sent := part.prepared(inputs, config, origin)) is not None},
         has_accelerometer=inputs.has_accelerometer,
         wheels=inputs.travels)
 
@@ -70,18 +74,18 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     """Return the problem of a leg; ``imu``: its steps, if keyframes are given."""
     imu = ImuSteps.of(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
-    still = standing(leg, t)
+    still = is_standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    config = replace(config, imu=imu_as_seen(config.imu, at_rest(imu, leg, still)))
+    config = replace(config, imu=imu_as_seen(config.imu, white_noise_at_rest(imu, leg, still)))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
-    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.outside.items()}
-    own = {part.source: part.constants for part in OUTSIDE
-           if part.name in leg.outside and part.name not in SHARED}
+    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}
+    own = {part.source: part.constants for part in EXTERNAL_FACTORS
+           if part.name in leg.external and part.name not in SHARED}
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     made = Problem(
         leg, imu, grade, _priors(config, grade, leg), use, root, still,
-        {name: sent for name, sent in within.items() if len(sent.t)}, own, turned(leg, imu),
+        {name: sent for name, sent in within.items() if len(sent.t)}, own, total_turn(leg, imu),
         config.gnss.correlation_time, rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
         drift_time(leg, t), LEAST.fix if not leg.origin.local
         or config.reference.points else LEAST.pose)     # a robot stands on marks
@@ -93,7 +97,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     # with vibration, most of which cancels within a second: initial levels that decrease
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     made.vibrating = {name: max(sigma**2, made.first_levels[name])
-                      for name, sigma in of_samples(leg, rows).items()}
+                      for name, sigma in sample_noise(leg, rows).items()}
     return made
 
 
@@ -155,12 +159,12 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     # of a coarse speed, 0 to half a step
     half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
     centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
-    for part in OUTSIDE:
-        sent = leg.outside.get(part.name)
+    for part in EXTERNAL_FACTORS:
+        sent = leg.external.get(part.name)
         sigma[part.constants] = (
             layout.NO_ERROR if sent is None else part.prior_sigmas(sent, config))
     if not leg.has_accelerometer:        # mounting and attitude are not separable: as configured
         sigma[layout.ACCEL] = sigma[layout.PITCH] = layout.NO_ERROR
-        if 'heading' not in leg.outside:
+        if 'heading' not in leg.external:
             centre[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
     return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.leg import Outside, SmootherLeg
+from odocal_ros.estimator.imu import ImuSteps
+from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.state import Priors
 from odocal_ros.settings.grades import Grade
@@ -25,7 +25,7 @@ class Problem:
     use: np.ndarray          # (k,) bool, fixes within the keyframes
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
-    outside: dict[str, Outside]    # within the keyframes
+    external: dict[str, ExternalSamples]    # within the keyframes
     own: dict[str, slice]    # slices of their constants, by source, that no other leg shares
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN estimated

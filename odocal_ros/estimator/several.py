@@ -13,15 +13,19 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import FREE_STEP, Joint, joint, scale_steps, ScaleStep
-from odocal_ros.calib.judge import cause_of_change, change_in_words
 from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.value_limits import cause_of_change, format_change
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import WANTED
-from odocal_ros.estimator.factors.priors import SHARED, SIZE
-from odocal_ros.estimator.result.exported import as_sent_of
-from odocal_ros.estimator.result.outcome import determined, floored, not_observable, SCALES
-from odocal_ros.estimator.result.refusal import OPTIONAL
-from odocal_ros.estimator.result.remarks import beside, MODEL_FLOOR
+from odocal_ros.estimator.factors.pseudo_observations import SHARED, SIZE
+from odocal_ros.estimator.result.estimates import (
+    estimate_constants,
+    not_observable_reason,
+    OPTIONAL,
+)
+from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
+from odocal_ros.estimator.result.outcome import SCALES, with_model_floor
+from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.result.wheel_result import joined, wheel_details, wheel_estimates
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
@@ -61,7 +65,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
                   dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True)), (days == 0).tolist())
     at = [found.names.index(name) for name in CONSTANTS]
-    C = floored(found.covariance[np.ix_(at, at)])
+    C = with_model_floor(found.covariance[np.ix_(at, at)])
     common = _common(legs)
     C[:WANTED, :WANTED] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
@@ -69,8 +73,8 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     scale = legs[-1].estimates['scale_factor']
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
                     (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
-    estimates, why = determined(found.value[at], sigma, ratio, scale.unit, nominal, config)
-    estimates |= as_sent_of(legs, estimates['scale_factor'])
+    estimates, why = estimate_constants(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates |= combine_as_sent(legs, estimates['scale_factor'])
     wheels = joined(legs)
     if wheels:
         of_wheels, more = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
@@ -78,14 +82,14 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
-        why.append(not_observable(f'these {len(legs)} drives', unsaid))
+        why.append(not_observable_reason(f'these {len(legs)} drives', unsaid))
     sources = _sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
     said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
     return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
-                        | {'beside': beside(found.value[at], C, grade)}
+                        | {'beside': additional_figures(found.value[at], C, grade)}
                         | wheel_details(wheels),
                         found.carried)
 
@@ -113,7 +117,7 @@ def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
     """Return the reason for a scale that changed between two legs: size, time, likely cause."""
     relative = float(np.expm1(change.change))
     since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
-    return Reason(Code.SCALE_CHANGED, f'the scale changed by {change_in_words(relative)} '
+    return Reason(Code.SCALE_CHANGED, f'the scale changed by {format_change(relative)} '
                   f'({abs(change.sigmas):.1f} sigma) since {since.replace("T", " ")} UTC, seen '
                   f'in {_name(numbers[change.leg])}: {cause_of_change(relative)}')
 

@@ -10,17 +10,17 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
+from odocal_ros.estimator.cold_start import first_state, Start
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace
-from odocal_ros.estimator.imu_steps import rows_of
+from odocal_ros.estimator.imu import imu_rows
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.outcome import outcome
-from odocal_ros.estimator.result.refusal import no_imu, refused
-from odocal_ros.estimator.start import first_state, Start
+from odocal_ros.estimator.result.estimates import implausible_imu_reasons, refused_result
+from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.state import Priors, SPEED_OFFSET, State, YAW
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
@@ -47,17 +47,17 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     """
     few = too_little_of(leg)
     if few:
-        return refused([few], leg.scale_unit, leg.wheels)
+        return refused_result([few], leg.scale_unit, leg.wheels)
     problem = problem_of(leg, config)
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
-                               'Likely cause: missing or invalid samples')],
-                       leg.scale_unit, leg.wheels)
-    if implausible := no_imu(best):
-        return refused(implausible, leg.scale_unit, leg.wheels)
-    return outcome(leg, problem, best, config)
+        reason = Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
+                        'Likely cause: missing or invalid samples')
+        return refused_result([reason], leg.scale_unit, leg.wheels)
+    if implausible := implausible_imu_reasons(best):
+        return refused_result(implausible, leg.scale_unit, leg.wheels)
+    return make_result(leg, problem, best, config)
 
 
 def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
@@ -133,7 +133,7 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:
     """Return the reason if a leg has too few fixes with IMU rows, else None."""
-    _, t = rows_of(leg)
+    _, t = imu_rows(leg)
     if len(t) < 2:
         return too_little(0, 0.0)
     beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])

@@ -10,8 +10,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
 from odocal_ros.estimator.factors.motion import gravity_n
-from odocal_ros.estimator.imu_steps import ImuSteps, keyframes
-from odocal_ros.estimator.leg import BEFORE_MARK, Outside, OUTSIDE_RATE, SmootherLeg
+from odocal_ros.estimator.imu import ImuSteps, keyframes
+from odocal_ros.estimator.leg import BEFORE_MARK, EXTERNAL_RATE, ExternalSamples, SmootherLeg
 from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import Sigmas
@@ -78,7 +78,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
         imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
-        outside=_heading(drive, config, t_begin, spacing))
+        external=_heading(drive, config, t_begin, spacing))
     key = keyframes(leg, spacing)
     return Ideal(leg, ImuSteps.between(leg, key), _state(motion, key),
                  max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
@@ -108,14 +108,14 @@ def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:
 
 
 def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
-             ) -> dict[str, Outside]:
+             ) -> dict[str, ExternalSamples]:
     """Return the external heading of the settings; none for a course or a gyrocompass."""
     asked, sigma = config.alignment.source, config.alignment.heading_sigma
     if asked == 'fixed':
         t, noise = np.zeros(1), GIVEN_NOISE
     elif asked in SENT and sigma <= HEADING_LIMIT:
-        t = _times(t_begin, drive.duration, OUTSIDE_RATE, spacing)
-        noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * OUTSIDE_RATE))
+        t = _times(t_begin, drive.duration, EXTERNAL_RATE, spacing)
+        noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * EXTERNAL_RATE))
     else:
         return {}
     yaw = np.interp(t, drive.t, drive.yaw)

@@ -19,7 +19,7 @@ from odocal_ros.calib.planar.result import result_of
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.forecast import planned_methods
 from odocal_ros.forecast.ideal_samples import ideal
 from odocal_ros.forecast.indoor_motion import MOTION_STEP, RobotMotion
@@ -150,8 +150,8 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     slow = 2 / max(correlated, 1.0) * robot.drift**2 * drifts
     levels = planned_methods.planned_levels(problem, sigmas, made.fixes_in_one).but(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
-    return _with_slip(outcome(leg, problem, planned_methods.fit_at(problem, made, levels), config),
-                      motion, robot)
+    fit = planned_methods.fit_at(problem, made, levels)
+    return _with_slip(make_result(leg, problem, fit, config), motion, robot)
 
 
 def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> MethodResult:

@@ -14,13 +14,13 @@ from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.factor import SPREAD
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
-from odocal_ros.estimator.imu_noise import sensor_noise
+from odocal_ros.estimator.imu import sensor_noise
 from odocal_ros.estimator.level_steps import SLIPPING
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of, SPACING
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.outcome import outcome
-from odocal_ros.estimator.result.refusal import refused
+from odocal_ros.estimator.result.estimates import refused_result
+from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.smoother import too_little
 from odocal_ros.estimator.state import M
 from odocal_ros.forecast.ideal_samples import Ideal, ideal
@@ -44,17 +44,17 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     """
     few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
-        return refused([few], '1')
+        return refused_result([few], '1')
     made = ideal(drive, sigmas, spacing_for(drive) if spacing is None else spacing)
     problem = problem_of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = fit_at(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}. '
-                               'Likely cause: too little data for the unknowns')],
-                       '1')
-    return outcome(made.leg, problem, fit, sigmas.config)
+        reason = Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}. '
+                        'Likely cause: too little data for the unknowns')
+        return refused_result([reason], '1')
+    return make_result(made.leg, problem, fit, sigmas.config)
 
 
 def spacing_for(drive: PlannedDrive) -> float:

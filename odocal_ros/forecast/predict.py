@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.drive import judge_drive
-from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.two_point import Chord, fit, refusal, unsolved
+from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_result
+from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.forecast.planned_drive import PlannedDrive
@@ -129,12 +129,12 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
                   np.zeros(3), _velocity_change(track, (start, end)), alignment)
     reasons = (*found, *said)
-    refused = refusal(chord, 1.0)
+    refused = refusal_reasons(chord, 1.0)
     if refused:
-        method = unsolved(refused, '1')
+        method = refused_result(refused, '1')
     else:
         method = fit(chord, 1.0, '1', sigmas.quantum, np.ones(3), config)
-        reasons += judge(method.estimates, 1.0, config)
+        reasons += check_limits(method.estimates, 1.0, config)
     return Prediction(method, reasons + method.reasons, alignment, distance,
                       float(np.linalg.norm((end.position_n - start.position_n)[:2])),
                       drive.duration, (_rest(0.0, spans), _rest(drive.duration, spans)),

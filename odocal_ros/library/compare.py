@@ -9,8 +9,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from odocal_ros.calib.judge import ANOTHER_SCALE, change_in_words, OTHER, TYRES
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.value_limits import ANOTHER_SCALE, format_change, OTHER, TYRES
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.nav.rotations import wrap
@@ -231,7 +231,7 @@ def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> 
     if change.parameter.startswith('scale_'):
         before = stored[difference.since].value(change.parameter)
         assert before is not None      # entries have a value
-        return change_in_words(difference.change / before)
+        return format_change(difference.change / before)
     if change.unit == 'rad':
         return f'{math.degrees(1.0) * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'

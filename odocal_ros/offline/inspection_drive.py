@@ -12,8 +12,9 @@ import numpy as np
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import not_moving, path_and_chord
 from odocal_ros.calib.gyro_axes import turning
-from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
+from odocal_ros.calib.two_point import LEAST_CHORD_SHARE
+from odocal_ros.calib.value_limits import far_from_nominal
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import lengths, medians
@@ -198,7 +199,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests
 
 def closed(leg: dict[str, Any]) -> bool:
     """Return True if a leg ends where it starts: ratio of chord to path length."""
-    return bool(leg['chord'] < 0.2 * leg['distance'])
+    return bool(leg['chord'] < LEAST_CHORD_SHARE * leg['distance'])
 
 
 def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:

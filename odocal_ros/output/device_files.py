@@ -19,7 +19,7 @@ from odocal_ros.settings.levels import INFORMED_SHARE
 from odocal_ros.settings.nominal import nominal_scale
 
 if TYPE_CHECKING:
-    from odocal_ros.estimator.result.twist_noise import TwistNoise
+    from odocal_ros.estimator.result.odometry_output import TwistNoise
 
 CONTROLLERS = 'ros2_controllers.yaml'
 # controllers that take the radius itself, and their parameter for it
@@ -156,7 +156,7 @@ def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
 def wheel_covariance(calibration: Calibration, config: Config,
                      content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty without a scale factor of the smoother."""
-    from odocal_ros.estimator.result.twist_noise import twist_noise
+    from odocal_ros.estimator.result.odometry_output import twist_noise
     noise = twist_noise(calibration)
     if noise is None:
         return {}

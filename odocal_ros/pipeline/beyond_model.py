@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.judge import judge, speed_unit
 from odocal_ros.calib.result import MethodResult, Source, wheel_factors
+from odocal_ros.calib.value_limits import check_limits, speed_unit
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.pipeline.prepared_leg import PreparedLeg
 from odocal_ros.reasons import Code, Reason
@@ -45,7 +45,7 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                  for name_, e in method.estimates.items()}
     row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
            for name_ in method.parameters} | {'shared': shared}
-    sigma_reasons = [r for r in judge(estimates, prepared.nominal, prepared.config)
+    sigma_reasons = [r for r in check_limits(estimates, prepared.nominal, prepared.config)
                      if r.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),

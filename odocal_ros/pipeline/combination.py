@@ -13,8 +13,8 @@ import numpy as np
 from odocal_ros.calib.border import Carried
 from odocal_ros.calib.choice import choose, leg_estimates, relevant_reasons
 from odocal_ros.calib.combine import combine_method
-from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix, wrap
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -70,7 +70,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
                for r in relevant_reasons(methods[name].reasons, name, estimates)
                if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
                or name in on_border and r.code in COMBINED_CODES]
-        reasons += [r for r in (*own, *judge(estimates, nominal, config))
+        reasons += [r for r in (*own, *check_limits(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))
     reasons += inconsistent_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in usable])

@@ -13,7 +13,7 @@ import numpy as np
 from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over
 from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raised_if_wild
-from odocal_ros.calib.two_point import unsolved
+from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
@@ -48,8 +48,8 @@ def _smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
 
 
 def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
-    from odocal_ros.estimator.result.refusal import refused
-    return refused((why,), inputs.scale_unit, inputs.travels)
+    from odocal_ros.estimator.result.estimates import refused_result
+    return refused_result((why,), inputs.scale_unit, inputs.travels)
 
 
 # in the order of the output; two_point, by the operator's own marks, is always computed
@@ -57,7 +57,7 @@ METHODS: dict[str, Callable[[PreparedLeg, PassCallback], MethodRun]] = {
     'two_point': two_point, 'smoother': _smoother}
 # the result of a method that cannot estimate: (inputs, reason) to MethodResult
 REFUSED_RESULTS: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
-           'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
+           'two_point': lambda inputs, why: refused_result((why,), inputs.scale_unit),
            'smoother': _no_smoother}
 
 

@@ -11,17 +11,17 @@ import numpy as np
 from odocal_ros.calib import check
 from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.drive import white_noise
-from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.reversal import against_travel, pieces
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.two_point import (
     Chord,
     fit,
-    refusal,
+    refusal_reasons,
+    refused_result,
     solve,
-    unsolved,
 )
+from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.pipeline.prepared_leg import (
     configured_forward,
@@ -56,9 +56,11 @@ class TwoPointRun:
     def result(self) -> MethodRun:
         """Return the method's result and the path."""
         chord = self._chord()
-        refused = tuple(self.reasons) if chord is None else refusal(chord, self.prepared.rough)
+        refused = tuple(self.reasons) if chord is None else refusal_reasons(
+            chord, self.prepared.rough)
         if chord is None or refused:
-            return MethodRun(unsolved(refused, self.inputs.scale_unit), found=tuple(self.found))
+            return MethodRun(refused_result(refused, self.inputs.scale_unit),
+                             found=tuple(self.found))
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
@@ -73,7 +75,7 @@ class TwoPointRun:
         method = fit(chord, self.prepared.nominal, self.inputs.scale_unit,
                      self.inputs.travel.quantum, factor, self.config)
         self._check_counting_direction(chord)
-        method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
+        method = replace(method, reasons=(*method.reasons, *self.reasons, *check_limits(
             method.estimates, self.prepared.nominal, self.config)))
         f = method.details['f']
         paths = Paths(*map(self.prepared.path,
@@ -106,7 +108,8 @@ class TwoPointRun:
         chord = Chord(track, prepared.origin, start, end, prepared.lever_b,
                       self._velocity_change((start, end)), prepared.alignment,
                       (self.inputs.doubt_t, self.inputs.doubt_sigma))
-        if all(m.standing or m.surveyed for m in (start, end)) or refusal(chord, prepared.rough):
+        exact = all(m.standing or m.surveyed for m in (start, end))
+        if exact or refusal_reasons(chord, prepared.rough):
             return chord
         path = prepared.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
         return replace(chord, start=prepared.mark(start.t, path, 'start') or start,

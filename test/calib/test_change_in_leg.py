@@ -15,12 +15,11 @@ from smoother_legs import leg_of, made, said as texts
 from odocal_ros.calib.sections import counter_change, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
-from odocal_ros.estimator.changes import changes, Step
-from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.result.remarks import _changes, LEAST_CHANGE
+from odocal_ros.estimator.result.remarks import _change_reasons, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, M, PITCH, YAW
 from odocal_ros.pipeline.calibrate import calibrate
@@ -80,7 +79,7 @@ def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
     problem, fit = fitted
     weighted, rows = fit.weighted, fit.weighted[MotionRows]
     solved = solve(weighted.normal())
-    step = next(s for s in changes(weighted, solved) if s.constant == constant)
+    step = next(s for s in find_constant_steps(weighted, solved) if s.constant == constant)
     at = int(np.searchsorted(fit.state.t, step.t))
     column = column_of(problem, fit, constant, 1e-5)
     column[:at] = 0.0
@@ -114,7 +113,7 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
         full = solve(weighted.normal())
         solved = replace(full, step=taken * full.step, step_border=taken * full.step_border,
                          taken=taken)
-        found.append([step.size for step in changes(weighted.after(solved), solved)])
+        found.append([step.size for step in find_constant_steps(weighted.after(solved), solved)])
     sigma = [step.sigma for step in fit.steps]
     # fixes beyond their tails lose weight with the full step
     np.testing.assert_allclose(*found, atol=0.1 * max(sigma))
@@ -168,8 +167,8 @@ def test_a_scale_that_changes_gradually_has_no_step():
 @pytest.mark.parametrize('constant', [LN_K, YAW])
 def test_a_change_that_does_not_matter_is_not_reported(constant):
     for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
-        fit = SimpleNamespace(steps=(Step(constant, 100.0, size, size / 7),))
-        assert len(_changes(fit)) == count
+        fit = SimpleNamespace(steps=(ConstantStep(constant, 100.0, size, size / 7),))
+        assert len(_change_reasons(fit)) == count
 
 
 @pytest.mark.core

@@ -13,10 +13,10 @@ from smoother_legs import made, said as texts, truth
 
 from odocal_ros.estimator import fit, smooth
 from odocal_ros.estimator.chain import Solved
+from odocal_ros.estimator.cold_start import first_state, with_bias
 from odocal_ros.estimator.fit import damped
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.start import first_state, with_bias
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict

@@ -173,8 +173,8 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
 def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, text, do):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[CONSTANTS.index('antenna_lever_arm_z')] = found
-    reason, = remarks._arms(value, sigma, np.full(len(CONSTANTS), ratio),
-                            with_settings(Config(), {'gnss.lever_arm': set_to}))
+    reason, = remarks._lever_arm_reasons(value, sigma, np.full(len(CONSTANTS), ratio),
+                                         with_settings(Config(), {'gnss.lever_arm': set_to}))
     assert f'gnss.lever_arm {text}' in reason.text
     assert re.search(do, reason.do)
     assert ('easure' in reason.do) != ('larger' in text)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from odocal_ros.estimator.factors.odometer_filter import as_rolled, REACH
-from odocal_ros.estimator.imu_steps import ImuSteps, STEP
+from odocal_ros.estimator.factors.odometer import as_rolled, REACH
+from odocal_ros.estimator.imu import ImuSteps, STEP
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -159,8 +159,8 @@ def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
     rng = np.random.default_rng(3)
     leg = samples(t, 0.2 * rng.standard_normal((len(t), 3)), rng.standard_normal((len(t), 3)))
     whole = ImuSteps.of(leg, 1.0)
-    monkeypatch.setattr('odocal_ros.estimator.imu_steps.AT_A_TIME', 33)
-    monkeypatch.setattr('odocal_ros.estimator.imu_steps.KEYS_AT_A_TIME', 3)
+    monkeypatch.setattr('odocal_ros.estimator.imu.SAMPLES_IN_CACHE', 33)
+    monkeypatch.setattr('odocal_ros.estimator.imu.KEYFRAMES_IN_CACHE', 3)
     parts = ImuSteps.of(leg, 1.0)
     for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)

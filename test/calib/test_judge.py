@@ -9,9 +9,9 @@ import pytest
 from odocal_ros.calib.check import bent, fix_noise_factor, mismatch, steady, track_check
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.calib.gyro_axes import gyro_reasons, turn_ratio
-from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import slow_variance
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.reasons import Code
 from odocal_ros.screening.facing import imu_sanity
 from odocal_ros.settings.config import Config, ImuConfig, with_settings
@@ -40,8 +40,8 @@ def fixes_of(rate):
 
 
 def test_good_and_undetermined_values_say_nothing():
-    assert judge(estimates(), 0.021, CONFIG) == judge(estimates(), 0.0, CONFIG) == ()
-    assert judge(estimates(None, yaw=None, yaw_sigma=None), 0.02, CONFIG) == ()
+    assert check_limits(estimates(), 0.021, CONFIG) == check_limits(estimates(), 0.0, CONFIG) == ()
+    assert check_limits(estimates(None, yaw=None, yaw_sigma=None), 0.02, CONFIG) == ()
 
 
 @pytest.mark.parametrize(('values', 'nominal', 'code', 'text'), [
@@ -53,7 +53,7 @@ def test_good_and_undetermined_values_say_nothing():
     (estimates(scale=0.03), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '+50.0 % from the nominal value '),
     (estimates(scale=0.01), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '-50.0 %')])
 def test_each_limit_has_its_sentence(values, nominal, code, text):
-    reason, = judge(values, nominal, CONFIG)
+    reason, = check_limits(values, nominal, CONFIG)
     assert reason.code is code
     assert text in reason.text
     rejects = code is Code.SCALE_NOT_DETERMINED
@@ -66,7 +66,7 @@ def test_each_limit_has_its_sentence(values, nominal, code, text):
 def test_a_scale_that_a_mistaken_unit_makes_names_it(kmh, unit, nominal, word, wanted):
     found = {'scale_factor': Estimate(kmh, 1e-6, unit),
              'yaw_mounting_angle': Estimate(None, None, 'rad')}
-    (reason,) = judge(found, nominal, CONFIG)
+    (reason,) = check_limits(found, nominal, CONFIG)
     assert word in reason.text
     assert ' 1 ' not in reason.text.split(' from')[0]      # a speed's scale has no unit
     if wanted is None:

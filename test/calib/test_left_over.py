@@ -11,11 +11,11 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.motion import D, PHI, V
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.result.left_over import bias_sigmas, left_over
+from odocal_ros.estimator.result.residuals import bias_sigmas, stored_residuals
 from odocal_ros.estimator.smoother import best_fit
 
 pytestmark = pytest.mark.slow
@@ -37,13 +37,13 @@ def left_by_odometer(leg, config):
     """Return the fit of a leg, and the odometer's residuals and sigmas."""
     problem = problem_of(leg, config)
     fit = best_fit(problem, config)
-    return fit, *in_halves(left_over(leg, problem, fit)['left_odometer'])
+    return fit, *in_halves(stored_residuals(leg, problem, fit)['left_odometer'])
 
 
 def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
     """The fit has brought its rows there to first order; it ended within 0.03 sigma."""
     _, _, leg, problem, fit = fitted()
-    found = left_over(leg, problem, fit)
+    found = stored_residuals(leg, problem, fit)
     again = Equations(problem, fit.state, fit.priors, fit.spread, True)
     motion = again.parts[MotionRows.name].motion
     begin, end = (np.swapaxes(C, 1, 2) for C in (motion.C, motion.C_end))
@@ -68,7 +68,7 @@ def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
 def test_sigmas_are_those_of_white_noise_over_an_interval():
     """White noise of density s gives a mean over T a sigma of s / sqrt(T)."""
     _, _, leg, problem, fit = fitted()
-    found = left_over(leg, problem, fit)
+    found = stored_residuals(leg, problem, fit)
     T = np.diff(fit.state.t)
     _, sigma = in_halves(found['left_gyro'])
     # walks of the bias add less than 1e-3 of it

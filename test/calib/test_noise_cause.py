@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import AS_SENT
-from odocal_ros.estimator.result.mismatch import noise_remedy, quantised, steps
-from odocal_ros.estimator.result.twist_noise import twist_noise
+from odocal_ros.estimator.result.mismatch import (
+    find_noise_cause,
+    find_quantised,
+    quantisation_steps,
+)
+from odocal_ros.estimator.result.odometry_output import twist_noise
 from odocal_ros.estimator.several import _disputed
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.combination import combine
@@ -29,7 +33,7 @@ def leg(step_w, step_f, noise=0.5, n=20_000):
 
 
 def test_the_step_of_a_signal_is_found_and_none_where_there_is_none():
-    found = steps(leg(np.deg2rad(0.25), 0.0))
+    found = quantisation_steps(leg(np.deg2rad(0.25), 0.0))
     assert found['gyro'] == pytest.approx(np.deg2rad(0.25), rel=0.01)
     assert found['accel'] == 0.0
 
@@ -38,9 +42,9 @@ def test_quantisation_explains_noise_of_its_own_size_only():
     step = 0.125
     white = step * np.sqrt(1 / 12 / RATE)        # the closed form of rounding
     coarse = leg(0.0, step)
-    assert quantised(coarse, {'gyro': 1.0, 'accel': 1.4 * white}) == {
+    assert find_quantised(coarse, {'gyro': 1.0, 'accel': 1.4 * white}) == {
         'accel': pytest.approx(step, rel=0.01)}
-    assert quantised(coarse, {'gyro': 1.0, 'accel': 2.0 * white}) == {}
+    assert find_quantised(coarse, {'gyro': 1.0, 'accel': 2.0 * white}) == {}
 
 
 def problem(leg, rest):
@@ -66,7 +70,7 @@ def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknow
             (1e-2, 8e-3, 1e-2, 'If this is its normal noise, set imu.gyro_noise to 0.01 '
              '(rad/s/sqrt(Hz)).', 'cause is vibration'),
             (1e-3, 1e-3, 1e-2, 'unknown: single samples vary less', 'at rest it is similar')):
-        text = noise_remedy(noisy(moving, rest), {'gyro': gyro, 'accel': 1.0}, ['gyro'])
+        text = find_noise_cause(noisy(moving, rest), {'gyro': gyro, 'accel': 1.0}, ['gyro'])
         assert cause in text
         assert other not in text
 
@@ -75,18 +79,18 @@ def test_a_cause_of_one_sensor_is_not_stated_for_both():
     one = noisy(1e-2, 1e-2)
     sigma = np.where(one.leg.t_imu < 60.0, 0.01, 0.1)[:, None]
     one.leg.f_b = sigma * np.random.default_rng(5).standard_normal((len(sigma), 3))
-    text = noise_remedy(one, {'gyro': 1e-2, 'accel': 5e-3}, ['gyro', 'accel'])
+    text = find_noise_cause(one, {'gyro': 1e-2, 'accel': 5e-3}, ['gyro', 'accel'])
     assert text.startswith('The cause of the accelerometer noise is vibration: ')
     assert 'The gyro noise does not come from vibration: at rest it is similar.' in text
-    text = noise_remedy(one, {'gyro': 1e-2, 'accel': 5e-3}, ['accel'])
+    text = find_noise_cause(one, {'gyro': 1e-2, 'accel': 5e-3}, ['accel'])
     assert text.startswith('The cause is vibration: ')
 
 
 def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unknown():
     one = noisy(1e-2, 1e-2, rest_s=0.0)
-    vibrating = noise_remedy(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])
+    vibrating = find_noise_cause(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])
     assert 'gyro samples vary 10 times as much as their means over seconds' in vibrating
-    assert 'unknown: there is no standstill' in noise_remedy(
+    assert 'unknown: there is no standstill' in find_noise_cause(
         one, {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
 
 
@@ -94,10 +98,10 @@ def test_a_quantised_sensor_is_named_beside_another_cause():
     one = noisy(1e-2, 8e-3)
     one.leg.f_b = np.round(np.cumsum(np.full((20_000, 3), 1e-3), axis=0) / 0.125) * 0.125
     white = 0.125 * np.sqrt(1 / 12 / RATE)
-    text = noise_remedy(one, {'gyro': 1e-2, 'accel': white}, ['gyro', 'accel'])
+    text = find_noise_cause(one, {'gyro': 1e-2, 'accel': white}, ['gyro', 'accel'])
     assert 'quantisation: the accelerometer has steps of 0.125 m/s^2' in text
     assert 'gyro noise does not come from vibration' in text
-    assert noise_remedy(one, {'gyro': 1e-2, 'accel': white}, []) == ''
+    assert find_noise_cause(one, {'gyro': 1e-2, 'accel': white}, []) == ''
 
 
 @pytest.mark.parametrize(('name', 'tyres'), [('odometer_delay', False), ('scale_factor', True)])

@@ -14,13 +14,17 @@ from smoother_legs import made, truth
 from odocal_ros.data.mapped import HELD_BYTES, let_go, room
 from odocal_ros.estimator import bound
 from odocal_ros.estimator.chain import Normal, NotPositive, solve
+from odocal_ros.estimator.cold_start import first_state
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.axle import rates_at
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.priors import SIZE, START_SIGMAS
-from odocal_ros.estimator.factors.rests import STILL_SPEED, STILL_TURN
+from odocal_ros.estimator.factors.pseudo_observations import (
+    SIZE,
+    START_SIGMAS,
+    STILL_SPEED,
+    STILL_TURN,
+)
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.start import first_state
 from odocal_ros.estimator.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
 pytestmark = pytest.mark.core

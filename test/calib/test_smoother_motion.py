@@ -11,11 +11,11 @@ import pytest
 from smoother_legs import made, truth
 
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.equations import Equations, sums as preintegrated
+from odocal_ros.estimator.equations import Equations, preintegrate_at as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
-from odocal_ros.estimator.factors.rests import STILL_TURN
+from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import M, PHI, WITH_SLOW
 from odocal_ros.nav.dead_reckoning import forward_b
@@ -70,14 +70,14 @@ def test_the_truth_fulfils_the_equations(perfect):
 
 def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
     problem, state = perfect
-    sums = preintegrated(problem, state)[0]
-    rate_n = turn(state.C_nb[:-1], sums.mean_rate)
+    preintegrate_at = preintegrated(problem, state)[0]
+    rate_n = turn(state.C_nb[:-1], preintegrate_at.mean_rate)
     assert np.abs(rate_n[:, 2]).max() > 0.1
     rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level, and the mounting is 1 deg
     leaning = replace(state, C_nb=rolled)
     measured = turn(transpose(rolled[:-1]), rate_n)
     upright, other = (Motion(problem, one, own).nose_down[:, 0] for one, own in (
-        (state, sums), (leaning, replace(sums, mean_rate=measured))))
+        (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
     # of a turn by 0.2 rad a tenth was pitch; the heading that the mounting changes with the roll,
     # by 0.1 times some degrees, turns what the body really pitches by
     assert np.abs(other - upright).max() < 0.01 * np.abs(upright).max() + 1e-5

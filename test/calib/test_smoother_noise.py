@@ -15,8 +15,8 @@ from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors import signals
 from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.travel_error import once_a_rest
-from odocal_ros.estimator.imu_noise import at_rest
+from odocal_ros.estimator.factors.odometer import once_a_rest
+from odocal_ros.estimator.imu import white_noise_at_rest
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
@@ -71,7 +71,7 @@ def test_a_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most
     imu = SimpleNamespace(t=np.arange(401.0), key=np.arange(401), signals=None,
                           over_intervals=lambda _: signals)
     still = np.arange(401) % 40 <= 20
-    sigma = at_rest(imu, SimpleNamespace(has_accelerometer=True), still)['accel']**0.5
+    sigma = white_noise_at_rest(imu, SimpleNamespace(has_accelerometer=True), still)['accel']**0.5
     # 4 sigma of a quartile from 180 draws
     assert 0.75 * 1e-3 < sigma < most * 1e-3
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Velocity, heading and air pressure from outside in the smoother."""
+"""Velocity, heading and air pressure from other sensors in the smoother."""
 
 from dataclasses import replace
 import math
@@ -133,12 +133,12 @@ def test_a_delay_is_not_lost_in_vibration():
 
 def test_what_cannot_be_used_or_is_not_asked_for_is_left_out():
     drive, config, leg = made(**SHORT, **HILLS, velocity_sigma=SIGMA, orientation_sigma=1e-3)
-    assert set(leg.outside) == {'velocity', 'pressure'}     # no orientation unless asked for
+    assert set(leg.external) == {'velocity', 'pressure'}     # no orientation unless asked for
     without = with_settings(config, {'gnss.use_velocity': False, 'imu.use_pressure': False})
-    assert not leg_of(drive.leg(), without).outside
+    assert not leg_of(drive.leg(), without).external
     assert 'pressure' not in without.inputs
     silent = replace(drive.leg(), imu=changed(drive.imu, f_i=lambda f: f.fill(0.0)))
-    assert not leg_of(silent, config).outside
+    assert not leg_of(silent, config).external
 
 
 def test_white_errors_are_not_alike():
@@ -162,7 +162,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     method = fitted(drive.leg(), config, **ask)
     # without it, at the noise levels that this fit found: a fit of its own would find others
     levels = Levels.of_roots(method.details['noise'])
-    alone = math.sqrt(bound(replace(leg, outside={}), config,
+    alone = math.sqrt(bound(replace(leg, external={}), config,
                             truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the
     # drive contradicts, by 1.5 of its sigmas here, has less weight: up to 15 %
@@ -198,7 +198,7 @@ def test_rows_without_a_possible_value_are_left_out():
     assert not len(inputs.outside['pressure'].t)
     assert any('air pressure messages hold NaN, Inf or an impossible value' in r.text
                for r in found)
-    assert 'pressure' not in leg_of(leg, config).outside
+    assert 'pressure' not in leg_of(leg, config).external
 
 
 def test_rows_vanish_at_the_truth_but_for_the_constants():
@@ -212,14 +212,14 @@ def test_rows_vanish_at_the_truth_but_for_the_constants():
     left = part.raw[:, 0] - by @ np.linalg.lstsq(by, part.raw[:, 0], rcond=None)[0]
     # a mean of twenty heights of a second, 4 m/s^2 up at most at a change of slope: 4 / 24 m
     assert np.abs(left).max() < 4 / 24
-    assert np.ptp(problem.outside['pressure'].height) > 1.0
+    assert np.ptp(problem.external['pressure'].height) > 1.0
 
 
 def test_heights_sharpen_the_pitch_and_hold():
     pitch, errors, gain = 'pitch_mounting_angle', [], []
     for seed in range(1, 7):
         drive, config, leg = made(**HILLY, seed=seed)
-        found, without = smooth(leg, config), smooth(replace(leg, outside={}), config)
+        found, without = smooth(leg, config), smooth(replace(leg, external={}), config)
         errors.append(off(found, drive, pitch))
         gain.append(sigma_of(found, pitch) / sigma_of(without, pitch))
         assert off(found, drive) < 3.3

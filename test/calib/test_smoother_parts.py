@@ -15,7 +15,7 @@ from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.equations import Equations, FACTORS
 from odocal_ros.estimator.factors.axle import Axle
 from odocal_ros.estimator.factors.motion import D
-from odocal_ros.estimator.factors.priors import PriorRows, SIZE, SIZE_SPREADS
+from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE, SIZE_SPREADS
 from odocal_ros.estimator.factors.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.nav.coarse_speed import CoarseSpeed

@@ -15,12 +15,13 @@ from smoother_legs import leg_of, made, said as texts, smoothed, truth
 
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.estimator import smooth
+from odocal_ros.estimator.cold_start import first_state
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.result.outcome import determined, outcome
-from odocal_ros.estimator.start import first_state
+from odocal_ros.estimator.result.estimates import estimate_constants
+from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
@@ -97,7 +98,7 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     _, method = result()
     details = method.details
     usual = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
-                         for name in CONSTANTS[IMPERFECT]])
+                      for name in CONSTANTS[IMPERFECT]])
     problem = problem_of(leg, config)
     problem.priors.constants[IMPERFECT] = usual
     covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
@@ -115,7 +116,7 @@ def test_a_limit_that_model_errors_lower_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
     for doubt, text in ((1.0, ''), (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2, the ')):
-        _, reasons = determined(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(), doubt)
+        _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(), doubt)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
         assert len(said) == bool(text)
         assert all(text in one for one in said)
@@ -173,7 +174,7 @@ def test_what_still_moves_far_widens_by_as_much():
     problem = problem_of(leg, config)
     start = first_state(leg, problem.imu, problem.priors).state
     start.constants[YAW] += 0.1         # far off, and but one pass
-    method = outcome(leg, problem, fit(problem, start, problem.first_levels, 1), config)
+    method = make_result(leg, problem, fit(problem, start, problem.first_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',
                            texts(method)[Code.MODEL_MISMATCH])[1])
     assert move > 10.0

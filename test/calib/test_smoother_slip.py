@@ -16,7 +16,7 @@ from odocal_ros.calib.slip import find_slips, unforced
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
 from odocal_ros.estimator.result import mismatch
-from odocal_ros.estimator.result.outcome import in_words
+from odocal_ros.estimator.result.estimates import join_names
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.odometer import Travel
@@ -200,8 +200,8 @@ def test_slip_of_a_filtered_odometer_is_said():
 
 def test_names_of_parameters_in_words():
     arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
-    assert in_words(arm) == 'the antenna lever arm'
-    assert in_words(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
+    assert join_names(arm) == 'the antenna lever arm'
+    assert join_names(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
         'the odometer lever arm (up), the fix delay and the antenna lever arm')
 
 

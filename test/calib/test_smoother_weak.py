@@ -13,7 +13,7 @@ from reversing_drives import made as by_hand
 from smoother_legs import made, said as texts, truth
 
 from odocal_ros.estimator import bound, smooth
-from odocal_ros.estimator.factors import slide
+from odocal_ros.estimator.factors import interval_noise
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.nav.rotations import wrap
@@ -100,7 +100,7 @@ def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
     method = smooth(leg, config)
     # the road's noise in the place of what the fit made of the seconds
     levels = Levels.of_roots(method.details['noise']).but(
-        **dict.fromkeys(slide.SIDEWAYS, 0.05**2 / 10.0))
+        **dict.fromkeys(interval_noise.SIDEWAYS, 0.05**2 / 10.0))
     sigma = np.sqrt(bound(leg, config, truth(drive, config, leg), levels)[1, 1])
     stated = method.estimates['yaw_mounting_angle'].sigma
     # linearised at the estimate and not at the truth, heavy tails: 3 %; a second sways
@@ -117,8 +117,8 @@ def test_a_leg_with_turns_tests_it_itself():
     assert not said(method)
     # wheels that never slide: far below a road's; up and down springs and road do what they do
     noise = method.details['noise']
-    assert max(noise['side'], noise['side_turn']) < slide.ORDINARY_ROAD / 10
-    assert method.details['noise']['up'] == pytest.approx(slide.HEAVE)
+    assert max(noise['side'], noise['side_turn']) < interval_noise.ORDINARY_ROAD / 10
+    assert method.details['noise']['up'] == pytest.approx(interval_noise.HEAVE)
 
 
 def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
@@ -127,7 +127,8 @@ def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
     t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     yaw = np.abs(np.diff(drive.motion.at(t).yaw))
     # slower than TURNING between turns: less than that rate for all the time
-    assert slide.turned(leg, problem.imu) == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
+    turn = interval_noise.total_turn(leg, problem.imu)
+    assert turn == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
     biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
     assert problem_of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
     _, config, leg = straight()
@@ -136,11 +137,11 @@ def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
 
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
     angles = np.deg2rad(np.arange(0.0, 270.0))
-    least = np.array([slide.least_slide(a) for a in angles])
-    assert least[:90] == pytest.approx(slide.ORDINARY_ROAD)
-    assert least[181:] == pytest.approx(slide.TURN_SLIDE)
+    least = np.array([interval_noise.least_sideslip(a) for a in angles])
+    assert least[:90] == pytest.approx(interval_noise.ORDINARY_ROAD)
+    assert least[181:] == pytest.approx(interval_noise.TURN_SLIDE)
     # a factor of 80 over 90 deg: 5 % a degree
-    by_90 = np.log(slide.ORDINARY_ROAD / slide.TURN_SLIDE)
+    by_90 = np.log(interval_noise.ORDINARY_ROAD / interval_noise.TURN_SLIDE)
     assert np.abs(np.diff(np.log(least))).max() < by_90 / 90 * 1.001
 
 

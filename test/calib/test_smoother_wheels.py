@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.samples import take
 from odocal_ros.estimator.result import wheel_result
-from odocal_ros.estimator.result.wheels import Wheel
+from odocal_ros.estimator.result.wheel_result import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, SIDES, with_settings

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.estimator.result.wheel_noise import (
+from odocal_ros.estimator.result.wheels import (
     _left_out,
     _solved,
     fit_line,

@@ -10,9 +10,9 @@ import numpy as np
 
 from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.choice import PLANAR
-from odocal_ros.calib.judge import judge
 from odocal_ros.calib.planar.problem import Fit
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
+from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, SIDES
@@ -124,8 +124,9 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
         own_laws = [laws.get(name, 0.0) * (('scale' in name) == scales) for name in names]
         if any(own_laws):
             sources.append(Source(source, np.array(own_laws)[:, None], True))
-    return MethodResult(PLANAR, (*reasons, *judge(estimates, nominal, config)), estimates, names,
-                        tuple(sources), _details(fit, estimates, names, sources))
+    reasons += check_limits(estimates, nominal, config)
+    return MethodResult(PLANAR, tuple(reasons), estimates, names, tuple(sources),
+                        _details(fit, estimates, names, sources))
 
 
 def refused(reasons: Iterable[Reason], unit: str) -> MethodResult:

@@ -13,9 +13,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import stepping
+from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
-from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.rotations import turn
 from odocal_ros.settings.grades import G
 

@@ -22,9 +22,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import blocks
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.levels import Levels, LevelSides
+from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
-from odocal_ros.estimator.sums import Intervals, Points
 
 # levels of the IMU: white noises, and random walks of its biases
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
@@ -129,7 +129,7 @@ class Factor:
 
 
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
-         residual: Floats | float, weight: Floats | float = 1.0) -> None:
+              residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add priors of single unknowns: columns at keyframes k, a slice or one."""
     i = np.arange(out.g.shape[1])[columns]
     keys = np.atleast_1d(np.arange(len(out.g))[k])
@@ -142,7 +142,7 @@ def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | fl
 
 
 def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
-         residual: Floats) -> None:
+                residual: Floats) -> None:
     """Add a first-order process over all intervals, (K, c): x at the end less decay times x."""
     i = np.arange(out.g.shape[1])[columns]
     all_of = np.broadcast_shapes(np.shape(residual), (len(out.beside), len(i)))

@@ -15,8 +15,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
-from odocal_ros.estimator.leg import convergence, Outside, thinned
+from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
+from odocal_ros.estimator.leg import convergence, ExternalSamples, thinned
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI
@@ -31,7 +31,7 @@ GIVEN_NOISE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Heading(Outside):
+class Heading(ExternalSamples):
     """Yaw of the IMU's x axis in n."""
 
     yaw: Floats         # (m,) rad
@@ -40,7 +40,7 @@ class Heading(Outside):
     error_text: str        # the heading source, as in the settings
 
 
-class HeadingRows(OutsideRows):
+class HeadingRows(ExternalRows):
     """Residuals of a heading (sent less predicted) and their derivatives at one state."""
 
     name, source = 'heading', 'heading_noise'
@@ -73,7 +73,7 @@ class HeadingRows(OutsideRows):
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        sent = problem.outside['heading']
+        sent = problem.external['heading']
         assert isinstance(sent, Heading)
         state, points = point.state, point.points['heading']
         k = points.interval

@@ -2,12 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Variance components, and the effect of a unit of each on the rows of an interval, (S13).
+Variance components of an interval, and the effect of a unit of each on its rows, (S13).
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
 time is a two-point Gauss rule, exact for the polynomials of constant force and speed, except for
 3 % of the small ones of fourth order (position by gyro noise). Columns of one component times the
 root of its level are independent unit noises (docs/method.md).
+
+Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
+constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
+lower limit, even if the residuals of single seconds are smaller.
 """
 
 from dataclasses import dataclass
@@ -18,12 +22,65 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, SPREAD
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
-from odocal_ros.estimator.factors.odometer_filter import stamp_of
+from odocal_ros.estimator.factors.odometer import stamp_of
+from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, P, PHI, V
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import skew
 from odocal_ros.nav.statistics import gaps_in_rhythm
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import SWAY
+
+# m/sqrt(s), lower limit of sideslip if turns determine it. Tuned: the yaw sigma of simulated
+# vehicles, which do not slide, then matches their errors (docs/decisions/0005)
+TURN_SLIDE = 2e-4
+# m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
+# road. Tuned: with a tenth, pitch in yards was 3 sigmas off (docs/decisions/0005)
+HEAVE = 2e-3
+# m/rad, by which the pitch of a body within a second lifts its axle beyond the model, as kerbs
+# shorter than a wheelbase do: initial level and lower limit, judgement; each drive has its own
+PITCHING, PITCHING_LEAST = 0.03, 1e-4
+# m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
+ORDINARY_ROAD = SWAY / np.sqrt(10.0)
+# rad, total turn: one crossroads does not determine sideslip, two do. Judgement
+NO_TURN = np.pi / 2
+SIDEWAYS = ('side', 'side_turn', 'up')
+
+
+def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
+    """Return the total angle of turns faster than TURNING_RATE, without sign, rad."""
+    t = imu.t[imu.key]
+    T = np.diff(t)
+    bias = gyro_bias_at_rest(leg, imu)
+    turn = imu.over_intervals(imu.turn) - (0.0 if bias is None else bias) * T[:, None]
+    up = imu.signals[:, 3:].sum(axis=0)
+    angle = np.abs(turn @ up) / np.linalg.norm(up)
+    path = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    return float(angle[(angle > TURNING_RATE * T) & (path > 0.2 * T)].sum())    # m/s: moving
+
+
+def least_sideslip(angle: float) -> float:
+    """Return the minimum sideways and vertical noise, m/sqrt(s), by the total turn angle, rad."""
+    tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
+    return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
+
+
+def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
+    """Return the reason that reports an assumed road noise, if it affects the result."""
+    least = problem.least['side']
+    if least < 2e-3**2 or all(      # m^2/s, smallest that is reported
+            levels[name] > 1.01 * least for name in SIDEWAYS):
+        return []
+    return [Reason(
+        Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
+        f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to {np.rad2deg(problem.turned):.0f} deg, '
+        f'less than the limit of {np.rad2deg(2 * NO_TURN):.0f} deg. '
+        f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed; the uncertainties of the mounting angles '
+        'depend on it', 'Drive with left and right turns.')]
+
 
 # levels of the road, variance per second as those of IMU, and the axis of the vehicle
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
@@ -123,20 +180,20 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
               np.sqrt(2 * motion.swung))
     road = np.stack([size * ~rest * np.sqrt(spread[:, axis])
                      for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
-    extra = _extra(motion, leg)
+    extra = _given_variances(motion, leg)
     still = rest_noise(speed, rest)
     extra[rest, D] += still
     slow = ~rest & (speed < 1.0)
     extra[slow, D] += still * (1 - speed[slow, None])
     return IntervalNoise(motion, axes, np.sqrt(spread[:, IMU_NOISE]), road, extra,
-                         _given(motion, leg, axes, rest))
+                         _given_noises(motion, leg, axes, rest))
 
 
-def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
+def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
     """
     Return noises of travel from quantised speeds: (K, 18, g).
 
-    Fine steps are rounding noise. Coarse steps are not used along the path; speed_steps.py uses
+    Fine steps are rounding noise. Coarse steps are not used along the path; ``SpeedSteps`` uses
     their transitions. In a turn, a quantisation error that changes within the interval displaces
     the end sideways.
     """
@@ -151,11 +208,11 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
     # of unknown length, in the direction of rolling, without the pitching of the body
     size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
-    turned = motion.turning * motion.T[:, 0]
+    total_turn = motion.turning * motion.T[:, 0]
     most = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
     given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
-    given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]
+    given[:, D, 1] = axes[:, 1] * (most * total_turn / 8)[:, None]
     return given * ~rest[:, None, None]
 
 
@@ -176,7 +233,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     return hard, motion.turning > TURNING_RATE
 
 
-def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
+def _given_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     """Return variances of the motion within gaps and beside the rows: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
@@ -191,7 +248,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     stamp = stamp_of(t, motion.state.constants)
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
     extra[outside, D] = ABSENT_VARIANCE
-    extra[:, D] += _in_gaps(stamp, travel, motion.state.scale)[:, None]
+    extra[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
@@ -200,7 +257,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     return extra
 
 
-def _in_gaps(stamp: Floats, travel: Travel, scale: float) -> Floats:
+def _gap_variances(stamp: Floats, travel: Travel, scale: float) -> Floats:
     """Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2."""
     # a speed that rises and falls within a gap differs from the mean by up to half the gap times
     # its acceleration; an interval contains at most the travel of the whole gap

@@ -17,6 +17,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.axle import Axle, varies_with, WALK_SPEED
+from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -42,7 +43,6 @@ from odocal_ros.estimator.state import (
     V,
     YAW,
 )
-from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, gravity
 from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn

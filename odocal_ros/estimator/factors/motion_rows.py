@@ -12,18 +12,19 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
-from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
-from odocal_ros.estimator.factors.motion import D, Motion, ROWS
-from odocal_ros.estimator.factors.signals import Signals
-from odocal_ros.estimator.factors.slide import (
+from odocal_ros.estimator.factors.interval_noise import (
     HEAVE,
-    least_slide,
+    INTERVAL,
+    interval_noise,
+    least_sideslip,
     PITCHING,
     PITCHING_LEAST,
     SIDEWAYS,
 )
-from odocal_ros.estimator.factors.speed_steps import SpeedSteps
-from odocal_ros.estimator.imu_noise import at_rest, sensor_noise
+from odocal_ros.estimator.factors.motion import D, Motion, ROWS
+from odocal_ros.estimator.factors.odometer import SpeedSteps
+from odocal_ros.estimator.factors.signals import Signals
+from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
 from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
@@ -59,8 +60,8 @@ class MotionRows(Factor):
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
-        imu |= at_rest(problem.imu, problem.leg, problem.still)
-        slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, initial
+        imu |= white_noise_at_rest(problem.imu, problem.leg, problem.still)
+        slide, road = least_sideslip(problem.turned)**2, 0.01**2      # m^2/s, initial
         return (imu | dict.fromkeys(ALONG, road)
                 | dict.fromkeys(SIDEWAYS, max(road, slide)) | {'pitching': PITCHING**2},
                 imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)

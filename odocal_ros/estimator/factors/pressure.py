@@ -15,8 +15,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
-from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
-from odocal_ros.estimator.leg import Outside
+from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
+from odocal_ros.estimator.leg import ExternalSamples
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BARE, BG, GYRO, M, P, PHI, PRESSURE, V
@@ -36,14 +36,14 @@ RATE = 1.0              # Hz: judgement, heights of a vehicle change no faster
 
 
 @dataclass(frozen=True, eq=False)
-class Pressure(Outside):
+class Pressure(ExternalSamples):
     """Heights above an unknown zero, m, and their stated sigmas: (m,)."""
 
     height: Floats
     sigma: Floats
 
 
-class PressureRows(OutsideRows):
+class PressureRows(ExternalRows):
     """Residuals of heights (by pressure less predicted) and their derivatives at one state."""
 
     name, source = 'pressure', 'air_pressure'
@@ -75,7 +75,7 @@ class PressureRows(OutsideRows):
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         leg, state, points = problem.leg, point.state, point.points['pressure']
-        sent, k, tau = problem.outside['pressure'], points.interval, points.tau
+        sent, k, tau = problem.external['pressure'], points.interval, points.tau
         assert isinstance(sent, Pressure)
         C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
         dp = turn(C, points.dp)

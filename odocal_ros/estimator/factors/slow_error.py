@@ -27,7 +27,7 @@ class SlowError(factor.Factor):
 
     Levels slow, slow_up: the spectral density of the driving noise, m^2/s; the stationary variance
     is the density times half the correlation time. The time, s, is a level unless configured.
-    The rows of the fixes contain the error (fixes.py).
+    The rows of the fixes contain the error (gnss.py).
     """
 
     name = 'slow'

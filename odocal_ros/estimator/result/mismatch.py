@@ -8,19 +8,20 @@ IMU noise above its grade has a cause: quantisation, vibration, or the sensor it
 """
 
 from collections.abc import Collection
+from typing import NamedTuple
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import Array, by_row, thinned
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, WANTED
-from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.heading import Heading
 from odocal_ros.estimator.fit import CONVERGENCE, Fit
-from odocal_ros.estimator.imu_noise import of_samples, sensor_noise
-from odocal_ros.estimator.leg import Outside, SmootherLeg
+from odocal_ros.estimator.imu import sample_noise, sensor_noise
+from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.slip import SLIP_VARIANCE
+from odocal_ros.estimator.result.residuals import SLIP_VARIANCE
 from odocal_ros.estimator.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -41,70 +42,115 @@ EXPLAINED = 0.4         # judgement: share of the noise variance that quantisati
 VIBRATION = 3.0
 MOST_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
 FEWEST_ROWS = 100       # judgement: samples at rest, whose median then has a sigma of 15 %
+# judgement: share of outliers among the fixes, and of intervals with slip
+OUTLIER_SHARE_LIMIT = 0.15
+SIDESLIP_LIMIT = 0.2    # m/sqrt(s), judgement: of wheels
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
 UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
 
 
-def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
+def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
-    reasons: list[Reason] = []
-    stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
-    gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
-    # no reasons about an accelerometer that does not exist
-    sensors = {'gyro': 'gyro'} | (
-        {'accel': 'accelerometer'} if problem.leg.has_accelerometer else {})
-    remedy = noise_remedy(problem, level, [
-        name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
-    over_grade = max(level[name] / own[name] for name in sensors)
-    worse = [f'{what} noise is {level[name] / stated[name]:.1f} times'
-             for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
-    worse += [f'{what} bias is {np.max(np.abs(now[0]) / sigma):.1f} times' for (
-        now, sigma, sold), what in zip((
-            (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold),
-            (fit.state.accel_bias, problem.priors.accel_bias, accel_sold)),
-            sensors.values(), strict=False)
-        if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
-    noisy = over_grade > WORSE_THAN_GRADE      # vibration is not white, its spectrum is unknown
-    if worse:
-        reasons.append(Reason(
-            Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
-            f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used'
-            + '. The noise may not be white; uncertainties were increased' * noisy, remedy))
-    reasons += _outliers(fit)
-    odd, move = [], 0.0
-    if fit.creeping or not fit.settled:
-        move = moving(fit)
-        odd.append(f'after {fit.iterations} iterations ' + (
-            f'the estimates still changed by {move:.2g} sigma'
-            if move > CONVERGENCE.nearly else 'the noise levels still changed'))
-    odd_share = 0.15        # share of outliers among the fixes, of intervals with slip: judgement
+    noise = _noise_over_grade(problem, level, config)
+    excess = noise.over_problem_grade
+    # vibration is not white, and its spectrum is unknown
+    noisy = excess > WORSE_THAN_GRADE
+    worse = noise.texts + _biases_over_grade(problem, fit, config)
+    reasons = [Reason(
+        Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
+        f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used'
+        + '. The noise may not be white; uncertainties were increased' * noisy,
+        noise.remedy)] if worse else []
+    reasons += _accelerometer_outlier_reasons(fit)
+    contradictions, step = _convergence_texts(fit)
     if noisy and not worse:
-        odd.append(f'IMU noise is {over_grade:.1f} times that of its grade (limit '
-                   f'{WORSE_THAN_GRADE:g}) and may not be white')
+        contradictions.append(f'IMU noise is {excess:.1f} times that of its grade (limit '
+                              f'{WORSE_THAN_GRADE:g}) and may not be white')
+    only_noise = noisy and not worse and len(contradictions) == 1
+    others = _level_texts(problem, fit, level)
+    contradictions += others
+    reasons += _heading_reasons(problem.external.get('heading'),
+                                float(fit.state.constants[HEADING]))
+    if contradictions:
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(contradictions),
+                              noise.remedy if only_noise and not others else ''))
+    # judgement: the size of a model error is unknown; a fit that has not converged may be off by
+    # several times its last step
+    return max(1.0, 2.0 * bool(contradictions or noisy), 4.0 * step), reasons
+
+
+class _NoiseOverGrade(NamedTuple):
+    """White noise of the IMU relative to its grade."""
+
+    over_problem_grade: float   # largest ratio to the noise of the grade that the fit uses
+    texts: list[str]            # of the noises that exceed the configured grade
+    remedy: str                 # cause and action; '' if no noise exceeds a grade
+
+
+def _noise_over_grade(problem: Problem, level: dict[str, float],
+                      config: Config) -> _NoiseOverGrade:
+    """Return the IMU noise relative to the configured grade and to that of the problem."""
+    stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
+    # no reasons about an accelerometer that does not exist
+    sensors = _sensors(problem)
+    remedy = find_noise_cause(problem, level, [
+        name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
+    return _NoiseOverGrade(
+        max(level[name] / own[name] for name in sensors),
+        [f'{NAMES[name]} noise is {level[name] / stated[name]:.1f} times'
+         for name in sensors if level[name] > WORSE_THAN_GRADE * stated[name]], remedy)
+
+
+def _sensors(problem: Problem) -> list[str]:
+    """Return the sensors of the IMU, as in NAMES."""
+    return ['gyro', 'accel'] if problem.leg.has_accelerometer else ['gyro']
+
+
+def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
+    """Return texts of the biases that exceed the grade."""
+    gyro_sold, accel_sold = turn_on_bias(config.imu)
+    biases = {'gyro': (fit.state.gyro_bias[0], problem.priors.gyro_bias, gyro_sold),
+              'accel': (fit.state.accel_bias[0], problem.priors.accel_bias, accel_sold)}
+    texts = []
+    for name in _sensors(problem):
+        bias, sigma, sold = biases[name]
+        if np.max(np.abs(bias) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE:
+            texts.append(f'{NAMES[name]} bias is {np.max(np.abs(bias) / sigma):.1f} times')
+    return texts
+
+
+def _convergence_texts(fit: Fit) -> tuple[list[str], float]:
+    """Return the text about a fit that has not converged, and its last step, sigmas."""
+    if not fit.creeping and fit.settled:
+        return [], 0.0
+    step = last_step(fit)
+    return [f'after {fit.iterations} iterations ' + (
+        f'the estimates still changed by {step:.2g} sigma'
+        if step > CONVERGENCE.nearly else 'the noise levels still changed')], step
+
+
+def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> list[str]:
+    """Return texts about outliers, slip, sideslip and height errors beyond their limits."""
+    texts = []
     for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
                        ('of the time the wheel slips', fit.spread[:, 0] > SLIP_VARIANCE)):
         share = float(mask.mean())
-        if share > odd_share:
-            odd.append(f'{100 * share:.0f} % {what} (limit {100 * odd_share:.0f} %)')
-    sideslip, most = max(level['side'], level['side_turn']), 0.2    # m/sqrt(s), of wheels
-    if sideslip > most:
-        odd.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit {most:g})')
+        if share > OUTLIER_SHARE_LIMIT:
+            texts.append(f'{100 * share:.0f} % {what} (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)')
+    sideslip = max(level['side'], level['side_turn'])
+    if sideslip > SIDESLIP_LIMIT:
+        texts.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit '
+                     f'{SIDESLIP_LIMIT:g})')
     # m, judgement: receivers err by up to 10 m; with heights in cm slopes of 0.5 % make it 80 m
-    most = max(50.0, 4 * problem.height_sigma)
-    if level['slow_up'] > most:
-        odd.append(f'the time-correlated height error of the fixes is {level["slow_up"]:.0f} m '
-                   f'(limit {most:.0f} m)')
-    reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
-    if odd:
-        alone = noisy and not worse and len(odd) == 1
-        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), remedy if alone else ''))
-    # judgement: the size of a model error is unknown; a fit that has not converged may be off by
-    # several times its last step
-    return max(1.0, 2.0 * bool(odd or noisy), 4.0 * move), reasons
+    limit = max(50.0, 4 * problem.height_sigma)
+    if level['slow_up'] > limit:
+        texts.append(f'the time-correlated height error of the fixes is {level["slow_up"]:.0f} m '
+                     f'(limit {limit:.0f} m)')
+    return texts
 
 
-def _outliers(fit: Fit) -> list[Reason]:
+def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
     """Report an accelerometer whose errors are far beyond its noise level for many seconds."""
     factor = fit.spread[:, ACCEL_NOISE]
     size = np.sqrt(factor * fit.levels['accel'])
@@ -119,13 +165,13 @@ def _outliers(fit: Fit) -> list[Reason]:
         'low-pass filter of the IMU or a higher rate, and mount it firmly.')]
 
 
-def moving(fit: Fit) -> float:
+def last_step(fit: Fit) -> float:
     """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
     step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
     return float(np.abs(step[:WANTED]).max())
 
 
-def _heading(heading: Outside | None, error: float) -> list[Reason]:
+def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reason]:
     """Report an external heading that differs from that of the drive by more than its sigma."""
     if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
@@ -134,7 +180,7 @@ def _heading(heading: Outside | None, error: float) -> list[Reason]:
                    'the heading estimated on this drive; it was down-weighted')]
 
 
-def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
+def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
     """
     Return the cause of a noise that exceeds its grade, with the evidence, and what to do.
 
@@ -143,44 +189,48 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     """
     if not worse:
         return ''
-    coarse = {name: step for name, step in quantised(problem.leg, level).items() if name in worse}
+    coarse = {name: step for name, step in find_quantised(problem.leg, level).items()
+              if name in worse}
     vibrating: dict[str, str] = {}
-    own: list[str] = []
+    own_noise: list[str] = []
     unknown: list[str] = []
-    moving, rest = at_rest_and_moving(problem)
+    in_motion, at_rest = sample_noise_by_motion(problem)
     for name in (name for name in worse if name not in coarse):
-        still, vary = rest.get(name, 0.0), moving.get(name, 0.0)
-        if still and vary > VIBRATION * still:
-            vibrating[name] = (f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
+        rest, motion = at_rest.get(name, 0.0), in_motion.get(name, 0.0)
+        if rest and motion > VIBRATION * rest:
+            vibrating[name] = (f'{NAMES[name]} samples vary {motion / rest:.0f} times as much '
                                'in motion as at rest')
-        elif not still and vary > VIBRATION * level[name]:
-            vibrating[name] = (f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
+        elif not rest and motion > VIBRATION * level[name]:
+            vibrating[name] = (f'{NAMES[name]} samples vary {motion / level[name]:.0f} times as '
                                'much as their means over seconds')
         else:       # less at rest than its integral
-            (own if VIBRATION * still > level[name] else unknown).append(name)
-    said = []
-
-    def cause(names: Collection[str]) -> str:
-        """Return the subject of a cause, with the sensors if others have another cause."""
-        of = ' and '.join(NAMES[name] for name in names)
-        return 'The cause' + f' of the {of} noise' * (len(names) < len(worse))
+            (own_noise if VIBRATION * rest > level[name] else unknown).append(name)
+    texts = []
     if coarse:
-        said.append(f'{cause(coarse)} is quantisation: {_steps_in_words(coarse)}. Set a finer '
-                    'resolution or a smaller range in the IMU or its driver, if there is one.')
+        texts.append(f'{_cause_of(coarse, worse)} is quantisation: {_steps_in_words(coarse)}. Set '
+                     'a finer resolution or a smaller range in the IMU or its driver, if there is '
+                     'one.')
     if vibrating:
-        said.append(f'{cause(vibrating)} is vibration: {", ".join(vibrating.values())}. Mount '
-                    'the IMU firmly and away from the engine.')
-    said += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
-             f'this is its normal noise, {_setting(name, level)}' for name in own]
-    said += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
-        'single samples vary less than their means over seconds. ' if rest else
+        texts.append(f'{_cause_of(vibrating, worse)} is vibration: '
+                     f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from the '
+                     'engine.')
+    texts += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
+              f'this is its normal noise, {_setting(name, level)}' for name in own_noise]
+    texts += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
+        'single samples vary less than their means over seconds. ' if at_rest else
         'there is no standstill to compare with. ')
         + f'Mount the IMU firmly. If this is its normal noise, {_setting(name, level)}'
         for name in unknown]
-    return ' '.join(said)
+    return ' '.join(texts)
 
 
-def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+def _cause_of(names: Collection[str], worse: Collection[str]) -> str:
+    """Return the subject of a cause, with the sensors if others have another cause."""
+    sensors = ' and '.join(NAMES[name] for name in names)
+    return 'The cause' + f' of the {sensors} noise' * (len(names) < len(worse))
+
+
+def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Return the white noise of single samples in motion and at rest; {}: too few samples."""
     leg, keys = problem.leg, problem.imu.t[problem.imu.key]
     still = problem.still[:-1] & problem.still[1:]
@@ -192,31 +242,31 @@ def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, fl
         return np.where(inside, still[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
     parts = by_row(part, leg.t_imu)
-    moving, rest = (of_samples(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
+    in_motion, at_rest = (sample_noise(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
         np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1)))
-    return moving, rest
+    return in_motion, at_rest
 
 
 def _setting(name: str, level: dict[str, float]) -> str:
     return f'set imu.{name}_noise to {level[name]:.2g} ({UNITS[name]}).'
 
 
-def _steps_in_words(steps: dict[str, float]) -> str:
+def _steps_in_words(quantisation_steps: dict[str, float]) -> str:
     return ' and '.join(
         f'the {NAMES[name]} has steps of ' + (
             f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
-        for name, step in steps.items())
+        for name, step in quantisation_steps.items())
 
 
-def steps(leg: SmootherLeg) -> dict[str, float]:
+def quantisation_steps(leg: SmootherLeg) -> dict[str, float]:
     """Return the quantisation steps of gyro, rad/s, and accelerometer, m/s^2; 0: none."""
     return {'gyro': _step(leg.w_b), 'accel': _step(leg.f_b)}
 
 
-def quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
+def find_quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
     """Return the steps of sensors whose noise they explain; level : white noise, as a root."""
     interval = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
-    return {name: step for name, step in steps(leg).items()
+    return {name: step for name, step in quantisation_steps(leg).items()
             if step**2 / 12 * interval > EXPLAINED * level[name]**2}
 
 

@@ -1,41 +1,36 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics of a fit: a scale that varies, constants far off their priors, the model's floor."""
+"""
+Diagnostics of a fit: noise, outliers, clocks and filters, a scale that varies, lever arms.
 
-from typing import Any
+Also the errors of the result that the fit does not contain, and the model's floor.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from odocal_ros.calib.budget import HEIGHT_UNKNOWN
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
-from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import imperfect_sigmas
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.filters import (
-    by_map_drift,
-    clock_reasons,
-    follows_odometer,
-    lag_reasons,
-    odometer_reasons,
-)
 from odocal_ros.nav.earth import A
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_of
-from odocal_ros.settings.levels import FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS
+from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.levels import FAULT_SIGMAS, FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS
 
 CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
 AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
-AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
 ANOTHER_IMU = 4.0       # statistical: of the sigma of the grade, for scales and axes
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
@@ -58,81 +53,48 @@ SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the 
           'keep the setting.')
 
 
-def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
-    """Return additional figures for calibration.json; grade : None without an accelerometer."""
-    sigma = np.sqrt(np.diag(covariance))
-    # scale_by_speed: the slope at FAST
-    out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
-                 for name, i, unit in (('scale_by_speed', layout.BY_SPEED, '1/(m/s)'),
-                                       ('scale_by_time', layout.BY_TIME, '1/s'))}
-    if grade is not None:
-        for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
-            out[f'{name}_mounting_angle_housing_sigma'] = _figure(
-                _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
-    next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
-    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[layout.LN_K], next_drive), '1')
-    return out
-
-
-def _figure(value: float, unit: str) -> dict[str, Any]:
-    return {'value': float(value), 'sigma': None, 'unit': unit}
-
-
-def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
-    """Return the sigma of an angle relative to the housing, from that to the sensor axes."""
-    # the angle between them is one of two axis errors of equal size whose sum is ``found``
-    if not misalignment:
-        return sigma
-    posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
-    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (found / 2)**2)
-    return out
-
-
-def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
-    """Return the pitch relative to the accelerometer's level: third pitch of method_real."""
-    k = len(near) // 2
-    n = fit.solved.step.shape[1]
-    at = np.array([2 * n + layout.PITCH, layout.BA.start])
-    C = near[k][np.ix_(at, at)]
-    row = np.array([1.0, -1 / G])
-    return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
-            'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
-
-
-def wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
+def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     """Return the sigma of ln K by positions in a local frame that contain the wheels."""
-    if not problem.leg.origin.local or not follows_odometer(c[layout.FIX_BY_MOTION],
-                                                            sigma[layout.FIX_BY_MOTION]):
+    if not problem.leg.origin.local or not contains_odometer(c[layout.FIX_BY_MOTION],
+                                                             sigma[layout.FIX_BY_MOTION]):
         return 0.0
-    return by_map_drift(c[layout.FIX_BY_MOTION], c[layout.FIX_TIME],
-                        problem.leg.t_stop - problem.leg.t_begin)
+    return map_drift_sigma(c[layout.FIX_BY_MOTION], c[layout.FIX_TIME],
+                           problem.leg.t_stop - problem.leg.t_begin)
 
 
-def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str, float]]:
-    """Return errors beside those of the fit: the index of a constant, a source and its sigma."""
-    by_map = wheels_in_map(problem, fit.state.constants, sigma)
+class ErrorBeyondFit(NamedTuple):
+    """An error of a constant that the fit does not contain."""
+
+    constant: int     # index in CONSTANTS
+    source: str       # name in the budget
+    sigma: float
+
+
+def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[ErrorBeyondFit]:
+    """Return the errors that the fit does not contain; sigma : (M,) of the constants."""
+    by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
     leg = problem.leg
     by_height = 0.0 if leg.origin.local or not np.isnan(leg.fixes_n[:, 2]).all() \
         else HEIGHT_UNKNOWN / A
     # which of the two values a later drive has is unknown
-    moved = [(step.constant, 'change_of_mounting', abs(step.size)) for step in fit.steps
-             if step.constant != layout.LN_K and step.certain]
-    of_scale = [(layout.LN_K, name, own) for name, own in (
+    of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
+                 for step in fit.steps if step.constant != layout.LN_K and step.is_certain]
+    of_scale = [ErrorBeyondFit(layout.LN_K, name, own) for name, own in (
         ('wheels_in_positions', by_map), ('height', by_height)) if own]
-    return of_scale + moved
+    return of_scale + of_angles
 
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             config: Config) -> list[Reason]:
     """Return reasons; sigma : (M,) of the constants; ratio : (M,) posterior to prior sigma."""
     c = fit.state.constants
-    said = [*_noisy(problem, fit.levels), *_outlying(fit),
+    said = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(fit),
             *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
             *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
-                              c[layout.FIX_TIME], wheels_in_map(problem, c, sigma)),
+                              c[layout.FIX_TIME], sigma_by_wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
-            *_varies(fit, sigma), *_changes(fit), *_bias_steps(fit)]
+            *_scale_variation_reasons(fit, sigma), *_change_reasons(fit), *_bias_step_reasons(fit)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
@@ -151,10 +113,10 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
                            f'is {100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
                            'accounted for'))
-    return said + _arms(c, sigma, ratio, config)
+    return said + _lever_arm_reasons(c, sigma, ratio, config)
 
 
-def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
+def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     """Return the reason for fix errors, white and correlated, above the stated ones."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
@@ -166,7 +128,7 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
                    OF_POSES if problem.leg.origin.local else '')]
 
 
-def _outlying(fit: Fit) -> list[Reason]:
+def _outlier_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for fixes that are outliers."""
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
@@ -178,7 +140,7 @@ def _outlying(fit: Fit) -> list[Reason]:
                    f'outliers, up to {far:.1f} m from the track; they were down-weighted')]
 
 
-def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
+def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
@@ -194,7 +156,7 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
 
 
-def _bias_steps(fit: Fit) -> list[Reason]:
+def _bias_step_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a bias that steps: the largest step of each sensor."""
     said = []
     for name, bias, column, unit, per in (
@@ -211,11 +173,11 @@ def _bias_steps(fit: Fit) -> list[Reason]:
             ] if said else []
 
 
-def _changes(fit: Fit) -> list[Reason]:
+def _change_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a scale or mounting that changes in the leg."""
     said = []
     for step in fit.steps:
-        if step.certain and abs(step.size) > LEAST_CHANGE:
+        if step.is_certain and abs(step.size) > LEAST_CHANGE:
             what = layout.CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \
                 f'{np.rad2deg(step.size):+z.2f} deg'
@@ -224,7 +186,7 @@ def _changes(fit: Fit) -> list[Reason]:
     return [Reason(Code.CHANGE_IN_LEG, '; '.join(said))] if said else []
 
 
-def arms_off(c: Floats, sigma: Floats) -> set[int]:
+def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
     """Return the axes of lever arms that the drive puts far from their setting, by index."""
     axes = (*range(layout.ODO_ARM.start, layout.ODO_ARM.stop - 1),      # not z of the odometer
             *range(layout.GNSS_ARM.start, layout.GNSS_ARM.stop))
@@ -232,10 +194,10 @@ def arms_off(c: Floats, sigma: Floats) -> set[int]:
     return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], worth)}
 
 
-def _arms(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
+def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
     said, do = [], []
-    off = arms_off(c, sigma)
+    off = deviating_lever_arms(c, sigma)
     for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
                              ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
         for i, axis, value, most in zip(range(where.start, where.stop), 'xyz', arm, VEHICLE,
@@ -257,3 +219,61 @@ def _arms(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reaso
                 do.append(f'Measure {name} {axis} and set it.')
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
         [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []
+
+
+def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
+    """Return FIXES_SMOOTHED if the filter constant of the receiver, s^2, is significant."""
+    worth = 0.1     # s: the age of a fix at 10 Hz is up to this
+    if abs(square) <= max(REMARK_SIGMAS * sigma, worth**2):
+        return ()
+    what, time = ('averages its fixes', np.sqrt(square)) if square > 0 else (
+        'filters position and velocity', np.sqrt(-square / 2))
+    return (Reason(Code.FIXES_SMOOTHED, f'the receiver {what} with a time constant of about '
+                   f'{time:.2f} s; accounted for'),)
+
+
+def contains_odometer(share: float, sigma: float) -> bool:
+    """Return True if the receiver has an odometer of its own, of this error."""
+    worth = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
+    return bool(abs(share) > max(FAULT_SIGMAS * sigma, worth))
+
+
+def odometer_reasons(share: float, sigma: float, log_time: float,
+                     by_map: float) -> tuple[Reason, ...]:
+    """Return FIXES_FOLLOW_ODOMETER if significant; by_map: sigma of ln K, 0 without a map."""
+    if not contains_odometer(share, sigma):
+        return ()
+    return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
+                   f'of {100 * share:+z.2f} % ± {100 * sigma:.2f} % (time constant '
+                   f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
+                   'accounted for' + (f', with an uncertainty of the scale of {100 * by_map:.2g} %'
+                                      if by_map else '')),)
+
+
+def map_drift_sigma(share: float, log_time: float, duration: float) -> float:
+    """
+    Return the sigma of ln K by the drift of a map that is filtered together with the wheels.
+
+    This drift is not modelled. Within a time constant of the filter it cannot be distinguished
+    from the wheel error, which is therefore averaged over only duration / time constant samples.
+    """
+    return float(abs(share) * np.sqrt(np.exp(log_time) / duration))
+
+
+def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
+    """Return SPEED_FILTERED if the filter constant of the odometer, s^2, is significant."""
+    worth = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
+    if square <= max(REMARK_SIGMAS * sigma, worth**2):
+        return ()
+    return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
+                   f'constant of about {np.sqrt(square):.2f} s; accounted for'),)
+
+
+def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
+    """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
+    worth = 0.01        # s: the samples of most odometers are farther apart
+    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
+        return ()
+    return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '
+                   f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '
+                   f'{abs(rate) * duration:.3f} s in this leg; accounted for'),)

@@ -4,12 +4,12 @@
 """Estimates of single wheels of one or several legs: factors, track width, reasons."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
-from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
 from odocal_ros.settings import levels
@@ -20,6 +20,23 @@ Found = tuple[dict[str, Estimate], list[Reason]]
 FEWEST_ALIKE = 3        # definition: with fewer, the wheel that differs is unknown
 # judgement: difference of new tyres of one size; a third less pressure changes half of that
 DEPARTS = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Wheel:
+    """A wheel relative to the mean."""
+
+    ratio: float             # K_i / K
+    ratio_sigma: float       # relative
+    y: float                 # m to the left of the middle of all wheels
+    y_sigma: float           # m
+    walk: tuple[float, ...]  # m/sqrt(s), relative to the mean: even, hard, in turns
+    x: float | None = None   # m, of a steered wheel ahead of the mean; None: it does not steer
+    x_sigma: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:

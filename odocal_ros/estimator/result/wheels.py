@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Factor and position of each wheel relative to the mean, docs/method.md (W1) to (W4).
+Factor and position of each wheel relative to the mean, docs/method.md (W1) to (W7).
 
 The scale factor of the fit applies to the mean reading of the wheels that do not steer. The
 reading of a wheel differs from the mean by the turn times the wheel's distance from the middle,
@@ -14,24 +14,29 @@ s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's
 the left, x_i its distance ahead. The turn is from the attitudes of the fit; each wheel has one
 line. The positions include the effect of load in turns: the outer tyre has a higher load and a
 smaller rolling radius.
+
+The line is fitted to increments with a random walk and reading errors. The reading error at a node
+is in the increment that ends there and, with opposite sign, in the one that begins there: the
+covariance of the increments is tridiagonal, and reading errors do not accumulate.
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import by_row
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.odometer_filter import as_rolled, stamp_of
+from odocal_ros.estimator.factors.odometer import as_rolled, stamp_of
+from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.wheel_noise import fit_line, Increments, Line
+from odocal_ros.estimator.result.wheel_result import Wheel
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import rotvec
 from odocal_ros.screening.axles import STEER_GRID, steering_path
@@ -49,20 +54,27 @@ WHEELBASE = 5.0         # m, 1 sigma of the distance of a steered wheel ahead. P
 
 
 @dataclass(frozen=True, eq=False)
-class Wheel:
-    """A wheel relative to the mean."""
+class Increments:
+    """The observations y = X x + errors, in m."""
 
-    ratio: float             # K_i / K
-    ratio_sigma: float       # relative
-    y: float                 # m to the left of the middle of all wheels
-    y_sigma: float           # m
-    walk: tuple[float, ...]  # m/sqrt(s), relative to the mean: even, hard, in turns
-    x: float | None = None   # m, of a steered wheel ahead of the mean; None: it does not steer
-    x_sigma: float | None = None
+    y: Floats       # (k,)
+    X: Floats       # (k, p)
+    prior: Floats   # (p,) sigmas of x about ``centre``, inf: none
+    centre: Floats  # (p,)
+    reading: float  # m^2, variance of the error at a node
+    share: Floats   # (k,) variance of the walk in each increment at a level of 1
+    kind: Ints      # (k,) index of its level
+    walk: Floats    # m^2, first levels
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the entry of calibration.json."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """The line found."""
+
+    x: Floats           # (p,)
+    covariance: Floats  # (p, p)
+    levels: Floats      # m^2, of the walk
+    gain: Floats        # (p, k) derivatives of x by the increments
 
 
 def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
@@ -208,3 +220,70 @@ def _wheel(line: Line, moved: Floats, of_fit: Floats) -> Wheel:
     x = float(np.sqrt(max(line.x[-1], 0.0) / a))
     sigma = float(np.sqrt(covariance[2, 2])) / (2 * a * max(x, 0.1))
     return replace(whole, x=x, x_sigma=float(np.hypot(sigma, PLACE_SHARE * x)))
+
+
+# prior sigmas of the logarithm of a level: all walks together may differ by a factor of a thousand
+# from their first value, each from their mean by three; reading errors are those of rounding.
+# Judgement
+WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
+# judgement: iterations of the search for outliers, until variances change by less than a tenth;
+# each removes nine tenths of their effect on a level
+TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
+
+
+def fit_line(seen: Increments) -> Line:
+    """Return the line at the maximum of the restricted likelihood, with down-weighted outliers."""
+    from scipy.optimize import minimize
+    spread = np.ones(len(seen.y))
+    log_levels = np.zeros(len(seen.walk) + 1)
+    for _ in range(TAIL_ROUNDS):
+        simplex = log_levels + np.concatenate([np.zeros((1, len(log_levels))), -2 * np.eye(
+            len(log_levels))])
+        found = minimize(_minus_log_likelihood, log_levels, args=(seen, spread),
+                         method='Nelder-Mead', options={
+                             'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
+        log_levels = found.x
+        x, covariance, _, banded, root = _solved(log_levels, seen, spread)
+        off = _left_out(banded, root, seen.y - seen.X @ x)
+        before, spread = spread, np.maximum(spread * (off / TAIL_SIGMAS)**2, 1.0)
+        if np.allclose(spread, before, rtol=TAIL_SETTLED):
+            break
+    gain = covariance @ cho_solve_banded((root, False), seen.X, check_finite=False).T
+    return Line(x, covariance, seen.walk * np.exp(log_levels[:-1]), gain)
+
+
+def _solved(log_levels: Floats, seen: Increments,
+            spread: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
+    """Return x, its covariance, -2 log likelihood, increments' covariance and root (banded)."""
+    reading = seen.reading * np.exp(log_levels[-1])
+    walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.share * spread
+    banded = np.empty((2, len(seen.y)))
+    banded[0], banded[1] = -reading, walk + 2 * reading
+    root = cholesky_banded(banded, check_finite=False)
+    both = np.column_stack([seen.X, seen.y - seen.X @ seen.centre])
+    inverse = both.T @ cho_solve_banded((root, False), both, check_finite=False)
+    information = inverse[:-1, :-1] + np.diag(1 / seen.prior**2)
+    covariance = np.linalg.inv(information)
+    step = covariance @ inverse[:-1, -1]
+    cost = (2 * np.log(root[1]).sum() + np.linalg.slogdet(information)[1] + inverse[-1, -1]
+            - step @ information @ step)
+    return seen.centre + step, covariance, float(cost), banded, root
+
+
+def _minus_log_likelihood(log_levels: Floats, seen: Increments, spread: Floats) -> float:
+    walk, reading = log_levels[:-1], log_levels[-1]
+    held = (walk.mean()**2 / WALK_SPREAD**2 + ((walk - walk.mean())**2).sum() / APART_SPREAD**2
+            + reading**2 / READING_SPREAD**2)
+    return (_solved(log_levels, seen, spread)[2] + float(held)) / 2
+
+
+def _left_out(banded: Floats, root: Floats, residual: Floats) -> Floats:
+    """Return leave-one-out residuals of the increments, in sigmas: (k,)."""
+    weighted = cho_solve_banded((root, False), residual, check_finite=False)
+    before, after = banded[1].copy(), banded[1].copy()
+    square, k = banded[0, -1]**2, len(residual)
+    for i in range(1, k):
+        before[i] -= square / before[i - 1]
+        after[k - 1 - i] -= square / after[k - i]
+    off: Floats = weighted * np.sqrt(before + after - banded[1])
+    return off

@@ -2,21 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-IMU samples of a leg, summed once to steps of a tenth of a second.
+IMU samples of a leg: sums over steps of a tenth of a second, and the noise of the samples.
 
 A step holds the rotation vector and the single and double integral of the specific force in the
 axes at its begin, coning and sculling at the sample rate included (two-speed strapdown, Savage
 1998). The iterations of the fit integrate steps: the errors they estimate are constant within a
-step.
+step. White noise and random walks are those of the grade, of the standstills and of the samples.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import by_row, by_step, median
 from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_conjugate,
@@ -25,21 +27,23 @@ from odocal_ros.nav.rotations import (
     rotvec_from_quat,
 )
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.screening.leg_kind import TILT_SIGMA
+from odocal_ros.settings.grades import G, Grade
 
 # s. Tuned: with 0.02 s the results of six drives differ by 0.04 sigma rms, at most 0.19, and a fit
 # takes 1.6 times the time (docs/decisions/0020)
 STEP = 0.1
 # judgement: samples whose arrays stay in the cache; keyframes, which limits the memory
-AT_A_TIME, KEYS_AT_A_TIME = 8192, 64
+SAMPLES_IN_CACHE, KEYFRAMES_IN_CACHE = 8192, 64
 
 
-def rows_of(leg: SmootherLeg) -> tuple[int, Floats]:
+def imu_rows(leg: SmootherLeg) -> tuple[int, Floats]:
     """Return the first sample of a leg and the times from it to the last, s."""
     first = int(np.searchsorted(leg.t_imu, leg.t_begin))
     return first, leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
 
 
-def nearest(t: Floats, times: Floats) -> Ints:
+def nearest_samples(t: Floats, times: Floats) -> Ints:
     """Return the indices of the samples at t that are nearest to some times."""
     k: Ints = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
     k -= times - t[k - 1] < t[k] - times
@@ -48,9 +52,9 @@ def nearest(t: Floats, times: Floats) -> Ints:
 
 def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
     """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
-    first, t = rows_of(leg)
+    first, t = imu_rows(leg)
     grid = np.linspace(t[0], t[-1], max(1, round((t[-1] - t[0]) / spacing)) + 1)
-    return first + np.unique(nearest(t, grid))
+    return first + np.unique(nearest_samples(t, grid))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +89,11 @@ class ImuSteps(Steps):
     def between(cls, leg: SmootherLeg, key: Ints) -> 'ImuSteps':
         """Return the steps of a leg from its first to its last keyframe: (K + 1,) samples."""
         edges = np.append(np.concatenate([
-            _edges(leg.t_imu, key[k:k + KEYS_AT_A_TIME + 1])[:-1]
-            for k in range(0, len(key) - 1, KEYS_AT_A_TIME)]), key[-1])
+            _edges(leg.t_imu, key[k:k + KEYFRAMES_IN_CACHE + 1])[:-1]
+            for k in range(0, len(key) - 1, KEYFRAMES_IN_CACHE)]), key[-1])
         parts, first = [], 0
         while first < len(edges) - 1:
-            last = int(np.searchsorted(edges, edges[first] + AT_A_TIME, side='right')) - 1
+            last = int(np.searchsorted(edges, edges[first] + SAMPLES_IN_CACHE, side='right')) - 1
             last = min(max(last, first + 1), len(edges) - 1)
             parts.append(_summed(leg, edges[first:last + 1]))
             first = last
@@ -151,3 +155,73 @@ def _summed(leg: SmootherLeg, edges: Ints) -> Steps:
     mean = np.add.reduceat((turned + turn / 2) * dt, first) / np.add.reduceat(dt, first)
     return Steps(rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
                  np.maximum.reduceat(dt[:, 0], first))
+
+
+# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
+# seconds, and slopes of a few per cent over a minute. Judgement
+NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
+CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
+CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
+
+
+def sensor_noise(grade: Grade) -> dict[str, float]:
+    """Return sigmas of white noise and random walks by the grade of the IMU, SI."""
+    stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
+              'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
+    return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
+
+
+def without_accelerometer(grade: Grade) -> Grade:
+    """Return the grade of an IMU without an accelerometer: its specific force is gravity."""
+    return replace(grade, accel_noise=NO_ACCEL_NOISE, accel_bias=TILT_SIGMA * G,
+                   accel_bias_walk=NO_ACCEL_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
+
+
+def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
+    """Return white noise levels of gyro and accelerometer from standstills; lower limits."""
+    turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
+    T = np.diff(imu.t[imu.key])[:, None]
+    inside = still[:-1] & still[1:]
+    rest = np.flatnonzero(inside)
+    runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    # second differences contain no bias and no drift; their variance is six times as large
+    squares = [[(np.diff((x / T)[run], n=2, axis=0)**2).sum(axis=1) * T[run][1:-1, 0] / 6
+                for x in (turn, force)] for run in runs if len(run) > 2]
+    both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
+    if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
+        return {}
+    # people may get in and out, or load, during most of a stop: use the quarter with least motion
+    found = {name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
+                       LEAST.imu[name]**2)
+             for name, x in zip(('gyro', 'accel'), both, strict=True)}
+    return found if leg.has_accelerometer else {'gyro': found['gyro']}
+
+
+def sample_noise(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
+    """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
+    def jumps(x: Floats) -> Floats:
+        out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
+        return out
+
+    usual = median(by_step(np.diff, leg.t_imu[rows]))
+    return {name: float(np.sqrt(median(by_step(jumps, x[rows])) / CHI2_3_MEDIAN / 2 * usual))
+            for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}
+
+
+def is_standing(leg: SmootherLeg, t: Floats) -> Bools:
+    """Return a mask of times in a standstill, half a second from its ends: (N,) bool."""
+    def within(t: Floats) -> Bools:
+        inside = np.zeros(len(t), bool)
+        for begin, end in leg.standstills:
+            inside |= (t >= begin + 0.5) & (t <= end - 0.5)
+        return inside
+    return by_row(within, t)
+
+
+def gyro_bias_at_rest(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:
+    """Return the mean turn rate at standstills between the keyframes, (3,); None without any."""
+    first, last = imu.key[[0, -1]]
+    inside = is_standing(leg, imu.t[first:last + 1])
+    still = inside[:-1] & inside[1:]
+    length = float(np.diff(imu.t[first:last + 1])[still].sum())
+    return None if length < 1.0 else imu.turn[first:last][still].sum(axis=0) / length

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparison of values with their limits, for each leg and the combination, and causes."""
+"""Limits of the sigmas and of the deviation from nominal values, and likely causes of changes."""
 
 from collections.abc import Mapping
 
@@ -29,7 +29,7 @@ TYRES = 'tyre pressure, wear, load or another tyre'
 OTHER = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
 
-def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
+def _probable_unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return the probable unit of a scale this far from its nominal, and the setting for it."""
     for known, what in MISTAKEN.get(unit, {}).items():
         if abs(ratio / known - 1) < 0.04:      # tolerance for tyres: the ratios are farther apart
@@ -47,8 +47,8 @@ def speed_unit(scale: float) -> tuple[float, str]:
     return (factor, SPEED_UNITS[factor]) if abs(scale / factor - 1) < near_unit else (scale, '')
 
 
-def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
-          config: Config) -> tuple[Reason, ...]:
+def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
+                 config: Config) -> tuple[Reason, ...]:
     """Return the reasons by limits of the sigmas and of the deviation from nominal values."""
     reasons = []
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
@@ -61,9 +61,9 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
                                   f'limit is {100 * SCALE_LIMIT:g} %'))
         elif relative > limit:
             # in the unit of the uncertainty
-            shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else share(limit)
+            shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else format_relative(limit)
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
-                                  f'{share(relative)}; the limit is {shown}'))
+                                  f'{format_relative(relative)}; the limit is {shown}'))
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
@@ -78,13 +78,13 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
     off = scale / nominal - 1 if nominal else 0.0
     if abs(off) <= config.odometer.max_scale_deviation:
         return []
-    why, do = _unit(off + 1, unit, nominal)
+    why, do = _probable_unit(off + 1, unit, nominal)
     of = '' if unit == '1' else f' {unit}'
     return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+z.1f} % '
                    f'from the nominal value {nominal:.6g}{why}', do)]
 
 
-def share(relative: float, sign: str = '') -> str:
+def format_relative(relative: float, sign: str = '') -> str:
     """Return a relative value as text: in ppm, or in per cent if at least 1 %."""
     return f'{100 * relative:{sign}.1f} %' if abs(relative) >= PER_CENT_FROM else (
         f'{1e6 * relative:{sign}.0f} ppm')
@@ -95,7 +95,7 @@ def cause_of_change(relative: float) -> str:
     return OTHER if abs(relative) > ANOTHER_SCALE else TYRES
 
 
-def change_in_words(relative: float) -> str:
+def format_change(relative: float) -> str:
     """Return a relative change as text, in ppm or per cent."""
     if abs(relative) < 1e-3:
         return f'{1e6 * relative:+z.0f} ppm'

@@ -2,23 +2,130 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The factor of a coarse speed, docs/method.md (S14): its value is known at a change by a step.
+The odometer's readings: delay and filter, rounding error, and the steps of a coarse speed.
 
+``TravelError`` is the factor of the rounding error at each keyframe, docs/method.md (S10).
+``SpeedSteps`` is the factor of a coarse speed, (S14): its value is known at a change by a step.
 The integral of such a speed is not used along the path (interval_noise.py): while the value does
 not change, its error is up to a step.
 """
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
+from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.axle import Axle, varies_with
-from odocal_ros.estimator.factors.factor import LinearisationPoint
+from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.coarse_speed import SpeedInstants
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import turn
+
+# s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s, the
+# rounding error of a counter adds twice the error of a reading
+REACH = 0.5
+# definition: differences over it
+STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
+BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
+
+
+def stamp_of(t: Floats, constants: Floats) -> Floats:
+    """Return the stamps, s, of readings of the wheel at some times; the delay is that at 0."""
+    out: Floats = t + constants[ODO_DELAY] + constants[ODO_CLOCK] * t
+    return out
+
+
+def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
+    """
+    Return the travel of the wheel as a function of time, scale units.
+
+    A filtered reading is a weighted mean of past ones. Its weights have a mean delay D and a
+    variance T^2, which is the square of the time constant for a first-order filter. The travel of
+    the wheel is x(t + D) - T^2 x''(t + D) / 2 + T^3 x'''(t + D) / 3, with the third moment of such
+    a filter.
+
+    travel : of the readings.   constants : (M,), with D, s, and T^2, s^2.
+    """
+    square = float(constants[ODO_LAG2])
+    weights = -square / 2 * BY_SQUARE + max(square, 0.0)**1.5 / 3 * BY_CUBE
+
+    def rolled(t: Floats) -> Floats:
+        at = stamp_of(t, constants)
+        # at the ends the derivative of the first and last second: there are no readings beyond
+        middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
+        out: Floats = travel.at(at) + sum(
+            weight * travel.at(middle + step)
+            for weight, step in zip(weights.tolist(), STENCIL.tolist(), strict=True))
+        return out
+    return rolled
+
+
+class TravelError(Factor):
+    """Rows of the travel error at each keyframe, with one level: scale units."""
+
+    name = 'travel'
+
+    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+        self.state, self.still = point.state, problem.still
+        self.least = problem.least['travel']
+        self.weight = once_a_rest(problem.still)
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        leg = problem.leg
+        least = LEAST.travel / leg.rough_scale
+        level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
+        return level, level
+
+    def weigh(self, levels: Levels) -> None:
+        """Compute the variance, scale units squared."""
+        self.variance = max(self.least, levels['travel'])
+        self.log_R = self.weight.sum() * np.log(self.variance)
+
+    def add(self, out: Normal) -> None:
+        add_prior(out, slice(None), slice(E, E + 1), self.variance,
+                  self.state.travel_error[:, None], self.weight[:, None])
+
+    def cost(self) -> float:
+        out: float = (self.weight * self.state.travel_error**2).sum() / self.variance
+        return out
+
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
+        e, moving = self.variance, ~self.still
+        spread = marginals.variances()[:, E]
+        x = self.state.travel_error[moving]
+        return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
+
+    def add_levels(self, out: LevelSides) -> None:
+        i, = out.at((self.name,))
+        g = self.weight * self.state.travel_error / self.variance
+        out.chain[:, E, i] += g
+        out.square[i, i] += g @ self.state.travel_error
+
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
+        cross = self.all_with_wanted(marginals)
+        root = np.sqrt(self.weight / self.variance)
+        travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
+        yield 'quantisation', travel[:, :, None]
+
+
+def once_a_rest(still: Bools) -> Floats:
+    """Return the weights of rounding errors, (N,): 1 for all keyframes of a standstill."""
+    starts = np.flatnonzero(np.diff(still, prepend=False) & still)
+    stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
+    weight = np.ones(len(still))
+    for first, last in zip(starts, stops, strict=True):
+        weight[first:last] = 1 / (last - first)
+    return weight
+
 
 # definition: Gauss and Laguerre's nodes, less the mean delay, and weights of a first-order filter
 FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
@@ -98,7 +205,7 @@ class SpeedSteps(PointRows):
             - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by)
         J[:, layout.BG] = by_gyro[:, :3] + by_rate
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
-                                       * self.points.measured[:, layout.GYRO_SIGNAL])
+                                              * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.varied
         # by the published value: the speed is anywhere in its step, so only the speed has an error
         c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.said, K * self.instants.side

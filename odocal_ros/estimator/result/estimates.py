@@ -1,0 +1,163 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Estimates of the constants: values that the drive determines, refusals, and their reasons."""
+
+from collections.abc import Collection, Iterable
+
+import numpy as np
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.mounting import FAR_YAW
+from odocal_ros.calib.result import Estimate, MethodResult, unknown_values
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.result.remarks import IMU_SCALES
+from odocal_ros.estimator.result.wheel_result import unknown_wheels
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import wrap
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
+from odocal_ros.settings.nominal import nominal_yaw
+
+AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
+# rad from nominal, judgement: more than any mounting
+REVERSED_YAW = np.deg2rad(135.0)
+UNITS = dict.fromkeys(layout.CONSTANTS, 'm') | {
+    'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
+    'gnss_delay': 's'}
+# estimated if the drive determines them: lever arms and delays
+OPTIONAL = range(layout.ODO_ARM.start, layout.HEADING)
+
+
+def refused_result(reasons: Iterable[Reason], scale_unit: str,
+                   wheels: Iterable[Travel] = ()) -> MethodResult:
+    """Return the result of a leg that the method refuses: every value unknown."""
+    found = without_values(scale_unit) | unknown_wheels((one.name for one in wheels), scale_unit)
+    return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
+
+
+def implausible_imu_reasons(fit: Fit) -> list[Reason]:
+    """Return the reasons against implausible errors of the IMU, [] if there are none."""
+    c = fit.state.constants
+    worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
+    if abs(c[worst]) <= 0.2:        # twenty times the error of a consumer IMU
+        return []
+    return [Reason(Code.NOT_CONVERGED, 'the fit converged to '
+                   f'{layout.CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+z.0f} %, '
+                   'impossible for an IMU: a local minimum, or wrong units, axes or time offsets')]
+
+
+def without_values(scale_unit: str) -> dict[str, Estimate]:
+    """Return the estimates of a leg, each without a value."""
+    units = {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
+        layout.CONSTANTS[i]: UNITS[layout.CONSTANTS[i]] for i in OPTIONAL}
+    return unknown_values(scale_unit) | {
+        name: Estimate(None, None, unit) for name, unit in units.items()}
+
+
+def estimate_constants(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str,
+                       nominal: float, config: Config, factor: float = 1.0,
+                       changed_angles: Collection[str] = (),
+                       ) -> tuple[dict[str, Estimate], list[Reason]]:
+    """
+    Return the estimates of the constants, and the reasons for those that are not determined.
+
+    value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
+    sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :
+    limits.   factor : on the sigmas, by model errors; angles must be determined with it.
+    changed_angles : names of angles that change in the leg.
+    """
+    K, yaw = float(np.exp(value[layout.LN_K])), float(wrap(value[layout.YAW]))
+    pitch = float(value[layout.PITCH])
+    found = without_values(scale_unit)
+    if sigma[layout.LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[layout.LN_K]), scale_unit)
+        if nominal:
+            found['scale_ratio'] = Estimate(K / nominal,
+                                            float(K / nominal * sigma[layout.LN_K]), '1')
+    # an angle with a larger sigma than half a degree and the limit is not determined
+    limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
+    for name, i, angle in (('yaw_mounting_angle', layout.YAW, yaw),
+                           ('pitch_mounting_angle', layout.PITCH, pitch)):
+        # a configured mounting angle is not determined by the drive
+        if factor * sigma[i] <= limit and ratio[i] < INFORMED_SHARE:
+            found[name] = Estimate(angle, float(sigma[i]), 'rad')
+    for i in OPTIONAL:
+        if ratio[i] < INFORMED_SHARE:
+            name = layout.CONSTANTS[i]
+            found[name] = Estimate(float(value[i]), float(sigma[i]), UNITS[name])
+    reasons = _scale_reasons(float(sigma[layout.LN_K]))
+    return found, reasons + _angle_reasons(sigma, limit, factor, config, yaw, changed_angles)
+
+
+def configured_constants(leg: SmootherLeg) -> Floats:
+    """Return the values of the settings that constants are corrections to: (M,)."""
+    value = np.zeros(layout.M)
+    value[layout.ODO_ARM], value[layout.GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
+    return value
+
+
+def not_observable_reason(drives: str, names: list[str]) -> Reason:
+    """Return the reason that constants keep their configured values; names: of estimates."""
+    heights = all(name.endswith('_z') for name in names)
+    return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
+                  f'{join_names(names)}; the configured values are used',
+                  'Measure these heights and set them: turns, stops and starts hardly determine '
+                  'them.' if heights else '')
+
+
+def join_names(names: Iterable[str]) -> str:
+    """Return names of estimates as people say them, axes of one thing together."""
+    words: dict[str, list[str]] = {}
+    for name in names:
+        stem, _, axis = name.rpartition('_')
+        if axis not in AXES:
+            stem, axis = name, ''
+        words.setdefault(stem.replace('gnss', 'fix').replace('_', ' '), []).append(
+            AXES.get(axis, ''))
+    texts = [f'the {word}' + (f' ({", ".join(axes)})' if 0 < len(axes) < 3 and axes[0] else '')
+             for word, axes in words.items()]
+    return texts[0] if len(texts) == 1 else f'{", ".join(texts[:-1])} and {texts[-1]}'
+
+
+def _scale_reasons(sigma: float) -> list[Reason]:
+    """Return the reason for a scale that is not determined; sigma : relative."""
+    if sigma <= SCALE_LIMIT:
+        return []
+    return [Reason(Code.SCALE_NOT_DETERMINED, f'scale uncertainty is {100 * sigma:.0f} %, too '
+                   f'large to state a value; the limit is {100 * SCALE_LIMIT:g} %')]
+
+
+def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, yaw: float,
+                   changed_angles: Collection[str]) -> list[Reason]:
+    """Return the reasons for mounting angles that are not determined, or far from nominal."""
+    reasons, limit_text = [], f'; the limit is {np.rad2deg(limit / factor):.2g} deg'
+    if factor > 1:
+        limit_text += (f' ({np.rad2deg(limit):.2g} deg / {factor:.2g}, the factor on '
+                       'uncertainties)')
+    off = abs(float(wrap(yaw - nominal_yaw(config))))
+    if sigma[layout.YAW] > limit / factor:
+        cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (
+            'too little acceleration, or too few turns')
+        reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
+                              f'{np.rad2deg(sigma[layout.YAW]):.2f} deg{limit_text}. '
+                              f'Likely cause: {cause}'))
+    elif off > REVERSED_YAW:
+        reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
+                              'directions: positive counts mean backwards, or the IMU x axis '
+                              f'points backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'))
+    elif off > FAR_YAW:
+        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+z.1f} '
+                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value; '
+                              f'the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
+    if sigma[layout.PITCH] > limit / factor:
+        reasons.append(Reason(
+            Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
+            f'{np.rad2deg(sigma[layout.PITCH]):.2f} deg{limit_text}',
+            'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in changed_angles else
+            'Drive longer, with stops and starts. Accurate ellipsoidal heights also help.'))
+    return reasons

@@ -1,0 +1,254 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Data of a fitted leg for other programs: odometer messages, motion, biases, twist covariance.
+
+The mean factor of a quantised speed as published is for consumers that only multiply. The
+covariance of the twist of calibrated wheels is from noise levels and constants of the legs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
+from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.factors.interval_noise import hard_and_turning, TURNING_RATE
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BA, FAST_SPEED, LN_K, SPEED_OFFSET, State
+from odocal_ros.settings.config import SIDES
+from odocal_ros.settings.grades import G, Grade
+
+AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+
+
+def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
+                     widen: float) -> dict[str, Any]:
+    """
+    Return ``odometer`` and ``accelerometer_bias``, as details of a method.
+
+    odometer: sigma of a reading in scale units, period s, step of a quantised speed in scale units
+    per s, share of the motion that is accelerated, speeds m/s and turn rates rad/s in motion.
+    Biases at the start of the leg in b, m/s^2, with the ratio of their sigmas to the prior's.
+    """
+    motion = fit.weighted[MotionRows].motion
+    path = np.linalg.norm(motion.displacement, axis=1)
+    moving = ~problem.still[:-1] & ~problem.still[1:]
+    moving = moving if moving.any() else ~moving
+    speed = (path / motion.T[:, 0])[moving]
+    rate = motion.turning[moving]
+    t, coarse = leg.travel.t, leg.travel.coarse
+    within = (t >= leg.t_begin) & (t <= leg.t_stop)
+    least = 0.0 if leg.travel.quantum else problem.least['travel']      # no reading error
+    odometer = {
+        'reading': float(np.sqrt(max(fit.levels['travel'] - least, 0.0))),
+        'period': float(np.median(np.diff(t[within]))),
+        'speed_step': coarse.step if coarse else 0.0,
+        'hard': float(hard_and_turning(motion)[0][moving].mean()),
+        'speed': float(np.sqrt(np.mean(speed**2))), 'fastest': float(speed.max()),
+        'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
+        'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
+    sigma = np.sqrt(np.diagonal(near[0])[BA]) * widen
+    biases = zip('xyz', fit.state.accel_bias[0], sigma, sigma / fit.first.accel_bias, strict=True)
+    return {'odometer': odometer} | ({'accelerometer_bias': {
+        axis: {'value': float(value), 'sigma': float(s), 'ratio': float(ratio)}
+        for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
+
+
+def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:
+    """
+    Return the path length of a leg over the integral of its speeds as sent, by its name.
+
+    A truncated speed lacks half a step while the vehicle moves: K (1 + offset t / s), with t the
+    time in motion and s the integral. Only of a speed that the smoother uses by its steps.
+
+    leg, state : SmootherLeg, State.   covariance : (M, M) of the constants.
+    """
+    coarse = leg.travel.coarse
+    if coarse is None or not leg.by_steps:
+        return {}
+    middle = (coarse.t[1:] + coarse.t[:-1]) / 2
+    within = (middle >= leg.t_begin) & (middle <= leg.t_stop)
+    dt, speed = np.diff(coarse.t)[within], np.abs(coarse.value[1:])[within]
+    if not speed.any():
+        return {}
+    lacks = float(dt[speed > 0].sum() / (dt @ speed))       # of the scale, by the offset
+    whole = 1 + lacks * state.constants[SPEED_OFFSET]
+    by = np.array([1.0, lacks / whole])
+    at = [LN_K, SPEED_OFFSET]
+    relative = float(np.sqrt(by @ covariance[np.ix_(at, at)] @ by))
+    value = state.scale * whole
+    return {AS_SENT: Estimate(value, value * relative, leg.scale_unit)}
+
+
+def combine_as_sent(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, Estimate]:
+    """Return the factor of several legs: joint scale times mean ratio of factor and scale."""
+    ratios = [(leg.estimates[AS_SENT].value or 0.0) / (leg.estimates['scale_factor'].value or 1.0)
+              for leg in legs if AS_SENT in leg.estimates]
+    if not ratios or scale.value is None or scale.sigma is None:
+        return {}
+    ratio = float(np.mean(ratios))
+    sigma = float(np.hypot(scale.sigma, scale.value * np.std(ratios) / np.sqrt(len(ratios))))
+    return {AS_SENT: Estimate(scale.value * ratio, sigma * ratio, scale.unit)}
+
+
+def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
+    """Return additional figures for calibration.json; grade : None without an accelerometer."""
+    sigma = np.sqrt(np.diag(covariance))
+    # scale_by_speed: the slope at FAST
+    out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
+                           for name, i, unit in (('scale_by_speed', layout.BY_SPEED, '1/(m/s)'),
+                                                 ('scale_by_time', layout.BY_TIME, '1/s'))}
+    if grade is not None:
+        for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
+            out[f'{name}_mounting_angle_housing_sigma'] = _entry(
+                _housing_sigma(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
+    next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
+    out['scale_ratio_next_drive_sigma'] = _entry(np.hypot(sigma[layout.LN_K], next_drive), '1')
+    return out
+
+
+def _entry(value: float, unit: str) -> dict[str, Any]:
+    return {'value': float(value), 'sigma': None, 'unit': unit}
+
+
+def _housing_sigma(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
+    """Return the sigma of an angle relative to the housing, from that to the sensor axes."""
+    # the angle between them is one of two axis errors of equal size whose sum is ``found``
+    if not misalignment:
+        return sigma
+    posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
+    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (found / 2)**2)
+    return out
+
+
+def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
+    """Return the pitch relative to the accelerometer's level: third pitch of method_real."""
+    k = len(near) // 2
+    n = fit.solved.step.shape[1]
+    at = np.array([2 * n + layout.PITCH, layout.BA.start])
+    C = near[k][np.ix_(at, at)]
+    row = np.array([1.0, -1 / G])
+    return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
+            'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
+
+
+SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocity faster
+
+
+@dataclass(frozen=True, eq=False)
+class TwistNoise:
+    """Errors of the twist that calibrated wheels give over a message interval."""
+
+    period: float                     # s
+    speed: float                      # m/s, rms of the drive in motion
+    turn_rate: float                  # rad/s, rms
+    fastest: tuple[float, float]      # highest speed and turn rate
+    legs: tuple[dict[str, Any], ...]  # ``odometer``, levels, constants of each leg's fit
+    estimates: dict[str, Estimate]    # of the calibration
+
+    @property
+    def has_turn_rate(self) -> bool:
+        """Return True if two wheels give the turn rate."""
+        return all(f'scale_factor_{side}' in self.estimates for side in SIDES) and bool(
+            self._known('track_width')[0]) and all('left' in leg['wheels'] for leg in self.legs)
+
+    def variances(self, speed: float, turn_rate: float) -> Floats:
+        """
+        Return the variances of the velocity forward, left and up and of the turn rate: (4,).
+
+        In (m/s)^2 and (rad/s)^2, mean of the legs; the turn rate is NaN if it is not measured.
+        speed, turn_rate : m/s, rad/s.
+        """
+        found: Floats = np.mean([self._of_leg(leg, abs(speed), abs(turn_rate))
+                                 for leg in self.legs], axis=0)
+        return found
+
+    def _of_leg(self, leg: dict[str, Any], v: float, w: float) -> Floats:
+        noise, odometer, T = leg['noise'], leg['odometer'], self.period
+        K = self._known('scale_factor')[0]
+        factor = self._known(AS_SENT)[0] or K
+        # as in noise.py: the noise of a wheel grows with the time it turns
+        turned, hard = min(max(v, 0.02), 1.0) / T, odometer['hard']
+        reading = (K * odometer['reading'])**2 / T**2       # of one reading; an interval has two
+        along = (1 - hard) * noise['along']**2 + hard * noise['along_hard']**2
+        swayed = turned * T / max(T, SWAY_TIME)
+        grid = noise.get('steps')
+        if grid is not None:      # the fit does not use the integral of such a speed
+            along, reading = 0.0, 0.0
+        side = noise['side_turn' if w > TURNING_RATE else 'side']**2
+        white = leg['widened']**2 * np.array(
+            [along * turned + 2 * reading, side * swayed, noise['up']**2 * swayed])
+        arm_x, arm_y = (_mean_square(self._known(f'odometer_lever_arm_{axis}')) for axis in 'xy')
+        by_sideslip = _mean_square(_value_and_sigma(leg['sideslip'])) * (v**2 * w)**2
+        constant = np.array([self._scale_variance(leg, v) + arm_y * w**2,
+                             by_sideslip + arm_x * w**2, 0.0])
+        coarse = (K * odometer['speed_step'])**2 / 12 * max(grid or 1.0, 1.0)**2 + (
+            (factor - K) / K * v - K * leg['speed_offset']['value'])**2 * (factor != K)
+        return np.append(white + constant + [coarse, 0.0, 0.0],
+                         self._turn_rate(leg, v, w, turned, reading))
+
+    def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
+        """Return the variance of the speed by the scale: its sigma and its change with speed."""
+        scale, sigma = self._known('scale_factor')
+        by_speed = _value_and_sigma(leg['scale_by_speed'])
+        change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
+        return float(v**2 * ((sigma / scale)**2 + _mean_square(by_speed) * change**2))
+
+    def _turn_rate(self, leg: dict[str, Any], v: float, w: float, turned: float,
+                   reading: float) -> float:
+        """Return the variance of the turn rate from the difference of two wheels."""
+        if not self.has_turn_rate:
+            return np.nan
+        left, right = (leg['wheels'][side] for side in SIDES)
+        (width, sigma), hard = self._known('track_width'), leg['odometer']['hard']
+        even, pulled, turning = (np.square(left['walk']) + np.square(right['walk'])) / 2
+        walk = turning if w > TURNING_RATE else (1 - hard) * even + hard * pulled
+        # the mean of two wheels has half the variance of one; their deviations from the mean have
+        # opposite signs
+        white = leg['widened']**2 * (4 * walk * turned + 8 * reading)
+        ratio = left['ratio_sigma'] + right['ratio_sigma']
+        return float(white + (sigma * w)**2 + (ratio * v)**2) / width**2
+
+    def _known(self, name: str) -> tuple[float, float]:
+        """Return value and sigma of an estimate, 0 if it is not determined."""
+        found = self.estimates.get(name)
+        return (found.value or 0.0, found.sigma or 0.0) if found else (0.0, 0.0)
+
+
+def twist_noise(calibration: Calibration) -> TwistNoise | None:
+    """Return the errors of the twist, None without a scale factor of the smoother."""
+    scale = calibration.estimates.get('scale_factor')
+    legs = _fitted_details(calibration.legs)
+    if scale is None or not scale.value or scale.method != 'smoother' or not legs:
+        return None
+    odometers = [leg['odometer'] for leg in legs]
+    speed, turn_rate = (float(np.sqrt(np.mean(np.square([o[name] for o in odometers]))))
+                        for name in ('speed', 'turn_rate'))
+    return TwistNoise(float(np.median([o['period'] for o in odometers])), speed, turn_rate,
+                      (max(o['fastest'] for o in odometers),
+                       max(o['fastest_turn'] for o in odometers)), legs, calibration.estimates)
+
+
+def _fitted_details(legs: Sequence[LegResult]) -> tuple[dict[str, Any], ...]:
+    """Return the details of the legs that the smoother fitted and nothing rejects."""
+    found = [leg.methods['smoother'].details for leg in legs
+             if 'smoother' in leg.methods and leg.verdict.value != 'rejected']
+    return tuple({'wheels': {}, **details} for details in found if 'odometer' in details)
+
+
+def _value_and_sigma(entry: dict[str, float]) -> tuple[float, float]:
+    return entry['value'], entry['sigma']
+
+
+def _mean_square(effect: tuple[float, float]) -> float:
+    """Return the mean square of an effect, value and sigma, that a driver does not correct."""
+    return effect[0]**2 + effect[1]**2
