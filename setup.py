@@ -125,10 +125,10 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'calibrator = odocal_ros.live.start:calibrator',
-            'drive_pattern = odocal_ros.live.start:drive_pattern',
+            'calibrator = odocal_ros.live.node_commands:calibrator',
+            'drive_pattern = odocal_ros.live.node_commands:drive_pattern',
             'odocal = odocal_ros.offline.cli:main',
-            'odometry = odocal_ros.live.start:odometry',
+            'odometry = odocal_ros.live.node_commands:odometry',
         ],
         # ros2 odocal ...
         'ros2cli.command': ['odocal = odocal_ros.offline.cli:OdocalCommand'],

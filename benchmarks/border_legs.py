@@ -41,7 +41,7 @@ def driven(vehicle, legs, grade, fixes):
     from smoother_legs import leg_of
 
     from odocal_ros.estimator import smooth
-    from odocal_ros.settings.grades import GRADES
+    from odocal_ros.settings.nominal import GRADES
     from odocal_ros.sim.noise import stream
     seed = FIRST_SEED + 100 * vehicle
     rng, of_grade = stream(seed, 'what the vehicle is'), GRADES[grade]

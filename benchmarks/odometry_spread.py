@@ -101,7 +101,7 @@ def main():
 
 
 def _grade(name):
-    from odocal_ros.settings.grades import GRADES
+    from odocal_ros.settings.nominal import GRADES
     return GRADES[name]
 
 

@@ -88,7 +88,7 @@ def simulated(seed, **options):
 def true_levels(problem, drive):
     """Return the noise levels of the simulation."""
     from odocal_ros.estimator.factors.interval_noise import INTERVAL
-    from odocal_ros.settings.grades import GRADES as FIGURES
+    from odocal_ros.settings.nominal import GRADES as FIGURES
     o, grade = drive.options, FIGURES[drive.options.imu_grade]
     road = dict.fromkeys(INTERVAL[4:], 0.0)
     road |= dict.fromkeys(('along', 'along_hard'), o.speed_noise**2 / o.odometer_rate)

@@ -54,7 +54,7 @@ def drive(seed: int) -> dict:
     """Calibrate one drive; return errors and stated sigmas (scales: relative; rad; m)."""
     from odocal_ros.pipeline.calibrate import calibrate
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.settings.grades import GRADES
+    from odocal_ros.settings.nominal import GRADES
     from odocal_ros.sim.noise import stream
     from odocal_ros.sim.options import DEFAULTS
     from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -16,8 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
-from odocal_ros.live.panel import panel
-from odocal_ros.live.status_listener import StatusListener
+from odocal_ros.live.watch import panel, StatusListener
 
 FRAME_S = 1.5       # judgement: s per frame
 COLUMNS = 88        # judgement: width of the panel

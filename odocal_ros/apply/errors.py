@@ -18,8 +18,8 @@ import numpy as np
 from odocal_ros.apply.attitude import Matrix, plus, skewed, Vector, ZERO
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.settings.grades import Grade
 from odocal_ros.settings.levels import FAULT_SIGMAS
+from odocal_ros.settings.nominal import Grade
 
 # definition: indices of the errors in the error state
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)

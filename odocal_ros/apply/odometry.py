@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
+from odocal_ros.apply.odometry_start import begin
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
-from odocal_ros.apply.start import begin
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
@@ -26,9 +26,9 @@ from odocal_ros.data.samples import (
     Reading,
     readings_of,
 )
-from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
 from odocal_ros.settings.node_configs import ApplyConfig
+from odocal_ros.settings.nominal import grade_of
 
 RESTARTS = 'odometry restarts'      # begin of the note on a restart
 

@@ -30,13 +30,12 @@ from odocal_ros.apply.attitude import (
     Vector,
     ZERO,
 )
-from odocal_ros.apply.delay import DelaySearch
 from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
+from odocal_ros.apply.odometry_start import Start
 from odocal_ros.apply.pose import covariances, Pose, raw_of, velocity_variances
-from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
-from odocal_ros.apply.wheels import Wheels
+from odocal_ros.apply.wheels import DelaySearch, Wheels
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.settings.levels import FASTEST

@@ -27,8 +27,15 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, turn_on_bias
-from odocal_ros.settings.nominal import nominal_scale, nominal_yaw
+from odocal_ros.settings.nominal import (
+    G,
+    Grade,
+    grade_of,
+    imu_as_seen,
+    nominal_scale,
+    nominal_yaw,
+    turn_on_bias,
+)
 
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)

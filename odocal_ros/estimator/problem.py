@@ -11,7 +11,7 @@ from odocal_ros.estimator.imu import ImuSteps
 from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.state import Priors
-from odocal_ros.settings.grades import Grade
+from odocal_ros.settings.nominal import Grade
 
 
 @dataclass(eq=False)

@@ -30,8 +30,8 @@ from odocal_ros.estimator.result.wheel_result import joined, wheel_details, whee
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, REMARK_SIGMAS
+from odocal_ros.settings.nominal import grade_of
 
 # usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
 # by load and the cross slopes of roads. Judgement

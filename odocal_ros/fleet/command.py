@@ -16,8 +16,8 @@ import tempfile
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.cli import say, warn
 from odocal_ros.offline.replay import add_calibration_arguments
-from odocal_ros.offline.say import say, warn
 
 if TYPE_CHECKING:
     from odocal_ros.fleet.bag_jobs import BagJob

@@ -27,7 +27,7 @@ from odocal_ros.forecast.ideal_samples import Ideal, ideal
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import predict, Prediction, Sigmas
 from odocal_ros.reasons import Code, Reason, Verdict, verdict_of
-from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.nominal import grade_of
 
 WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
 SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway

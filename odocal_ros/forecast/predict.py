@@ -39,8 +39,8 @@ from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_mult
 from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
-from odocal_ros.settings.grades import Grade, with_turn_on_level
 from odocal_ros.settings.levels import SWAY
+from odocal_ros.settings.nominal import Grade, with_turn_on_level
 
 SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
 OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')

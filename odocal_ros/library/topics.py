@@ -10,8 +10,8 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import INPUTS, OUTSIDE, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
+from odocal_ros.messages.message_fields import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
 from odocal_ros.settings.config import Config, OdometerConfig
 
 NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')

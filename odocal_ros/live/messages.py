@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
@@ -28,6 +28,9 @@ from odocal_ros.errors import BadConfig
 
 MESSAGE_TYPE = re.compile(r'(?P<package>[a-z][a-z0-9_]*)/msg/(?P<name>[A-Z][A-Za-z0-9]*)')
 NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
+# definition: of latched topics, publisher and subscriber
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 KIND = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
 Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
 

@@ -29,7 +29,7 @@ from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input, LOOK_AROUND_S
 from odocal_ros.messages.cdr import layout_of
-from odocal_ros.messages.sensor_types import types_of
+from odocal_ros.messages.message_fields import types_of
 from odocal_ros.safe_io.text_formats import error_text
 from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 

@@ -1,13 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Publishers of the node: status, diagnostics, paths, result parameters."""
+"""Status, diagnostics, paths and result parameters of the node: their content and publishers."""
 
 from functools import partial
+import math
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Path as PathMessage
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
@@ -15,17 +16,205 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64, String
 
-from odocal_ros.calib.result import Calibration
-from odocal_ros.live import params
+from odocal_ros.bagio.segments import STATUS_NAME
+from odocal_ros.calib.result import Calibration, wheel_factors
+from odocal_ros.forecast import quantities
+from odocal_ros.forecast.forecast import as_keys
+from odocal_ros.live import answers, params
 from odocal_ros.live.answers import action_first
+from odocal_ros.live.console import losses_in_words
+from odocal_ros.live.health import Health
+from odocal_ros.live.messages import LATCHED
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.session import SessionView
-from odocal_ros.live.status import calibration_status, in_force, input_status
-from odocal_ros.live.status_listener import LATCHED
+from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.live.worker import Paths
 from odocal_ros.output.figures import iso
+from odocal_ros.pipeline.prepared_leg import Stage
+from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
+
+SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fault
+# judgement: significant decimals
+PLACES = dict.fromkeys((
+    'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
+    'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
+    'metres_to_go_yaw', 'computing_percent'), 1) | {
+        'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
+        'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
+# results of the status, and the unit in their keys
+UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
+         'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
+VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
+          for name, unit in UNITS.items() for end in ('', '_sigma')}
+
+
+def calibration_status(now: SessionView) -> DiagnosticStatus:
+    session, results = now.session, now.results
+    text, ok = answers.hint(now), answers.quantities_ok(now)
+    legs = results['result.legs'] if now.restored else len(session.legs)
+    keys = {
+        'state': now.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
+        'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
+        'marks': ','.join(map(str, session.marks)),
+        'distance_m': now.distance_m, 'duration_s': now.duration_s,
+        'imu_rate_hz': now.rates_hz.get('imu', 0.0),
+        'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
+        'fix_rate_hz': now.rates_hz.get('fix', 0.0),
+    } | {key: results[name] for key, name in VALUES.items()} | _of_wheels(now) | {
+        'verdict': session.verdict(), 'hint': text, 'legs': legs,
+        'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
+        'restored': now.restored,
+        'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
+        'metres_to_least': answers.metres_to_go(now),
+        'seconds_to_stand': answers.seconds_to_stand(now),
+        'asked_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
+        'asked_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
+        'manoeuvres': '; '.join(answers.manoeuvres(now)),
+        'can_tell': ', '.join(now.ability.can) if now.ability else '',
+        'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
+        'messages_lost': sum(now.lost_messages.values()),
+        'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
+        'save_trouble': now.save_trouble, 'lost': now.lost,
+        'automatic': _automatic(now), 'unused': _unused(session),
+        'carried_legs': session.carried.legs if session.carried else 0,
+        'journal': now.journal, 'journal_trouble': now.journal_trouble,
+    } | _computing(now) | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
+    return DiagnosticStatus(
+        level=level(now), name=STATUS_NAME, message=sentence(now, text, ok), hardware_id='odocal',
+        values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
+
+
+def _of_wheels(now: SessionView) -> dict[str, object]:
+    """Return the keys of more than two wheels: factor and sigma of each by its name."""
+    calibration = now.session.calibration
+    estimates = calibration.estimates if calibration else {}
+    return {f'{name}{end}': math.nan if value is None else value
+            for name in wheel_factors(estimates) if name not in VALUES
+            for end, value in (('', estimates[name].value), ('_sigma', estimates[name].sigma))}
+
+
+def in_force(now: SessionView, name: str) -> float:
+    """Return a value or sigma of the result, or of the running estimate until the leg has one."""
+    if now.session.state is not State.RECORDING and now.forecast is None:
+        return float(now.results[f'result.{name}'])
+    estimate = (now.forecast.estimates if now.forecast else {}).get(name.removesuffix('_sigma'))
+    if estimate is None or estimate.value is None:
+        return math.nan
+    found = estimate.sigma if name.endswith('_sigma') else estimate.value
+    return math.nan if found is None else float(found)
+
+
+def level(now: SessionView) -> Any:
+    """Return STALE before any message, ERROR if action is required, WARN for cautions."""
+    state = now.session.state
+    if state in (State.FAILED, State.REJECTED) or now.lost_cause:
+        return DiagnosticStatus.ERROR
+    if state is State.IDLE and not now.received:
+        return DiagnosticStatus.STALE
+    doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
+    doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
+                                or now.save_trouble or now.lost or now.faults
+                                or now.doubled or _changes(now.session)
+                                or now.session.unused and now.session.unused.code not in SHORT)
+    return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
+
+
+def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
+    """Return one sentence: the state, the accuracy, and the next action."""
+    session = now.session
+    legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
+    if session.carried:
+        legs += f' and {session.carried.legs} before'
+    seen = {
+        'waiting': 'Waiting',
+        'idle': 'Ready',
+        'recording': f'Recording leg {session.leg_id}: {now.distance_m:.0f} m in '
+                     f'{now.duration_s:.0f} s',
+        'computing': f'Computing leg {session.leg_id}',
+        'calibrated': f'Calibrated from {legs}, {session.verdict()}',
+        'rejected': 'Rejected',
+        'failed': f'Failed: {session.trouble}',
+    }[now.state]
+    if now.restored and session.state is State.IDLE:
+        seen += f', including the result restored from {now.restored}'
+    good = '' if session.state is State.RECORDING else quantities.words(ok)
+    troubles = [f'{what}: {trouble}' for what, trouble in (
+        ('the result is not saved', now.save_trouble),
+        ('the journal cannot be written', now.journal_trouble)) if trouble]
+    return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
+                                   _unused(session), *now.doubled,
+                                   losses_in_words(now.lost_messages), *troubles)))
+
+
+def _computing(now: SessionView) -> dict[str, object]:
+    stage = now.computed if now.session.state is State.COMPUTING else Stage()
+    return {'computing_stage': stage.name, 'computing_passes': stage.passes,
+            'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}
+
+
+def _changes(session: Session) -> list[str]:
+    reasons = session.calibration.reasons if session.calibration else ()
+    return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
+
+
+def _unused(session: Session) -> str:
+    why = session.unused
+    return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
+
+
+def _automatic(now: SessionView) -> str:
+    if not now.config.leg.automatic:
+        return ''
+    if now.session.state is not State.RECORDING:
+        return 'waiting'
+    return 'leg' if now.session.by_itself else 'started by the operator'
+
+
+def _reason_codes(now: SessionView) -> str:
+    if now.session.state is State.RECORDING:
+        return ','.join(r.code.name for r in now.faults)
+    calibration = now.session.calibration
+    return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
+
+
+def _bare(value: object, places: int | None = None) -> str:
+    """Return a value as text for PlotJuggler: a number without unit, in full or rounded."""
+    if not isinstance(value, float):
+        return str(value)
+    return repr(float(value) if places is None or not math.isfinite(value)
+                else round(float(value), places))
+
+
+def input_status(name: str, health: Health, why: str, needed: bool,
+                 now_ns: int) -> DiagnosticStatus:
+    """
+    Return the health of one input for ``/diagnostics``.
+
+    Levels as in diagnostic_updater: no messages are an ERROR from the start, or a WARN if no leg
+    needs the input. STALE is left to the aggregator, for nodes that no longer report.
+    """
+    rate, silent = health.rate_hz(now_ns), health.silent_s(now_ns)
+    if why:
+        status, message = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN, why
+    elif health.fix_status is not None and health.fix_status < 0:
+        status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
+    elif health.unusable:
+        status = DiagnosticStatus.WARN
+        message = f'{rate:.1f} Hz, {health.unusable} messages unreadable'
+    else:
+        status, message = DiagnosticStatus.OK, f'{rate:.1f} Hz'
+    # the first two have the names of diagnostic_updater, which monitors search for
+    values = {'Events since startup': health.count, 'Actual frequency (Hz)': rate,
+              'rate_hz': rate, 'age_s': silent if math.isfinite(silent) else -1.0,
+              'messages': health.count, 'gaps': health.gaps, 'dropped': health.lost,
+              'unreadable': health.unusable, 'stamp_delay_s': health.delay_s}
+    if health.fix_status is not None:
+        values['fix_status'] = health.fix_status
+    return DiagnosticStatus(
+        level=status, name=name, message=message, hardware_id='odocal',
+        values=[KeyValue(key=k, value=_bare(v)) for k, v in values.items()])
+
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
 PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}

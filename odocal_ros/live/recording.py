@@ -18,7 +18,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.ability import Received
 from odocal_ros.forecast.progress import Progress
 from odocal_ros.live.topic_input import Input, StaticTransforms
-from odocal_ros.messages.sensor_types import types_of
+from odocal_ros.messages.message_fields import types_of
 from odocal_ros.settings.config import Config
 
 CLOCK_BACK_S = 0.1         # judgement: a clock that steps back by more has jumped

@@ -24,8 +24,8 @@ from odocal_ros.live.health import Health
 from odocal_ros.live.journal_writer import ALWAYS_NS
 from odocal_ros.live.messages import message_class, WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
+from odocal_ros.messages.message_fields import Pairs, TRANSFORMS
 from odocal_ros.messages.odometer_types import TYPES
-from odocal_ros.messages.sensor_types import Pairs, TRANSFORMS
 from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
 from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config

@@ -21,10 +21,16 @@ from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.samples import OdometerForm, Reading, readings_of, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
-from odocal_ros.messages.fields import MessageView, View
+from odocal_ros.messages.message_fields import (
+    MessageView,
+    Pairs,
+    sensor_plan,
+    SensorPlan,
+    TRANSFORMS,
+    View,
+)
 from odocal_ros.messages.odometer_types import OdometerPlan
 from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
-from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 
 # judgement: unreadable messages after which messages without a layout are skipped

@@ -16,7 +16,7 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Reading, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
-from odocal_ros.messages.fields import Column, MessageView, parts, STAMP, stamp_ns, View
+from odocal_ros.messages.message_fields import Column, MessageView, parts, STAMP, stamp_ns, View
 from odocal_ros.messages.wheel_choice import choose, sided
 from odocal_ros.settings.config import Config
 

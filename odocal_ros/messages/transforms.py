@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.decode import Deserialize, Reader
-from odocal_ros.messages.sensor_types import Pairs, SensorPlan, TRANSFORMS
+from odocal_ros.messages.message_fields import Pairs, SensorPlan, TRANSFORMS
 from odocal_ros.nav.frame_chain import FrameChain
 from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.settings.config import Config

@@ -16,7 +16,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose, wrap
-from odocal_ros.settings.grades import Grade
+from odocal_ros.settings.nominal import Grade
 
 # limits of the alignment of a leg, recorded or planned
 MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level without standstill

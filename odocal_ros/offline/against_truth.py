@@ -17,7 +17,7 @@ import sys
 from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.offline.say import say, warn
+from odocal_ros.offline.cli import say, warn
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
 

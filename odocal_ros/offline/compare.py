@@ -7,7 +7,7 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from odocal_ros.offline.say import say, say_json
+from odocal_ros.offline.cli import say, say_json
 
 if TYPE_CHECKING:
     from odocal_ros.library.compare import Change, Comparison, Difference

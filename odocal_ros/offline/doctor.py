@@ -14,7 +14,7 @@ import subprocess
 import sys
 
 from odocal_ros import __version__
-from odocal_ros.offline.say import say
+from odocal_ros.offline.cli import say
 
 NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'matplotlib', 'jinja2', 'tqdm')
 OPTIONAL = {'rosbags': 'rosbag1 files, message types of a bag, written bags',

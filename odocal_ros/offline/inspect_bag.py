@@ -6,8 +6,8 @@
 import argparse
 from pathlib import Path
 
+from odocal_ros.offline.cli import say, say_json
 from odocal_ros.offline.replay import add_input_arguments, asked_settings, asked_topics
-from odocal_ros.offline.say import say, say_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,8 +19,8 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.library.topics import REFERENCES
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
+from odocal_ros.messages.message_fields import IMU, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import lacking, look

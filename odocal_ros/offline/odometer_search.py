@@ -19,9 +19,8 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.library.topics import COMMANDS, FUSED, GNSS, NEVER
 from odocal_ros.messages.decode import Deserialize
-from odocal_ros.messages.fields import MessageView
+from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.nav.odometer import travel
 from odocal_ros.offline.survey import FixPath, Match
 from odocal_ros.offline.wheel_survey import sides, suggested

@@ -9,8 +9,8 @@ from typing import Any
 
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.cli import say, say_json
 from odocal_ros.offline.replay import asked_settings
-from odocal_ros.offline.say import say, say_json
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading')
 NOISE = {'white': 0.0, 'correlated': 60.0}

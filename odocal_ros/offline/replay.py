@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.asked import legs_of, Listener
-from odocal_ros.offline.say import Phase, say, say_json, warn
+from odocal_ros.offline.cli import Phase, say, say_json, warn
 from odocal_ros.safe_io.text_formats import one_line
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.say import Phase, say
+from odocal_ros.offline.cli import Phase, say
 from odocal_ros.safe_io.atomic_files import write_text
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.levels import DAY_NS

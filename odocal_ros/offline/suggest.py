@@ -9,7 +9,7 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import candidates, choose_topics, named, wanted
-from odocal_ros.messages.sensor_types import FIX
+from odocal_ros.messages.message_fields import FIX
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.config import Config, with_settings
 

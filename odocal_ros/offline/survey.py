@@ -18,7 +18,7 @@ from odocal_ros.screening.glitches import beyond, oriented
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.config import Config, GnssConfig
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 AXES = 'xyz'
 # tuned by benchmarks/odometer_fields.py and 3 real drives: true odometers explain 0.90 or more of

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadData
 from odocal_ros.offline import replay
-from odocal_ros.offline.say import say
+from odocal_ros.offline.cli import say
 
 if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag

@@ -39,7 +39,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, with_turn_on_level
+from odocal_ros.settings.nominal import G, Grade, grade_of, imu_as_seen, with_turn_on_level
 
 FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])

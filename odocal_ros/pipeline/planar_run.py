@@ -25,8 +25,7 @@ from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
-from odocal_ros.settings.grades import grade_of
-from odocal_ros.settings.nominal import nominal_scale
+from odocal_ros.settings.nominal import grade_of, nominal_scale
 
 LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
 FEWEST_POSITIONS = 10       # judgement: as for other methods

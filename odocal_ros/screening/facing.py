@@ -21,8 +21,8 @@ from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import ImuConfig
-from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import RAD_PER_DEG
+from odocal_ros.settings.nominal import G
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain has an error of 1/6

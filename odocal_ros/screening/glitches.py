@@ -16,7 +16,7 @@ from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 # judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units are kept
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.data.pieces import bin_means
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 ROW_S, ROWS_A_SECOND = 0.25, 4       # s, judgement: the yaw between rows stays small
 # tuned by benchmarks/zoo.py, 90 drives of 150 to 600 s: shorter or longer segments detect less

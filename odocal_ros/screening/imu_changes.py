@@ -11,7 +11,7 @@ from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import Accelerations, facing_of
 from odocal_ros.screening.inputs import Inputs
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 # judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter on one side
 LEAST_TURN, SIDE = 45.0, 20.0

@@ -27,7 +27,7 @@ from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 LEAST_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
 GRAVITY_ROWS = 20_000  # judgement: largest number of rows in the median

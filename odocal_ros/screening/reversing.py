@@ -19,8 +19,8 @@ from odocal_ros.data.pieces import runs
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import FAULT_SIGMAS
+from odocal_ros.settings.nominal import G
 
 REVERSING_STEP = 0.1          # s, judgement: grid
 PUSH_TIME = 0.6            # s, judgement: each side, of accelerations

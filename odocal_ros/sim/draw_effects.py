@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, MG, plain, Vehicle
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, FEWEST_OMNI, MECANUM, OMNI
-from odocal_ros.settings.grades import Grade, GRADES
+from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim.real import NONE3, Real, Vector
 from odocal_ros.sim.references import REFERENCES
 

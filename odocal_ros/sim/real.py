@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row

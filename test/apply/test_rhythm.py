@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.apply.arrivals import Rhythm
-from odocal_ros.apply.delay import DelaySearch, LEAST_DELAY_ROWS
 from odocal_ros.apply.errors import GRAVITY
+from odocal_ros.apply.wheels import DelaySearch, LEAST_DELAY_ROWS
 from odocal_ros.data.samples import take
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -18,7 +18,7 @@ from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.grades import GRADES, imu_as_seen, TURN_ON
+from odocal_ros.settings.nominal import GRADES, imu_as_seen, TURN_ON
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real

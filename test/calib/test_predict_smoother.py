@@ -26,7 +26,7 @@ from odocal_ros.forecast.planned_methods import (
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')

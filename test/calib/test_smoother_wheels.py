@@ -16,7 +16,7 @@ from odocal_ros.estimator.result.wheel_result import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, SIDES, with_settings
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}

@@ -18,8 +18,8 @@ from odocal_ros.forecast.ability import ability, Received, stated_variance
 from odocal_ros.forecast.forecast import better, Forecast, Prospect, WheelsForecast
 from odocal_ros.live import answers
 from odocal_ros.live.answers import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
+from odocal_ros.live.publishing import level
 from odocal_ros.live.session import Restored, Session, SessionView
-from odocal_ros.live.status import level
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 

@@ -26,7 +26,7 @@ from odocal_ros.live import worker
 from odocal_ros.live.health import Health
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.sensor_types import FIX, IMU
+from odocal_ros.messages.message_fields import FIX, IMU
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

@@ -16,7 +16,7 @@ import struct
 import numpy as np
 
 from odocal_ros.messages.cdr import FRAME_AT, layout_of
-from odocal_ros.messages.sensor_types import FIX, IMU
+from odocal_ros.messages.message_fields import FIX, IMU
 
 SAME = (1.0, 1.0)
 SIGMAS = 5.0

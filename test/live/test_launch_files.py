@@ -14,7 +14,7 @@ import yaml
 
 from odocal_ros.data.inputs import TOPICS
 from odocal_ros.live.params import fixed, refused, RESULTS
-from odocal_ros.messages.sensor_types import FIX, IMU
+from odocal_ros.messages.message_fields import FIX, IMU
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.node_configs import ApplyConfig
 
@@ -57,7 +57,7 @@ def test_the_files_named_are_installed():
     for path in (Path(node.parameters[0]), Path(rviz.arguments[1])):
         assert path.exists()
         assert f"glob('{path.parent.name}/*')" in setup
-    assert f"'{node.executable} = odocal_ros.live.start:calibrator'" in setup
+    assert f"'{node.executable} = odocal_ros.live.node_commands:calibrator'" in setup
 
 
 @pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],

@@ -142,7 +142,7 @@ def test_the_launch_file_starts_it_with_both_files():
                                {'calibration': '/tmp/calibration.yaml', 'imu_topic': '/a/imu'})
     assert declared['calibration'][0] == ''       # must be given
     assert node.executable == 'odometry'
-    assert f"'{node.executable} = odocal_ros.live.start:odometry'" in (
+    assert f"'{node.executable} = odocal_ros.live.node_commands:odometry'" in (
         ROOT / 'setup.py').read_text()
     assert node.parameters[:2] == [str(ROOT / 'config' / 'odometry.yaml'), '/tmp/calibration.yaml']
     assert node.remappings['imu/data'] == '/a/imu'

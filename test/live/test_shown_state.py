@@ -17,12 +17,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
 from std_msgs.msg import Float64, String
 
-from odocal_ros.live import start as commands
+from odocal_ros.live import node_commands as commands
 from odocal_ros.live.console import Console
+from odocal_ros.live.messages import LATCHED
+from odocal_ros.live.node_commands import NEEDS
 from odocal_ros.live.session import Session, SessionView
-from odocal_ros.live.start import NEEDS
-from odocal_ros.live.status_listener import LATCHED, StatusListener
 from odocal_ros.live.topic_input import LOOK_AROUND_S
+from odocal_ros.live.watch import StatusListener
 from odocal_ros.offline.cli import main
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -70,7 +71,7 @@ def test_the_panel_shows_a_running_node(start, connect):
 
 def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
     rich = pytest.importorskip('rich.console')
-    from odocal_ros.live.panel import panel
+    from odocal_ros.live.watch import panel
     status = {'state': 'computing', 'scale_factor': '0.03', 'scale_factor_sigma': '0.0001',
               'estimate_scale_factor': '0.02', 'estimate_scale_factor_sigma': '0.0001'}
 
@@ -96,7 +97,7 @@ def test_once_without_a_node_ends(monkeypatch, capsys):
 
 def test_the_bars_are_shares_of_what_is_asked():
     pytest.importorskip('rich')
-    from odocal_ros.live.panel import shares
+    from odocal_ros.live.watch import shares
     found = shares({'distance_m': '75.0', 'metres_to_least': '25.0', 'seconds_to_stand': '4.0',
                     'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})

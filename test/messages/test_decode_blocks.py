@@ -16,7 +16,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import readings_of
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.sensor_types import _fix, _heading
+from odocal_ros.messages.message_fields import _fix, _heading
 from odocal_ros.settings.config import Config, with_settings
 
 

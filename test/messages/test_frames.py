@@ -19,7 +19,7 @@ from odocal_ros.data.samples import columns_of, join, LOCAL
 from odocal_ros.errors import BadData
 from odocal_ros.library.calibrate_bag import calibrate_bag
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.sensor_types import IMU
+from odocal_ros.messages.message_fields import IMU
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import FRAME_LONGITUDE, geodetic_of, LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy

@@ -13,7 +13,7 @@ from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import matrix_from_rpy, wrap
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 pytestmark = pytest.mark.core
 LATITUDE, SECONDS, RATE = 0.7, 60.0, 5.0

@@ -13,7 +13,7 @@ from odocal_ros.nav.standstill import REST_TRAVEL, standstills
 from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN, robust_sigma
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 pytestmark = pytest.mark.core
 RATE = 100.0       # Hz

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.core
 OWN = [name for name, (home, _) in cli.COMMANDS.items() if home.startswith('odocal_ros.')]
 SETUP = Path(__file__).resolve().parents[2] / 'setup.py'
 CODE = """
-from odocal_ros.offline.say import Phase
+from odocal_ros.offline.cli import Phase
 with Phase('reading town', quiet={quiet}) as phase:
     phase(0.25)
     phase(0.5, 'leg 2 of 2')

@@ -13,7 +13,7 @@ import pytest
 from odocal_ros.pipeline.align import choose_standstill, with_observed_walk
 from odocal_ros.pipeline.prepared_leg import attitude_of
 from odocal_ros.reasons import Code
-from odocal_ros.settings.grades import GRADES
+from odocal_ros.settings.nominal import GRADES
 
 
 @pytest.mark.parametrize(('spans', 'chosen'), [

@@ -25,7 +25,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening import inputs as inputs_module
 from odocal_ros.screening.inputs import place
 from odocal_ros.screening.screen import screen
-from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.nominal import grade_of
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow

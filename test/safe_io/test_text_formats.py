@@ -144,7 +144,7 @@ def test_a_terminal_shows_control_characters_and_keeps_the_style_of_the_verdict(
 def test_all_commands_print_through_one_door():
     folder = Path(text_formats.__file__).parents[1] / 'offline'
     users = {path.name for path in folder.glob('*.py') if 'print(' in path.read_text()}
-    assert users == {'say.py'}
+    assert users == {'cli.py'}
 
 
 def test_no_cell_of_a_spreadsheet_is_a_formula():

@@ -14,7 +14,7 @@ from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.several_imus import alternating
 from odocal_ros.settings.config import Config, ImuConfig
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 RATE, SECONDS = 100.0, 120.0
 JITTER = 1e-3

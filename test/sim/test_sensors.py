@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_from_rpy, wrap
-from odocal_ros.settings.grades import Grade, GRADES
+from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white

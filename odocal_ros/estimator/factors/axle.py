@@ -17,7 +17,7 @@ from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
 from odocal_ros.nav.rotations import turn
-from odocal_ros.settings.grades import G
+from odocal_ros.settings.nominal import G
 
 WALK_SPEED = 1.0     # m/s, below it slopes are reduced: judgement
 WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving

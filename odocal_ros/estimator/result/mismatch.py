@@ -25,8 +25,8 @@ from odocal_ros.estimator.result.residuals import SLIP_VARIANCE
 from odocal_ros.estimator.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
+from odocal_ros.settings.nominal import grade_of, turn_on_bias
 
 WORSE_THAN_GRADE = 3.0      # judgement: times the noise of its grade
 # m/s in a second, share and number of the seconds, of outliers that are reported. Judgement:

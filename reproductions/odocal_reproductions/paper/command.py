@@ -6,7 +6,7 @@
 import argparse
 
 from odocal_reproductions.command import add_outputs, picture_of
-from odocal_ros.offline.say import say
+from odocal_ros.offline.cli import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

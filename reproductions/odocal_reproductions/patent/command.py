@@ -8,7 +8,7 @@ import math
 from typing import Any, TYPE_CHECKING
 
 from odocal_reproductions.command import add_outputs, picture_of
-from odocal_ros.offline.say import say
+from odocal_ros.offline.cli import say
 
 if TYPE_CHECKING:
     from odocal_ros.calib.wheel_search.planar import PlanarLeg

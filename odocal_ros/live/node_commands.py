@@ -49,8 +49,7 @@ def run(args: Namespace) -> int:
         from rich.live import Live
         from rich.panel import Panel
 
-        from odocal_ros.live.panel import panel
-        from odocal_ros.live.status_listener import StatusListener
+        from odocal_ros.live.watch import panel, StatusListener
     except ModuleNotFoundError as error:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '

@@ -16,8 +16,8 @@ from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
-from odocal_ros.settings.grades import Grade
 from odocal_ros.settings.node_configs import ApplyConfig
+from odocal_ros.settings.nominal import Grade
 
 MOST_TILTING = 0.5         # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
 START_SPAN = 2.0           # s; judgement: duration of the samples of a start
