@@ -14,67 +14,69 @@ from odocal_ros.screening.late_rows import LEAST_JITTER
 
 # judgement: limits of a stamp: lag below the least one, and age relative to the newest stamp, ns;
 # number of consecutive rows beyond a limit after which the clock was set
-ODD_NS, ODD_ROWS = 200_000_000, 10
+STAMP_LIMIT_NS, CLOCK_SET_ROWS = 200_000_000, 10
 LATEST_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, minus a time_offset
 FAST_PLAY = 1.5      # judgement: least speed of a played bag, times real time
 LAG_ROWS = 1000      # judgement: accepted rows over which the least lag increases again
 # judgement: consecutive rows, and least shift, s, of a clock step; rows of a permanent one; ns per
 # row, largest change of the median lag; lags are not used if a bag is played faster or slower by
 # this share
-MOVED_ROWS, MOVED_S, STAYS_ROWS, FOLLOW_NS, PLAYED = 3, 0.03, 50, 1e4, 0.05
+STEP_ROWS, LEAST_STEP_S, PERMANENT_ROWS, LAG_CHANGE_NS, PLAYBACK_SHARE = 3, 0.03, 50, 1e4, 0.05
 # judgement: rows before the line is used; rows of its memory, crystals are stable for longer
 FIRST_ROWS, LINE_ROWS = 20, 1000
-UNEVEN_ROWS = 100          # judgement: rows in motion of the mean roughness
+ROUGHNESS_ROWS = 100       # judgement: rows in motion of the mean roughness
 # judgement: ratio of the roughness on the line to that at arrival: the line is no longer used
 # above the first, and used again below the second
-AS_EVEN, EVENER = 1.0, 0.8
+ROUGHNESS_LIMIT, ROUGHNESS_REUSE_LIMIT = 1.0, 0.8
 LATE_SIGMA = 1.5           # judgement: sigma over mean of delays, 1 if exponential
 LATE_ROWS = 50             # judgement: rows of the mean deviation
 # judgement: least counts per interval, and least speed, m/s, to detect lost rows by the travel
 SURE_STEP, SURE_SPEED = 4.0, 0.5
-FAR = 0.5                  # judgement: least lateness of lost rows, intervals
-# judgement: consecutive rows at rest that are late by FAR: rows before them are lost; rows after
-# which this is no longer questioned
-FAR_ROWS, SURE_LOST = 25, 100
+LATE_INTERVALS = 0.5       # judgement: least lateness of lost rows, intervals
+# judgement: consecutive rows at rest that are late by LATE_INTERVALS: rows before them are lost;
+# rows after which this is no longer questioned
+LATE_REST_ROWS, SURE_LOST = 25, 100
 LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
 MOST_LOST = 5              # judgement: largest gap, intervals, without a new line
 
 
-class Arrivals:
+class StampScreen:
     """
     Test of the stamps of one topic against their arrival.
 
     Lag is arrival minus stamp. No usable stamp has a lag far below the least lag so far: it is
-    false, or the clock was set. ``jumped`` is True after ODD_ROWS consecutive stamps beyond a
-    limit; ``jump_row`` is then the first of them in the last block.
+    false, or the clock was set. ``clock_jumped`` is True after CLOCK_SET_ROWS consecutive stamps
+    beyond a limit; ``jump_row`` is then the first of them in the last block.
     """
 
     def __init__(self) -> None:
-        self.jumped = False
+        self.clock_jumped = False
         self.jump_row = 0
-        self.off_s = 0.0              # excess of the last odd stamp; negative: behind
+        self.excess_s = 0.0           # excess of the last odd stamp; negative: behind
         self.dropped = 0              # rows of the last block
-        self._odd = 0
+        self._refused_rows = 0
         self._newest_ns = 0
         self._first: tuple[int, int] | None = None      # stamp and arrival, ns
         self.rate = 1.0               # stamps over arrival time; 1 below FAST_PLAY
         self.lag_ns: float | None = None      # the least one
         self._real_time = True
-        self._usual_ns = 0.0                  # running median of the lags
-        self._lags: deque[int] = deque(maxlen=STAYS_ROWS)
+        self._median_lag_ns = 0.0             # running median of the lags
+        self._lags: deque[int] = deque(maxlen=PERMANENT_ROWS)
 
-    def moved_s(self, rows: int) -> float:
-        """Return the shift of the lag of the last rows, s; 0 if any of them is within MOVED_S."""
+    def clock_step_s(self, rows: int) -> float:
+        """Return the shift of the lag of the last rows, s; 0 if any is within LEAST_STEP_S."""
         if len(self._lags) < rows or not self._real_time or (
-                abs(self._lags[-1] - self._usual_ns) * 1e-9 <= MOVED_S):
+                abs(self._lags[-1] - self._median_lag_ns) * 1e-9 <= LEAST_STEP_S):
             return 0.0
         last = list(self._lags)[-rows:]
-        least = max(min(last) - self._usual_ns, self._usual_ns - max(last)) * 1e-9
-        return abs(sum(last) / rows - self._usual_ns) * 1e-9 if least > MOVED_S else 0.0
+        smallest_shift = max(min(last) - self._median_lag_ns,
+                             self._median_lag_ns - max(last)) * 1e-9
+        shift = abs(sum(last) / rows - self._median_lag_ns) * 1e-9
+        return shift if smallest_shift > LEAST_STEP_S else 0.0
 
-    def usable(self, rows: Sequence[Reading]) -> list[Reading]:
+    def select_usable(self, rows: Sequence[Reading]) -> list[Reading]:
         """Return the rows of the next block with a usable stamp."""
-        good: list[Reading] = []
+        accepted: list[Reading] = []
         self.jump_row = self.dropped = 0
         for k, row in enumerate(rows):
             stamp, received = row[:2]
@@ -84,43 +86,43 @@ class Arrivals:
             lag = received - stamp
             ahead = 0.0 if self.lag_ns is None else self.lag_ns - lag
             behind = self._newest_ns - stamp
-            if ahead > ODD_NS * self.rate or behind > ODD_NS:
-                self.jump_row = k if not self._odd else self.jump_row
-                self._odd += 1
+            if ahead > STAMP_LIMIT_NS * self.rate or behind > STAMP_LIMIT_NS:
+                self.jump_row = k if not self._refused_rows else self.jump_row
+                self._refused_rows += 1
                 self.dropped += behind != 0
-                self.off_s = (-behind if behind > ODD_NS else ahead) * 1e-9
-                self.jumped |= self._odd >= ODD_ROWS
+                self.excess_s = (-behind if behind > STAMP_LIMIT_NS else ahead) * 1e-9
+                self.clock_jumped |= self._refused_rows >= CLOCK_SET_ROWS
             elif behind < 0:
-                self._odd, self._newest_ns = 0, stamp
-                good.append(row)
+                self._refused_rows, self._newest_ns = 0, stamp
+                accepted.append(row)
                 if self.lag_ns is None or ahead > 0:
                     self.lag_ns = lag
                 else:
                     self.lag_ns -= ahead / LAG_ROWS
             else:
                 self.dropped += behind > 0      # a row may come twice
-            if not self._odd:
-                self._follow(lag)
-        self._take_rate(rows[-1][1] if rows else 0)
-        return good
+            if not self._refused_rows:
+                self._update_lag(lag)
+        self._update_rate(rows[-1][1] if rows else 0)
+        return accepted
 
-    def _follow(self, lag: int) -> None:
+    def _update_lag(self, lag: int) -> None:
         """Update the median lag by a lag, ns; it changes slowly, as two clocks drift."""
-        self._usual_ns = self._usual_ns if self._lags else float(lag)
-        self._usual_ns += min(max(lag - self._usual_ns, -FOLLOW_NS), FOLLOW_NS)
+        self._median_lag_ns = self._median_lag_ns if self._lags else float(lag)
+        self._median_lag_ns += min(max(lag - self._median_lag_ns, -LAG_CHANGE_NS), LAG_CHANGE_NS)
         self._lags.append(lag)
 
-    def _take_rate(self, received_ns: int) -> None:
+    def _update_rate(self, received_ns: int) -> None:
         """Update the rate of the stamps since the first block: the speed of a played bag."""
         if self._first is None:
             self._first = (self._newest_ns, received_ns) if self._newest_ns else None
         elif received_ns > self._first[1]:
             rate = (self._newest_ns - self._first[0]) / (received_ns - self._first[1])
-            self._real_time = abs(rate - 1) < PLAYED
+            self._real_time = abs(rate - 1) < PLAYBACK_SHARE
             self.rate = rate if rate > FAST_PLAY else 1.0
 
 
-class Rhythm:
+class RowTimes:
     """
     Row times of a counter without arrival jitter.
 
@@ -131,11 +133,11 @@ class Rhythm:
     """
 
     def __init__(self) -> None:
-        self._even = True      # travel is not rougher on the line
+        self._line_is_smoother = True      # travel is not rougher on the line
         self.error_s = 0.0
         self._t = -math.inf                     # s, time of the last row
         self._rows: deque[tuple[float, float, float]] = deque(maxlen=3)  # arrival, line, travel
-        self._uneven = [0.0, 0.0]               # m^2, roughness at arrival, on the line
+        self._roughness = [0.0, 0.0]               # m^2, roughness at arrival, on the line
         self._rounding = self._moved = 0.0      # m^2, of a count; (m/s)^2, mean square speed
         self._tested = 0
         self._restart()
@@ -144,10 +146,10 @@ class Rhythm:
         self._count = self._row = self._assumed = 0
         self._line = self._interval = self._late = self._step = 0.0
         self._hull: list[tuple[int, float]] = []      # rows and arrivals below all others
-        self._far: list[float] = []     # s, lateness of consecutive rows at rest
+        self._late_at_rest: list[float] = []     # s, lateness of consecutive rows at rest
         self._before = (0, 0.0, 1.0)    # row, time, interval
 
-    def place(self, t: float, travel: float, speed: float, quantum: float) -> float:
+    def next_time(self, t: float, travel: float, speed: float, quantum: float) -> float:
         """
         Return the time of the next row, s.
 
@@ -158,12 +160,12 @@ class Rhythm:
         sure = expected > max(SURE_STEP * quantum, SURE_SPEED * self._interval)
         if not sure and t - self._line > LONG_GAP and not 0 < step <= 2 * SURE_STEP * quantum:
             self._restart()      # lost rows; late ones arrive one after the other
-        self._follow(t, step, expected if sure else 0.0)
+        self._advance_line(t, step, expected if sure else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
             self._test(quantum)
-        at = self._rows[-1][1] if self._in_use() else t
-        self._t = max(at, self._t + APART, math.nextafter(self._t, math.inf))
+        row_time = self._rows[-1][1] if self._in_use() else t
+        self._t = max(row_time, self._t + APART, math.nextafter(self._t, math.inf))
         return self._t
 
     @property
@@ -179,47 +181,47 @@ class Rhythm:
         return LATE_SIGMA * self._late / (self._row - self._hull[0][0]) / self._interval
 
     def _in_use(self) -> bool:
-        return self._even and self._late > LEAST_JITTER and self._count > FIRST_ROWS
+        return self._line_is_smoother and self._late > LEAST_JITTER and self._count > FIRST_ROWS
 
-    def _follow(self, t: float, step: float, expected: float) -> None:
+    def _advance_line(self, t: float, step: float, expected: float) -> None:
         """
         Advance the line to the next row.
 
         t : s, arrival.   step : m, travel since the last row.   expected : m, travel in an
         interval, 0 if it is too small to detect lost rows.
         """
-        off = t - self._line - self._interval
+        lateness = t - self._line - self._interval
         intervals = 1
-        if expected and off > FAR * self._interval and self._count > FIRST_ROWS:
+        if expected and lateness > LATE_INTERVALS * self._interval and self._count > FIRST_ROWS:
             intervals = max(1, round(step / expected))
         if intervals > MOST_LOST:
             self._restart()
         self._step = step / intervals
-        intervals += self._lost_at_rest(t, off, expected > 0)
+        intervals += self._lost_at_rest(t, lateness, expected > 0)
         self._count += 1
         self._row += intervals
         self._fit(t)
         if self._count > 2:       # two rows determine a line
             self._late += (t - self._line - self._late) / min(self._count - 2, LATE_ROWS)
 
-    def _lost_at_rest(self, t: float, off: float, moves: bool) -> int:
+    def _lost_at_rest(self, t: float, lateness: float, moves: bool) -> int:
         """Return lost rows that the travel does not show, less those that were only late."""
         if self._assumed:
-            row, at, interval = self._before
-            least = round((t - at) / interval) - (self._row + 1 - self._assumed - row)
-            back = min(self._assumed, max(self._assumed - least, 0))
-            self._hull = [(r - back if r > row else r, s) for r, s in self._hull]
-            self._assumed = self._assumed - back if self._row - row < SURE_LOST else 0
-            if back:
-                return -back
-        if moves or off <= FAR * self._interval or self._count <= FIRST_ROWS:
-            self._far.clear()
+            row, t_before, interval = self._before
+            least_lost = round((t - t_before) / interval) - (self._row + 1 - self._assumed - row)
+            only_late = min(self._assumed, max(self._assumed - least_lost, 0))
+            self._hull = [(r - only_late if r > row else r, s) for r, s in self._hull]
+            self._assumed = self._assumed - only_late if self._row - row < SURE_LOST else 0
+            if only_late:
+                return -only_late
+        if moves or lateness <= LATE_INTERVALS * self._interval or self._count <= FIRST_ROWS:
+            self._late_at_rest.clear()
             return 0
-        self._far.append(off)
-        if len(self._far) < FAR_ROWS:
+        self._late_at_rest.append(lateness)
+        if len(self._late_at_rest) < LATE_REST_ROWS:
             return 0
-        lost = round(min(self._far) / self._interval)
-        self._far.clear()
+        lost = round(min(self._late_at_rest) / self._interval)
+        self._late_at_rest.clear()
         if not self._assumed:
             self._before = self._row, self._line, self._interval
         self._assumed += lost
@@ -245,17 +247,17 @@ class Rhythm:
         if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * SURE_STEP * quantum:
             return
         self._tested += 1
-        share = 1 / min(self._tested, UNEVEN_ROWS)
+        share = 1 / min(self._tested, ROUGHNESS_ROWS)
         for k, (a, b, c) in enumerate(((t0, t1, t2), (p0, p1, p2))):
             even = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
-            self._uneven[k] += ((s1 - even)**2 - self._uneven[k]) * share
+            self._roughness[k] += ((s1 - even)**2 - self._roughness[k]) * share
         self._moved += (((s2 - s0) / max(p2 - p0, APART))**2 - self._moved) * share
         self._rounding += (quantum**2 / 12 - self._rounding) * share
-        limit = AS_EVEN if self._even else EVENER
+        limit = ROUGHNESS_LIMIT if self._line_is_smoother else ROUGHNESS_REUSE_LIMIT
         known = self._tested > FIRST_ROWS
-        self._even = not known or self._uneven[1] <= limit**2 * self._uneven[0]
+        self._line_is_smoother = not known or self._roughness[1] <= limit**2 * self._roughness[0]
         # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
-        left = max(self._uneven[self._in_use()] / 1.5 - self._rounding, 0.0)
+        left = max(self._roughness[self._in_use()] / 1.5 - self._rounding, 0.0)
         self.error_s = math.sqrt(left / max(self._moved, APART))
         if not known:       # few rows: times of arrival may be correct
             self.error_s = max(self.error_s, LATE_SIGMA * self._late)

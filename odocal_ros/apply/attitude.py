@@ -32,7 +32,7 @@ def rotation(phi: Sequence[float]) -> Quaternion:
     return s * a, s * b, s * c, math.cos(half)
 
 
-def product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
+def quaternion_product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
     """Return the product of two quaternions, normalised."""
     (x, y, z, w), (a, b, c, d) = q, r
     i, j, k, re = (w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a,
@@ -41,7 +41,7 @@ def product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
     return i / size, j / size, k / size, re / size
 
 
-def matrix_of(q: Sequence[float]) -> Matrix:
+def rotation_matrix(q: Sequence[float]) -> Matrix:
     """Return the rotation matrix of a quaternion, which need not be normalised."""
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
@@ -50,7 +50,7 @@ def matrix_of(q: Sequence[float]) -> Matrix:
             (s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)))
 
 
-def rotated(C: Sequence[Sequence[float]], v: Sequence[float]) -> Vector:
+def rotate_vector(C: Sequence[Sequence[float]], v: Sequence[float]) -> Vector:
     """Return the product of a matrix and a vector."""
     (a, b, c), (d, e, f), (g, h, i) = C
     x, y, z = v
@@ -62,12 +62,12 @@ def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
     return y * w - z * v, z * u - x * w, x * v - y * u
 
 
-def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
+def add_scaled(a: Vector, b: Vector, times: float = 1.0) -> Vector:
     """Return the sum of a vector and a multiple of another."""
     return a[0] + b[0] * times, a[1] + b[1] * times, a[2] + b[2] * times
 
 
-def skewed(a: Sequence[float]) -> Floats:
+def cross_matrix(a: Sequence[float]) -> Floats:
     """Return the matrix of the cross product with a vector, (3, 3)."""
     x, y, z = a
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

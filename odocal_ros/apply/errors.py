@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.attitude import Matrix, plus, skewed, Vector, ZERO
+from odocal_ros.apply.attitude import add_scaled, cross_matrix, Matrix, Vector, ZERO
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.settings.levels import FAULT_SIGMAS
@@ -85,13 +85,13 @@ class Errors:
         gaps : s, parts of the interval without IMU data.
         """
         F = EYE.copy()
-        cross = skewed(travel_n)
+        cross = cross_matrix(travel_n)
         F[P, PHI], F[P, K], F[P, M] = -cross, travel_n, -cross @ C_nb[:, 1:]
-        F[PHI, BG], F[PHI, G] = C_nb * -T, plus(ZERO, turn_n, -1.0)
+        F[PHI, BG], F[PHI, G] = C_nb * -T, add_scaled(ZERO, turn_n, -1.0)
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
         tilts = self.cov[ROTATIONS, ROTATIONS].tolist()
-        self.shortening = plus(self.shortening, travel_n,
-                               min(SHORTENING * sum(tilts), LARGEST_SHORTENING))
+        self.shortening = add_scaled(self.shortening, travel_n,
+                                     min(SHORTENING * sum(tilts), LARGEST_SHORTENING))
         cov = F @ self.cov @ F.T
         along, left, up = self.slip_variances(math.hypot(*travel_n))
         hidden = sum(GAP_RATE * gap * min(1.0, gap / GAP_TIME)**2 for gap in gaps)
@@ -172,7 +172,7 @@ class Errors:
         """
         J, out = POSE.copy(), np.empty((2, 6, 6))
         J[3:, M] = [row[1:] for row in C_nb]
-        J[:3, 3:] = -skewed(arm_n) @ J[3:, 3:]
+        J[:3, 3:] = -cross_matrix(arm_n) @ J[3:, 3:]
         out[0] = J @ self.cov @ J.T
         out[0, :3, :3] += np.outer(self.shortening, self.shortening)
         # rotations about two axes cause half their product about the third

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
-from odocal_ros.apply.odometry_start import begin
+from odocal_ros.apply.arrivals import PERMANENT_ROWS, StampScreen, STEP_ROWS
+from odocal_ros.apply.odometry_start import find_start
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
 from odocal_ros.apply.stream import ImuStream
@@ -26,11 +26,19 @@ from odocal_ros.data.samples import (
     Reading,
     readings_of,
 )
-from odocal_ros.settings.levels import CLOCK_APART
+from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.settings.nominal import grade_of
 
 RESTARTS = 'odometry restarts'      # begin of the note on a restart
+
+
+def clock_difference_text(difference_s: float) -> str:
+    """Return the text on a lead of the odometer stamps over the IMU stamps, s."""
+    return (f'odometer stamps differ from IMU stamps by {difference_s:+.3g} s; the limit is '
+            f'{CLOCK_DIFFERENCE_LIMIT:g} s. Likely cause: the drivers use different clocks. '
+            'Synchronise the clocks, set odometer.arrival_time and imu.arrival_time to true, or '
+            'set use_sim_time if a bag is played')
 
 
 class Odometry:
@@ -45,7 +53,7 @@ class Odometry:
         self.vehicle, self.config = vehicle, config
         self.grade = grade_of(config.imu)
         self.restarts = 0
-        self._first_ahead: float | None = None
+        self._first_lead_s: float | None = None
         self._notes: list[str] = []
         self._reset()
 
@@ -55,86 +63,90 @@ class Odometry:
         self._notes.clear()
         return notes
 
-    def apart(self) -> float:
+    def clock_difference_s(self) -> float:
         """Return the lead of the odometer's clock over the IMU's, s, 0 if it may be a delay."""
-        ahead = self._ahead()
+        lead = self._odometer_lead_s()
         # a bag that is played fast has a coarser time of arrival
-        return ahead if abs(ahead) > CLOCK_APART and abs(ahead) > CLOCK_APART * max(
-            one.rate for one in self._arrivals.values()) else 0.0
+        rates = (screen.rate for screen in self._arrivals.values())
+        limit = CLOCK_DIFFERENCE_LIMIT * max(1.0, *rates) if self._arrivals else math.inf
+        return lead if abs(lead) > limit else 0.0
 
-    def _ahead(self) -> float:
+    def _odometer_lead_s(self) -> float:
         """Return the lead of the odometer's stamps over the IMU's, s, 0 if unknown."""
         imu = self._arrivals.get('imu')
         if imu is None or imu.lag_ns is None:
             return 0.0
-        return max((imu.lag_ns - one.lag_ns for one in self._arrivals.values()
-                    if one.lag_ns is not None), key=abs) * 1e-9
+        return max((imu.lag_ns - screen.lag_ns for screen in self._arrivals.values()
+                    if screen.lag_ns is not None), key=abs) * 1e-9
 
-    def restart(self, why: str) -> None:
+    def restart(self, reason: str) -> None:
         self.restarts += 1
-        self._notes.append(f'{RESTARTS} from the origin: {why}')
+        self._notes.append(f'{RESTARTS} from the origin: {reason}')
         self._reset()
 
     def _reset(self) -> None:
         self.wheels = Wheels(self.vehicle, self.config, self._notes)
         self.imu = ImuStream(self.config, self._notes)
-        self._arrivals: dict[str, Arrivals] = {}
+        self._arrivals: dict[str, StampScreen] = {}
         self._path: Reckoning | None = None
 
     def feed(self, slot: str, block: ImuSamples | OdometerSamples | list[Reading],
              form: OdometerForm | None = None) -> None:
         """Add rows of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
         if slot not in self._arrivals:
-            self._arrivals[slot] = Arrivals()
+            self._arrivals[slot] = StampScreen()
         arrivals = self._arrivals[slot]
         rows = block if isinstance(block, list) else readings_of(block)
-        usable = arrivals.usable(rows)
-        if arrivals.jumped:
-            self.restart(f'the {slot} stamps jump by {arrivals.off_s:+.3g} s')
+        usable = arrivals.select_usable(rows)
+        if arrivals.clock_jumped:
+            self.restart(f'the {slot} stamps jump by {arrivals.excess_s:+.3g} s')
             rows = rows[arrivals.jump_row:]
-            arrivals = self._arrivals[slot] = Arrivals()
-            usable = arrivals.usable(rows)
+            arrivals = self._arrivals[slot] = StampScreen()
+            usable = arrivals.select_usable(rows)
         if arrivals.dropped:
             self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
-                              f'from their arrival times by {arrivals.off_s:+.3g} s')
+                              f'from their arrival times by {arrivals.excess_s:+.3g} s')
         if slot == 'imu':
             self.imu.feed(usable)
         else:
             self.wheels.feed(slot, usable, form or COUNTER)
         self.wheels.zero_ns = self.imu.zero_ns
 
-    def lacking_s(self) -> float:
+    def missing_odometer_s(self) -> float:
         """Return the time from the newest odometer row to the next pose, s; inf without a path."""
-        return math.inf if self._path is None else self._path.due() - self.wheels.newest()
+        if self._path is None:
+            return math.inf
+        return self._path.next_pose_time() - self.wheels.newest()
 
     def wait_s(self) -> float:
         """Return the time until the samples of the next pose arrive, s, if without delay."""
-        return self.lacking_s() + self.imu.usual
+        return self.missing_odometer_s() + self.imu.median_interval
 
     def poses(self) -> list[Pose]:
-        apart = self.apart()
-        if apart and self._path is not None:
-            self.restart(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
-        if self._path is None and not apart:
+        clock_difference_s = self.clock_difference_s()
+        if clock_difference_s and self._path is not None:
+            self.restart(clock_difference_text(clock_difference_s))
+        if self._path is None and not clock_difference_s:
             self._path = self._begin()
         if self._path is None:
             self.imu.forget(ODOMETER_SILENCE)
             return []
-        moved = max(one.moved_s(MOVED_ROWS) for one in self._arrivals.values())
-        stays = max(one.moved_s(STAYS_ROWS) for one in self._arrivals.values()) if moved else 0.0
-        out = self._path.poses(moved, stays)
+        clock_step = max(screen.clock_step_s(STEP_ROWS) for screen in self._arrivals.values())
+        permanent_step = max(screen.clock_step_s(PERMANENT_ROWS)
+                             for screen in self._arrivals.values()) if clock_step else 0.0
+        out = self._path.poses(clock_step, permanent_step)
         if self._path.failed:
             self.restart(self._path.failed)
         return out
 
     def _begin(self) -> Reckoning | None:
-        start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
+        start = find_start(self.imu, self.wheels, self.vehicle, self.config, self.grade)
         if start is None:
             return None
-        ahead = self._ahead()
-        if self._first_ahead is None:
-            self._first_ahead = ahead
+        lead = self._odometer_lead_s()
+        if self._first_lead_s is None:
+            self._first_lead_s = lead
         # after one clock was set, the stamps have an additional offset that is not calibrated
-        delay = float(np.hypot(self.config.odometer.time_sigma, ahead - self._first_ahead))
+        delay = float(np.hypot(self.config.odometer.time_sigma, lead - self._first_lead_s))
         return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._notes,
                          delay)

@@ -42,38 +42,39 @@ class Start:
     errors: Errors
 
 
-def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
-          grade: Grade) -> Start | None:
+def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
+               grade: Grade) -> Start | None:
     """Return the start, None while there are too few samples."""
     if not wheels.ready() or not imu.rows:
         return None
     row = imu.from_time(wheels.oldest())
     if config.start.attitude:
-        return _given(row, vehicle, config, grade) if len(imu.rows) > row else None
+        return _start_from_settings(row, vehicle, config, grade) if len(imu.rows) > row else None
     end = imu.from_time(imu.rows[row].t + START_SPAN) if row < len(imu.rows) else row
     if end >= len(imu.rows) or wheels.newest() < imu.rows[end].t:
         return None
     rows = imu.rows[row:end + 1]
     t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
-    holes = np.flatnonzero(np.diff(t) > max(START_HOLE, HOLE_INTERVALS * imu.usual))
+    holes = np.flatnonzero(np.diff(t) > max(START_HOLE, HOLE_INTERVALS * imu.median_interval))
     if len(holes):
         imu.drop(row + int(holes[-1]) + 1)      # start from the rows after the gap
         return None
-    resting = wheels.still(t[0], t[-1]) and bool(
+    is_resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
-    if not resting and np.linalg.norm(_tilting(w.mean(axis=0), f.mean(axis=0))) > MOST_TILTING:
+    tilt_rate_b = _tilt_rate_b(w.mean(axis=0), f.mean(axis=0))
+    if not is_resting and np.linalg.norm(tilt_rate_b) > MOST_TILTING:
         imu.drop(end)       # implausible gyro data: wait for its end
         return None
-    return _levelled(end, float(t[-1] - t[0]), w, f, resting, vehicle, grade)
+    return _start_by_gravity(end, float(t[-1] - t[0]), w, f, is_resting, vehicle, grade)
 
 
-def _tilting(w: Floats, f: Floats) -> Floats:
+def _tilt_rate_b(w: Floats, f: Floats) -> Floats:
     """Return the horizontal part of a mean turn rate, (3,) rad/s; zero without force."""
     up = f / np.linalg.norm(f)
     return w - up * (w @ up) if np.isfinite(up).all() else np.zeros(3)
 
 
-def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
+def _start_from_settings(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
     start = config.start
     q = np.asarray(start.attitude)
     earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))
@@ -81,15 +82,15 @@ def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Sta
     return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
 
 
-def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehicle: Vehicle,
-              grade: Grade) -> Start:
+def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting: bool,
+                      vehicle: Vehicle, grade: Grade) -> Start:
     """Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated."""
     mean = f.mean(axis=0)
-    level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
-    C_Lb = level_frame(mean) if level else vehicle.C_vb
+    is_level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
+    C_Lb = level_frame(mean) if is_level else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
     C_nb = C_nL(-np.arctan2(forward[1], forward[0])) @ C_Lb
-    if resting:
+    if is_resting:
         bias = w.mean(axis=0)
         noise = np.maximum(grade.gyro_noise / np.sqrt(length), w.std(axis=0) / np.sqrt(len(w)))
         sigma = np.hypot(noise, grade.gyro_bias_walk * np.sqrt(length))
@@ -97,6 +98,6 @@ def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehi
         known = vehicle.gyro_bias is not None
         bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
     errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
-    if level:        # correlates the tilt with the accelerometer bias
-        errors.correct_by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else BRAKING_SIGMA)
+    if is_level:        # correlates the tilt with the accelerometer bias
+        errors.correct_by_gravity(C_nb, np.zeros(3), length, 0.0 if is_resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

@@ -74,26 +74,27 @@ class Pose:
         return math.isfinite(sum(values)) and min(values[7:43:7] + values[49::7]) >= 0
 
 
-def raw_of(position: Vector, q: Quaternion, twist: Sequence[float],
-           covariances: Sequence[bytes]) -> bytes:
+def pack_pose(position: Vector, q: Quaternion, twist: Sequence[float],
+              covariances: Sequence[bytes]) -> bytes:
     """Return the floats of a pose as in a message: m, x y z w, 6 m/s, rad/s, two covariances."""
     of_pose, of_twist = covariances
     return PLACE.pack(*position, *q) + of_pose + MOTION.pack(*twist) + of_twist
 
 
-def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[float],
-                swing: Sequence[float], variances: Sequence[float]) -> list[bytes]:
+def covariances(from_errors: Floats, by_delay: Sequence[float], along_n: Sequence[float],
+                twist_by_turn: Sequence[float], variances: Sequence[float]) -> list[bytes]:
     """
     Return the covariances of pose and twist, (6, 6) each, as in a message.
 
-    by_errors : (2, 6, 6), by the error state.   late : (6,) effect of one sigma of the delay on
-    the pose.   along_n : (3,) m, one sigma of the travel.   swing : (6,) effect of one sigma of
-    the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
+    from_errors : (2, 6, 6), by the error state.   by_delay : (6,) effect of one sigma of the delay
+    on the pose.   along_n : (3,) m, one sigma of the travel.   twist_by_turn : (6,) effect of one
+    sigma of the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
     """
     x, y, z = map(math.sqrt, variances)
-    off = np.array([[late, (*along_n, *NONE[3:]), NONE, NONE],
-                    [swing, (x, *NONE[1:]), (0.0, y, *NONE[2:]), (0.0, 0.0, z, *NONE[3:])]])
-    return [cov.tobytes() for cov in by_errors + off.swapaxes(1, 2) @ off]
+    off = np.array([[by_delay, (*along_n, *NONE[3:]), NONE, NONE],
+                    [twist_by_turn, (x, *NONE[1:]), (0.0, y, *NONE[2:]),
+                     (0.0, 0.0, z, *NONE[3:])]])
+    return [cov.tobytes() for cov in from_errors + off.swapaxes(1, 2) @ off]
 
 
 def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:

@@ -18,21 +18,21 @@ import math
 import numpy as np
 
 from odocal_ros.apply.attitude import (
+    add_scaled,
     cross,
     Matrix,
-    matrix_of,
-    plus,
-    product,
     Quaternion,
-    rotated,
+    quaternion_product,
+    rotate_vector,
     rotation,
     rotation_increment,
+    rotation_matrix,
     Vector,
     ZERO,
 )
 from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
 from odocal_ros.apply.odometry_start import Start
-from odocal_ros.apply.pose import covariances, Pose, raw_of, velocity_variances
+from odocal_ros.apply.pose import covariances, pack_pose, Pose, velocity_variances
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import DelaySearch, Wheels
@@ -73,33 +73,33 @@ class Reckoning:
         self._arm_b, self._q_bv = vehicle.arm_b.tolist(), vehicle.q_bv.tolist()
         self._t = self._t_pose = self._t_corrected = self.imu.rows[self.imu.at].t
         self._s = self._s_pose = self.wheels.at(self._t)
-        self._C_nb = matrix_of(self.q)
-        self._turn_b, self._dv_n, self._levels = ZERO, ZERO, True
+        self._C_nb = rotation_matrix(self.q)
+        self._turn_b, self._dv_n, self._force_is_usable = ZERO, ZERO, True
         self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
         self._rates: list[Vector] = []
-        self._rested, self._mismatch_count, self._implausible_turn = False, 0, PLAUSIBLE
+        self._was_resting, self._mismatch_count, self._implausible_turn = False, 0, PLAUSIBLE
         self._v_corrected = self._velocity_n(self._t)
         # m/s in n: velocity at the start plus changes by turns
-        self._swung: Vector = tuple(self._v_corrected.tolist())
-        self._moved = self._stays = 0.0      # s, clock steps: newest, and permanent
+        self._turned_velocity_n: Vector = tuple(self._v_corrected.tolist())
+        self._clock_step = self._permanent_step = 0.0      # s, clock steps: newest, and permanent
         self._travel_variance = self._T_cov = 0.0      # m^2, of travel since the last pose; s
-        self._arm0_n = rotated(self._C_nb, self._arm_b)
+        self._arm0_n = rotate_vector(self._C_nb, self._arm_b)
 
-    def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
+    def poses(self, clock_step: float = 0.0, permanent_step: float = 0.0) -> list[Pose]:
         """
         Return the poses that are due and whose samples have arrived.
 
-        moved, stays : s, clock step by the last rows, and if it is permanent.
+        clock_step, permanent_step : s, by the last rows; by the last PERMANENT_ROWS.
         """
         out: list[Pose] = []
-        if stays and not self._stays:
-            self._notes.append(f'stamps shifted by {stays:.2g} s relative to their arrival times; '
-                               'sigma increased. Likely cause: a clock was set, or messages are '
-                               'late')
-        self._stays = max(self._stays, stays)
-        moved = max(self._stays, moved)
-        self.errors.changed |= moved != self._moved
-        self._moved = moved
+        if permanent_step and not self._permanent_step:
+            self._notes.append(f'stamps shifted by {permanent_step:.2g} s relative to their '
+                               'arrival times; sigma increased. Likely cause: a clock was set, '
+                               'or messages are late')
+        self._permanent_step = max(self._permanent_step, permanent_step)
+        clock_step = max(self._permanent_step, clock_step)
+        self.errors.changed |= clock_step != self._clock_step
+        self._clock_step = clock_step
         while not self.failed and (last := self._next()) is not None:
             received = self.imu.rows[last].t <= self.wheels.newest()
             self._advance(last)
@@ -116,13 +116,13 @@ class Reckoning:
                 self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)
         return out
 
-    def due(self) -> float:
+    def next_pose_time(self) -> float:
         """Return the earliest time of the next pose, s."""
         return self._t_pose + 1 / self.config.publish.rate - 1e-6
 
     def _next(self) -> int | None:
         """Return the IMU row of the next pose, None until all its samples have arrived."""
-        rows, last = self.imu.rows, self.imu.from_time(self.due(), self.imu.at + 1)
+        rows, last = self.imu.rows, self.imu.from_time(self.next_pose_time(), self.imu.at + 1)
         return last if last < len(rows) - 1 and (      # a cubic needs the next sample
             rows[last].t <= self.wheels.newest()
             or rows[-1].t - rows[last].t >= ODOMETER_SILENCE) else None
@@ -133,65 +133,68 @@ class Reckoning:
         low = max(at - 1, 0)      # a cubic needs the samples before and after
         rows = imu.rows[low:last + 2]
         own = rows[at - low:-1]
-        t, w = [row.t for row in rows], [plus(row.w_b, self.bias, -1.0) for row in rows]
-        f = [plus(row.f_b, self.accel_bias, -1.0) for row in own]
+        t, w = [row.t for row in rows], [add_scaled(row.w_b, self.bias, -1.0) for row in rows]
+        f = [add_scaled(row.f_b, self.accel_bias, -1.0) for row in own]
         s = [self.wheels.at(row.t) for row in own]
         gaps = [b.t - a.t for a, b in pairwise(own)]
-        lost, self._s = abs(s[0] - self._s), s[-1]
+        dropped_travel, self._s = abs(s[0] - self._s), s[-1]
         C_nb, turn_b, travel_n, dv_n = self._C_nb, ZERO, ZERO, ZERO
-        forward_n, f_n = rotated(C_nb, self._forward_b), rotated(C_nb, f[0])
+        forward_n, f_n = rotate_vector(C_nb, self._forward_b), rotate_vector(C_nb, f[0])
         for k, T in enumerate(gaps):
             phi = rotation_increment(t, w, at - low + k)
-            C_nb = self._turn(phi, T)
-            forward_before, forward_n = forward_n, rotated(C_nb, self._forward_b)
-            f_before, f_n = f_n, rotated(C_nb, f[k + 1])
-            turn_b = plus(turn_b, phi)
-            travel_n = plus(travel_n, plus(forward_before, forward_n), (s[k + 1] - s[k]) / 2)
-            dv_n = plus(dv_n, plus(f_before, f_n), T / 2)
-        self._C_nb, self.position = C_nb, plus(self.position, travel_n)
-        self._dv_n = plus(self._dv_n, dv_n)
-        T, turn_n = t[-2] - self._t, rotated(C_nb, turn_b)
-        holes = [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual]
-        self._propagate(T, travel_n, turn_n, holes, self.wheels.variance_between(self._t, t[-2]))
-        self._swung = plus(self._swung, cross(turn_n, travel_n), 1 / T)
-        self._add_turn_variance([row.strange for row in own[1:]], gaps)
-        if lost > self.wheels.quantum:
-            self.errors.add_travel(lost)
-        calm = self._implausible_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
-        self._levels &= calm and math.isfinite(sum(dv_n))
-        self._turn_b = plus(self._turn_b, turn_b)
+            C_nb = self._rotated_by(phi, T)
+            forward_before, forward_n = forward_n, rotate_vector(C_nb, self._forward_b)
+            f_before, f_n = f_n, rotate_vector(C_nb, f[k + 1])
+            turn_b = add_scaled(turn_b, phi)
+            travel_n = add_scaled(travel_n, add_scaled(forward_before, forward_n),
+                                  (s[k + 1] - s[k]) / 2)
+            dv_n = add_scaled(dv_n, add_scaled(f_before, f_n), T / 2)
+        self._C_nb, self.position = C_nb, add_scaled(self.position, travel_n)
+        self._dv_n = add_scaled(self._dv_n, dv_n)
+        T, turn_n = t[-2] - self._t, rotate_vector(C_nb, turn_b)
+        long_gaps = [gap for gap in gaps if gap > HOLE_INTERVALS * imu.median_interval]
+        self._propagate(T, travel_n, turn_n, long_gaps,
+                        self.wheels.variance_between(self._t, t[-2]))
+        self._turned_velocity_n = add_scaled(self._turned_velocity_n, cross(turn_n, travel_n),
+                                             1 / T)
+        self._add_turn_variance([row.implausible for row in own[1:]], gaps)
+        if dropped_travel > self.wheels.quantum:
+            self.errors.add_travel(dropped_travel)
+        is_plausible = self._implausible_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
+        self._force_is_usable &= is_plausible and math.isfinite(sum(dv_n))
+        self._turn_b = add_scaled(self._turn_b, turn_b)
         self._rates += [row.w_b for row in own[1:]]
         self._t, imu.at = t[-2], last
 
-    def _turn(self, phi: Vector, T: float) -> Matrix:
-        self.q = product(self.q, rotation(phi))
+    def _rotated_by(self, phi: Vector, T: float) -> Matrix:
+        self.q = quaternion_product(self.q, rotation(phi))
         if any(self._earth_n):
-            self.q = product(rotation(plus(ZERO, self._earth_n, -T)), self.q)
-        return matrix_of(self.q)
+            self.q = quaternion_product(rotation(add_scaled(ZERO, self._earth_n, -T)), self.q)
+        return rotation_matrix(self.q)
 
     def _propagate(self, T: float, travel_n: Vector, turn_n: Vector, gaps: list[float],
                    variance: float) -> None:
         """Propagate the errors every PROPAGATION_PERIOD, or at once if data are uncertain."""
         self._pending_s += T
         self._travel_variance += variance
-        self._pending_travel = plus(self._pending_travel, travel_n)
-        self._pending_turn = plus(self._pending_turn, turn_n)
+        self._pending_travel = add_scaled(self._pending_travel, travel_n)
+        self._pending_turn = add_scaled(self._pending_turn, turn_n)
         if self._pending_s > PROPAGATION_PERIOD - 1e-6 or variance or gaps:
             C_nb = np.array(self._C_nb)
             self.errors.propagate(self._pending_s, C_nb, self._pending_travel, self._pending_turn,
                                   C_nb @ self.vehicle.C_vb.T, variance, gaps)
             self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
 
-    def _add_turn_variance(self, strange: list[Vector], gaps: list[float]) -> None:
+    def _add_turn_variance(self, implausible: list[Vector], gaps: list[float]) -> None:
         """Add the variance of implausible turn rates in b, rad/s, each over a gap, s."""
-        if all(size is ZERO for size in strange):
+        if all(size is ZERO for size in implausible):
             self._implausible_turn = PLAUSIBLE
             return
         C_nb = np.array(self._C_nb)
         if self._implausible_turn is PLAUSIBLE:
-            self._notes.append(f'the gyro jumps in one sample by {np.max(strange):.2g} rad/s, '
+            self._notes.append(f'the gyro jumps in one sample by {np.max(implausible):.2g} rad/s, '
                               'more than a vehicle can turn: the gyro is down-weighted')
-        turn = self._implausible_turn + np.array(gaps) @ strange
+        turn = self._implausible_turn + np.array(gaps) @ implausible
         self.errors.add_turn(C_nb @ np.diag(turn**2 - self._implausible_turn**2) @ C_nb.T)
         self._implausible_turn = turn
         if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
@@ -199,10 +202,10 @@ class Reckoning:
 
     def _velocity_n(self, t: float) -> Floats:
         v, C_nb = self.vehicle, np.array(self._C_nb)
-        moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
+        travel = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
         arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
-        rate = plus(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
-        return C_nb @ (v.forward_b * moved / SPEED_SPAN + cross(rate, arm_b.tolist()))
+        rate = add_scaled(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
+        return C_nb @ (v.forward_b * travel / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _correct_periodically(self) -> None:
         T = self._t - self._t_corrected
@@ -210,35 +213,36 @@ class Reckoning:
             return
         velocity, received = self._velocity_n(self._t), self._t <= self.wheels.newest()
         w = np.array(self._rates)
-        resting = received and self.wheels.still(self._t_corrected, self._t) and bool(
+        is_resting = received and self.wheels.still(self._t_corrected, self._t) and bool(
             (w.std(axis=0) < REST_TURN).all()
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
         # the first period of a standstill may contain the end of braking
-        standing = resting and self._rested
-        if self.config.levelling and received and self._levels:
+        is_standing = is_resting and self._was_resting
+        if self.config.levelling and received and self._force_is_usable:
             residual_n = (np.array(self._dv_n) - velocity + self._v_corrected) / T - GRAVITY_N
             variance = self.wheels.variance_between(self._t_corrected, self._t)
             noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(variance) / T**2)
-            by = self.errors.correct_by_gravity(
+            correction = self.errors.correct_by_gravity(
                 np.array(self._C_nb), residual_n, T,
-                0.0 if standing and not variance else np.hypot(DRIVING_FORCE, noise))
-            if by is None:
+                0.0 if is_standing and not variance else np.hypot(DRIVING_FORCE, noise))
+            if correction is None:
                 self._add_mismatch(residual_n, velocity, T, w)
             else:
                 self._mismatch_count = 0
-                self._correct(by)
+                self._correct(correction)
                 # error of the linearisation for a large correction
-                self.errors.add_turn(np.eye(3) * np.sum(by[PHI]**2)**2 / 4)
-        if self.config.levelling and standing:
+                self.errors.add_turn(np.eye(3) * np.sum(correction[PHI]**2)**2 / 4)
+        if self.config.levelling and is_standing:
             of_rate = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_n
             self._correct(self.errors.correct_by_rest(rate_b, of_rate))
         self.errors.changed |= self._delay.take(
-            rotated(self._C_nb, self._forward_b),
-            velocity - self._v_corrected if received and self._levels else None, self._dv_n, T)
-        self._rested = resting
+            rotate_vector(self._C_nb, self._forward_b),
+            velocity - self._v_corrected if received and self._force_is_usable else None,
+            self._dv_n, T)
+        self._was_resting = is_resting
         self._t_corrected, self._v_corrected = self._t, self._velocity_n(self._t)
-        self._dv_n, self._levels, self._rates = ZERO, True, []
+        self._dv_n, self._force_is_usable, self._rates = ZERO, True, []
 
     def _add_mismatch(self, residual_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
         """Report a force that contradicts the odometer; increase the variance of the last T s."""
@@ -253,39 +257,44 @@ class Reckoning:
         if self._mismatch_count >= MOST_MISMATCHES and abs(length - GRAVITY) < GRAVITY_TOLERANCE:
             self.failed = f'specific force and attitude disagree for {self._mismatch_count} s'
 
-    def _correct(self, by: Floats) -> None:
-        self.q = product(rotation(by[PHI].tolist()), self.q)
-        self._C_nb, self.bias = matrix_of(self.q), plus(self.bias, by[BG].tolist())
-        self.accel_bias = plus(self.accel_bias, by[BA].tolist())
+    def _correct(self, correction: Floats) -> None:
+        self.q = quaternion_product(rotation(correction[PHI].tolist()), self.q)
+        self._C_nb = rotation_matrix(self.q)
+        self.bias = add_scaled(self.bias, correction[BG].tolist())
+        self.accel_bias = add_scaled(self.accel_bias, correction[BA].tolist())
 
     def _pose(self) -> Pose:
         T, C_bn = self._t - self._t_pose, tuple(zip(*self._C_nb, strict=True))
-        arm_n = rotated(self._C_nb, self._arm_b)
-        rate_b = plus(plus(ZERO, self._turn_b, 1 / T), rotated(C_bn, self._earth_n), -1.0)
-        swing, speed = self.vehicle.swing(rate_b), (self._s - self._s_pose) / T
+        arm_n = rotate_vector(self._C_nb, self._arm_b)
+        rate_b = add_scaled(add_scaled(ZERO, self._turn_b, 1 / T),
+                            rotate_vector(C_bn, self._earth_n), -1.0)
+        twist_by_turn, speed = self.vehicle.twist_by_turn(rate_b), (self._s - self._s_pose) / T
         if abs(speed) > FASTEST:
             self._notes.append(f'the speed is {speed:.0f} m/s; the limit is {FASTEST:.0f} m/s. '
                                'Likely cause: the calibration is of another odometer or unit')
         if self.errors.changed or abs(T - self._T_cov) > PERIOD_CHANGE * self._T_cov:
-            self._T_cov, self._covariances = T, self._uncertainty(T, speed, arm_n, rate_b, swing)
+            self._T_cov = T
+            self._covariances = self._uncertainty(T, speed, arm_n, rate_b, twist_by_turn)
         self._t_pose, self._s_pose = self._t, self._s
         self._turn_b, self._travel_variance = ZERO, 0.0
-        return Pose(self.imu.rows[self.imu.at].stamp_ns, raw_of(
-            plus(plus(self.position, arm_n), self._arm0_n, -1.0), product(self.q, self._q_bv),
-            (swing[0] + speed, *swing[1:]), self._covariances))
+        return Pose(self.imu.rows[self.imu.at].stamp_ns, pack_pose(
+            add_scaled(add_scaled(self.position, arm_n), self._arm0_n, -1.0),
+            quaternion_product(self.q, self._q_bv),
+            (twist_by_turn[0] + speed, *twist_by_turn[1:]), self._covariances))
 
     def _uncertainty(self, T: float, speed: float, arm_n: Vector, rate_b: Vector,
-                     swing: Sequence[float]) -> list[bytes]:
+                     twist_by_turn: Sequence[float]) -> list[bytes]:
         """Return the covariances of pose and twist after T s, as in a message."""
-        forward_n = rotated(self._C_nb, self._forward_b)
+        forward_n = rotate_vector(self._C_nb, self._forward_b)
         # a delay changes the position by delay times the change of velocity by accelerations along
         # the path; a clock step also changes the time of the pose
-        delay = math.hypot(self._delay.sigma_s, self._moved, self.wheels.delay_s)
-        late = (*plus(ZERO, plus(self._swung, forward_n, -speed), delay),
-                *plus(ZERO, rotated(self._C_nb, rate_b), self._moved))
+        delay = math.hypot(self._delay.sigma_s, self._clock_step, self.wheels.delay_s)
+        by_delay = (*add_scaled(ZERO, add_scaled(self._turned_velocity_n, forward_n, -speed),
+                                delay),
+                    *add_scaled(ZERO, rotate_vector(self._C_nb, rate_b), self._clock_step))
         now, since = self.wheels.variances(self._t, T)
         return covariances(
-            self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), late,
-            plus(ZERO, forward_n, math.sqrt(now)),
-            [self.errors.grade.gyro_scale_error * one for one in swing],
+            self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), by_delay,
+            add_scaled(ZERO, forward_n, math.sqrt(now)),
+            [self.errors.grade.gyro_scale_error * component for component in twist_by_turn],
             velocity_variances(self.vehicle, speed, T, since + self._travel_variance))

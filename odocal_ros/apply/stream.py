@@ -16,7 +16,7 @@ from itertools import pairwise
 from operator import itemgetter
 from typing import NamedTuple
 
-from odocal_ros.apply.attitude import rotated, Vector, ZERO
+from odocal_ros.apply.attitude import rotate_vector, Vector, ZERO
 from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.screening.glitches import (
@@ -51,14 +51,14 @@ class Row(NamedTuple):
     A row of the IMU.
 
     t : s since the first.   w_b, f_b : rad/s, m/s^2; NO_FORCE: no force published.
-    strange : rad/s, implausible part of the turn rate.
+    implausible : rad/s, implausible part of the turn rate.
     """
 
     t: float
     stamp_ns: int
     w_b: Vector
     f_b: Vector
-    strange: Vector = ZERO
+    implausible: Vector = ZERO
 
 
 time_of = itemgetter(0)      # definition: sort key of a row
@@ -70,10 +70,10 @@ def is_possible(w_b: Vector, f_b: Vector) -> bool:
     return _within(w_b, MOST_TURN) and (f_b is NO_FORCE or _within(f_b, MOST_FORCE))
 
 
-def _within(a: Vector, most: float) -> bool:
-    """Return True if all elements of a vector are within ``most``; False for NaN."""
+def _within(a: Vector, limit: float) -> bool:
+    """Return True if all elements of a vector are within ``limit``; False for NaN."""
     x, y, z = a
-    return abs(x) <= most and abs(y) <= most and abs(z) <= most
+    return abs(x) <= limit and abs(y) <= limit and abs(z) <= limit
 
 
 class SpikeScreen:
@@ -89,35 +89,35 @@ class SpikeScreen:
         self._since = 0.0                   # s, begin of equal rows
         self._kept: deque[Row] = deque(maxlen=ROWS_BESIDE + 1)
         self._dropped = False               # a row was dropped since the last kept one
-        self._strange = ZERO                # rad/s, implausible step of the gyro
+        self._step_size = ZERO                # rad/s, implausible step of the gyro
         self._before = ZERO                 # rad/s, rate before the step
         self._until = 0.0                   # s, end of the implausible part
 
-    def sift(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    def screen(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
         kept, k = [], 0
         while k < len(rows):
             row, last = rows[k], self._kept[-1] if self._kept else rows[k]
-            step, alone, back = _step(last, row), self._alone(rows[k:k + 2]), None
-            if any(self._leaves(step)) and not self._is_over(row):
+            step, isolated, return_row = _step(last, row), self._isolated_axes(rows[k:k + 2]), None
+            if any(self._exceeds_usual(step)) and not self._is_over(row):
                 within = bisect_right(rows, last.t + GLITCH_TIME, key=time_of)
-                back = self._back(last, rows[k + 1:within], step)
-                if back is None and within == len(rows):
+                return_row = self._rows_until_return(last, rows[k + 1:within], step)
+                if return_row is None and within == len(rows):
                     break
-            if any(alone) and k + 1 == len(rows) and back is None:
+            if any(isolated) and k + 1 == len(rows) and return_row is None:
                 break                  # wait for the next row
-            self._learn(step)
+            self._update_usual_step(step)
             if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
                 self._since = row.t
-            self._dropped = back is not None or row.t - self._since > STUCK_TIME
+            self._dropped = return_row is not None or row.t - self._since > STUCK_TIME
             if not self._dropped:
-                strange = self._implausible_part(last, row, alone)
-                kept.append(row if strange is ZERO else row._replace(strange=strange))
+                implausible = self._implausible_part(last, row, isolated)
+                kept.append(row if implausible is ZERO else row._replace(implausible=implausible))
                 self._kept.append(row)
-            k += 1 + (back or 0)
+            k += 1 + (return_row or 0)
         return kept, list(rows[k:])
 
-    def _alone(self, rows: Sequence[Row]) -> tuple[bool, ...]:
+    def _isolated_axes(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """Return a mask of the gyro axes with an isolated step: a turn starts over several."""
         kept = self._kept
         if self._dropped or len(kept) <= ROWS_BESIDE or (
@@ -132,31 +132,31 @@ class SpikeScreen:
 
     def _is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
-        return self._strange is not ZERO and (row.t > self._until or all(
+        return self._step_size is not ZERO and (row.t > self._until or all(
             abs(w - before) <= BACK_SHARE * size for w, before, size in zip(
-                row.w_b, self._before, self._strange, strict=True) if size))
+                row.w_b, self._before, self._step_size, strict=True) if size))
 
-    def _implausible_part(self, last: Row, row: Row, alone: Sequence[bool]) -> Vector:
+    def _implausible_part(self, last: Row, row: Row, isolated: Sequence[bool]) -> Vector:
         """Return the implausible part of a rate, rad/s: the size of the step at its start."""
         if self._is_over(row):
-            self._strange = ZERO
-        elif self._strange is ZERO:
-            most = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
-            if any(alone) or _largest(last.w_b, row.w_b) > most:
+            self._step_size = ZERO
+        elif self._step_size is ZERO:
+            limit = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
+            if any(isolated) or _largest(last.w_b, row.w_b) > limit:
                 steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
-                x, y, z = (size if odd or size > most else 0.0
-                           for size, odd in zip(steps, alone or ZERO, strict=True))
-                self._strange, self._before = (x, y, z), last.w_b
+                x, y, z = (size if odd or size > limit else 0.0
+                           for size, odd in zip(steps, isolated or ZERO, strict=True))
+                self._step_size, self._before = (x, y, z), last.w_b
                 self._until = row.t + STRANGE_TURN_TIME
-        return self._strange
+        return self._step_size
 
-    def _leaves(self, step: Pair) -> tuple[bool, bool]:
+    def _exceeds_usual(self, step: Pair) -> tuple[bool, bool]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         return (turn > max(1.0, USUAL_STEPS * usual_turn),
                 force > max(1.0, USUAL_STEPS * usual_force))
 
-    def _learn(self, step: Pair) -> None:
+    def _update_usual_step(self, step: Pair) -> None:
         """Update the mean step; a single spike has little effect."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         self._usual = (
@@ -164,12 +164,12 @@ class SpikeScreen:
             usual_force + (min(force, 4 * usual_force + 1 / USUAL_STEPS) - usual_force)
             / USUAL_ROWS)
 
-    def _back(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
+    def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
         """Return the number of the row where the values are back after a step, None without."""
-        leaves = self._leaves(step)
+        exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
             if all(left <= BACK_SHARE * size for left, size, bound in zip(
-                    _step(last, row), step, leaves, strict=True) if bound):
+                    _step(last, row), step, exceeds, strict=True) if bound):
                 return k
         return None
 
@@ -195,9 +195,10 @@ def is_single(rows: Sequence[Row]) -> bool:
     if len(rows) < SINGLE_ROWS:
         return False
     before, row, after = rows[-3:]
-    leaves = 1 - EQUAL_NEIGHBOURS / 2      # least step to an outlier, in distances to the mean
-    if not (_largest(before.w_b, row.w_b) > leaves * SINGLE_TURN
-            or _largest(before.f_b, row.f_b) > leaves * SINGLE_FORCE):
+    # least step to an outlier, in distances to the mean
+    least_share = 1 - EQUAL_NEIGHBOURS / 2
+    if not (_largest(before.w_b, row.w_b) > least_share * SINGLE_TURN
+            or _largest(before.f_b, row.f_b) > least_share * SINGLE_FORCE):
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
     for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
@@ -214,7 +215,7 @@ class ImuStream:
     """
     Usable rows of the IMU in order of time.
 
-    at : current row of the path.   zero_ns : stamp of t = 0.   usual : s, median interval.
+    at : current row of the path.   zero_ns : stamp of t = 0.   median_interval : s.
     notes : list for texts on dropped rows.
     """
 
@@ -229,37 +230,37 @@ class ImuStream:
         self.rows: list[Row] = []
         self.zero_ns = 0
         self.at = 0
-        self.usual = 0.0
-        self._unmeasured = 0        # rows since ``usual`` was measured
+        self.median_interval = 0.0
+        self._unmeasured = 0        # rows since ``median_interval`` was measured
 
     def feed(self, readings: Sequence[Reading]) -> None:
         """Add rows with rising stamps; possible spikes are held until the next call."""
         rows, before = self._held, len(self._held)
         for stamp, _, w_i, f_i, *_ in readings:
-            w_b, f_b = rotated(self._gyro, w_i), rotated(self._accel, f_i)
+            w_b, f_b = rotate_vector(self._gyro, w_i), rotate_vector(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
                 f_b = NO_FORCE
             if is_possible(w_b, f_b):
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._say_dropped(before + len(readings) - len(rows),
-                          'hold NaN or impossible values')
-        kept, self._held = self._screen.sift(rows)
-        self._say_dropped(len(rows) - len(kept) - len(self._held),
-                          'jump and return, or repeat one value')
+        self._note_dropped(before + len(readings) - len(rows),
+                           'hold NaN or impossible values')
+        kept, self._held = self._screen.screen(rows)
+        self._note_dropped(len(rows) - len(kept) - len(self._held),
+                           'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
             if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
-                self._say_dropped(1, 'are isolated outliers')
+                self._note_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
         self._unmeasured += len(kept)
         few = len(self.rows) < INTERVAL_ROWS
         if len(self.rows) > 1 and (few or self._unmeasured > INTERVAL_ROWS // 4):
             steps = sorted(b.t - a.t for a, b in pairwise(self.rows[-INTERVAL_ROWS:]))
-            self.usual, self._unmeasured = steps[len(steps) // 2], 0
+            self.median_interval, self._unmeasured = steps[len(steps) // 2], 0
 
-    def _say_dropped(self, rows: int, why: str) -> None:
+    def _note_dropped(self, rows: int, why: str) -> None:
         if rows:
             self._notes.append(f'{rows} IMU messages dropped and interpolated: they {why}')
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.apply.attitude import cross, rotated, skewed, Vector
+from odocal_ros.apply.attitude import cross, cross_matrix, rotate_vector, Vector
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
@@ -46,7 +46,7 @@ class Vehicle:
     pitch_sigma: float
     lever_arm: Floats
     gyro_bias: Floats | None
-    guessed: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
 
     @cached_property
     def forward_b(self) -> Floats:
@@ -66,12 +66,12 @@ class Vehicle:
     @cached_property
     def twist_b(self) -> Floats:
         """Return the matrix from a turn rate in b to the twist of base_link: (6, 3)."""
-        return np.concatenate([skewed(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
+        return np.concatenate([cross_matrix(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
 
-    def swing(self, rate_b: Vector) -> tuple[float, ...]:
+    def twist_by_turn(self, rate_b: Vector) -> tuple[float, ...]:
         """Return ``twist_b`` times a turn rate in b, rad/s, as numbers."""
         C_vb, lever_v = self._plain
-        rate_v = rotated(C_vb, rate_b)
+        rate_v = rotate_vector(C_vb, rate_b)
         return *cross(lever_v, rate_v), *rate_v
 
     @cached_property
@@ -105,14 +105,14 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     nominal = config.imu.nominal_yaw
     yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
     pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
-    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {sigma:.2g} rad'
-                    for name, (value, sigma) in (('yaw_mounting_angle', yaw),
-                                                 ('pitch_mounting_angle', pitch))
-                    if name not in estimates or estimates[name].value is None)
+    assumptions = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {sigma:.2g} rad'
+                        for name, (value, sigma) in (('yaw_mounting_angle', yaw),
+                                                     ('pitch_mounting_angle', pitch))
+                        if name not in estimates or estimates[name].value is None)
     bias = np.array([estimate_of(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
     return Vehicle(
         scale, sigma / scale, None if math.isnan(left + right) else (left, right),
         yaw[0], pitch[0], yaw[1], pitch[1],
         np.array([estimate_of(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
             'xyz', config.odometer.lever_arm, strict=True)]),
-        None if np.isnan(bias).any() else bias, guessed)
+        None if np.isnan(bias).any() else bias, assumptions)

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 import math
 
-from odocal_ros.apply.arrivals import Rhythm
+from odocal_ros.apply.arrivals import RowTimes
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
@@ -30,8 +30,8 @@ LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
 HUNG_JITTERS = 2.0    # judgement: limit of a counter that stops abruptly; a held one has 3
 # judgement: rows before the first test; least number of consecutive refused rows, and their
 # duration, s, before one is accepted
-SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
-UNSURE_TIME = 1.0    # s; judgement: after it, acceleration may explain a step of the speed
+TESTED_FROM_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
+UNEXPLAINED_TIME = 1.0    # s; judgement: after it, acceleration may explain a step of the speed
 KEPT_TIME = 60.0    # s; judgement: age of rows that are dropped, also without IMU messages
 LEAST_BEND = 1e-3    # m; judgement: smaller errors of travel between two speeds are below slip
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, median intervals; judgement: least gap
@@ -49,13 +49,13 @@ class Wheel:
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
         self.quantum = 0.0             # m, size of a count, 0 if values are not counts
         self.speed = 0.0               # m/s, of the last rows
-        self.usual = 0.0               # s between rows
-        self.hung = False              # it stopped abruptly, and has not moved since
+        self.mean_interval = 0.0       # s between rows
+        self.is_hung = False           # it stopped abruptly, and has not moved since
         self.notes: list[str] = []
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
         self.uncertain: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
-        self._rhythm = Rhythm()
+        self._row_times = RowTimes()
         self._arrival = -math.inf      # s, of the last row
         self._value: int | float | None = None
         self._rows = self._refused = 0
@@ -67,7 +67,8 @@ class Wheel:
         self._jitter = STAMP_BURST / JITTERS if form.quantity != 'rate' else 0.0
         # after refused rows: unexplained change of speed, m/s, its travel, m, its duration, s, and
         # the speed before, m/s
-        self._unsure = self._unsure_travel = self._unsure_time = self._sure_speed = 0.0
+        self._unexplained_speed = self._unexplained_travel = 0.0
+        self._unexplained_time = self._speed_before = 0.0
 
     def feed(self, t: Sequence[float], value: Sequence[float]) -> None:
         """Add rows: times, s, and raw values. Repeated times and NaN are skipped."""
@@ -103,14 +104,14 @@ class Wheel:
         if self.form.quantity == 'rate':
             return 0.0
         travel = self.at(t) - self.at(t - T)
-        off = self._rhythm.error_s * travel / T
-        return 2.0 * off**2 * min(1.0, T / self.usual if self.usual else 1.0)**2 + (
-            self._rhythm.rate_error * travel)**2
+        deviation = self._row_times.error_s * travel / T
+        share = min(1.0, T / self.mean_interval) if self.mean_interval else 1.0
+        return 2.0 * deviation**2 * share**2 + (self._row_times.rate_error * travel)**2
 
     @property
     def delay_s(self) -> float:
         """Return the sigma of the constant delay of the rows, s."""
-        return self._rhythm.delay_s
+        return self._row_times.delay_s
 
     def interpolation_variance(self, t: float) -> float:
         """Return the variance by interpolation of the travel at a time, m^2."""
@@ -136,62 +137,65 @@ class Wheel:
             return
         before = self._value
         if self.form.quantity == 'rate':      # speeds do not show lost rows
-            self._rhythm.place(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
+            self._row_times.next_time(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
         else:
-            most = FASTEST * STAMP_BURST + self.quantum
-            step = min(max(self._step(value, before, 0.0) * self.scale, -most), most)
-            t = self._rhythm.place(t, self.s[-1] + step, self.speed, self.quantum)
+            limit = FASTEST * STAMP_BURST + self.quantum
+            step = min(max(self._step(value, before, 0.0) * self.scale, -limit), limit)
+            t = self._row_times.next_time(t, self.s[-1] + step, self.speed, self.quantum)
         dt = t - self.t[-1]
         self._rows += 1
         step = self._step(value, before, dt) * self.scale
-        gap = dt > max(MISSING_TIME, GAP_FACTOR * self.usual) and self._rows > SURE_ROWS
+        least_gap = max(MISSING_TIME, GAP_FACTOR * self.mean_interval)
+        gap = dt > least_gap and self._rows > TESTED_FROM_ROWS
         if gap:
-            step += self._bridged(dt, step)
-        shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
-        off = abs(shown - self.speed) * dt
-        if self._is_false(t, dt, step, shown, off):
+            step += self._travel_in_gap(dt, step)
+        row_speed = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
+        deviation = abs(row_speed - self.speed) * dt
+        if self._is_implausible(t, dt, step, row_speed, deviation):
             self.notes.append(f'the counter jumps by {step:+z.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
-            if abs(shown * dt) <= self._most(dt):      # else it is certainly not travel
-                self._refused_error += shown * dt - self.speed * dt
+            if abs(row_speed * dt) <= self._step_limit(dt):      # else it is certainly not travel
+                self._refused_error += row_speed * dt - self.speed * dt
             step = self.speed * dt
             lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
             self._add_variance((lost**2 + self.quantum**2) / 3)
             value = before if self.form.quantity == 'rate' else value
         else:
-            self._follow(dt, step, shown, off)
+            self._update_speed(dt, step, row_speed, deviation)
             if self._refused_error:
                 self._add_refused_variance()
         if self.form.quantity == 'rate':
             self._add_bend_variance((value - before) * self.scale, dt)
-        if self._unsure:      # the speed used for refused rows may be false
+        if self._unexplained_speed:      # the speed used for refused rows may be false
             self._add_speed_variance(dt)
         self._value = value
-        self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
+        if not gap:
+            self.mean_interval += (dt - self.mean_interval) * (0.1 if self.mean_interval else 1.0)
         self._add(t, self.s[-1] + step)
 
-    def _is_false(self, t: float, dt: float, step: float, shown: float, off: float) -> bool:
+    def _is_implausible(self, t: float, dt: float, step: float, row_speed: float,
+                        deviation: float) -> bool:
         """Return True if a row (step in m, speed in m/s, deviation in m) is not motion."""
-        possible = abs(step) <= self._most(dt) and (
-            self.form.quantity != 'rate' or abs(shown) <= FASTEST)
-        usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
-        if possible and usual:
+        possible = abs(step) <= self._step_limit(dt) and (
+            self.form.quantity != 'rate' or abs(row_speed) <= FASTEST)
+        is_usual = deviation <= self._limit(dt) or self._rows <= TESTED_FROM_ROWS
+        if possible and is_usual:
             return False
         self._refused += 1
         self._refused_since = t if self._refused == 1 else self._refused_since
         return not possible or self._refused <= MOST_REFUSED or (
             t - self._refused_since < REFUSED_TIME)
 
-    def _most(self, dt: float) -> float:
+    def _step_limit(self, dt: float) -> float:
         return FASTEST * max(dt, STAMP_BURST) + self.quantum
 
-    def _hangs(self, dt: float, step: float) -> bool:
-        return not step and not self._unsure and self.form.quantity != 'rate' and (
+    def _stops_abruptly(self, dt: float, step: float) -> bool:
+        return not step and not self._unexplained_speed and self.form.quantity != 'rate' and (
             abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
 
     def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
-        T = max(dt, self.usual)      # a row of a burst contains the travel of an interval
+        T = max(dt, self.mean_interval)      # a row of a burst contains the travel of an interval
         return (change * (T + self._speed_time()) * T + 3 * self.quantum
                 + (jitters * self._jitter + T - dt) * abs(self.speed))
 
@@ -200,39 +204,41 @@ class Wheel:
         coarse = counts / max(abs(self.speed), counts) if counts else 0.0
         return min(SPEED_TIME, LEAST_TIME + coarse)
 
-    def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
+    def _update_speed(self, dt: float, step: float, row_speed: float, deviation: float) -> None:
         """Update the speed by an accepted row; add variance after a step of the speed."""
-        hangs = self._hangs(dt, step)
-        self.hung = not step and (self.hung or hangs or (
-            self._refused > 0 and off > self._limit(dt)))
+        stops = self._stops_abruptly(dt, step)
+        self.is_hung = not step and (self.is_hung or stops or (
+            self._refused > 0 and deviation > self._limit(dt)))
         if self._refused:
-            if not self._unsure:      # else the speed is still unexplained
-                self._sure_speed, self._unsure_travel = self.speed, 0.0
-            back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._unsure > 0
-            self._unsure = 0.0 if back else abs(shown - self._sure_speed)
-            self._unsure_time = 0.0
-            self.speed = shown if off > self._limit(dt) else self.speed
-        elif hangs:
+            if not self._unexplained_speed:      # else the speed is still unexplained
+                self._speed_before, self._unexplained_travel = self.speed, 0.0
+            change = abs(row_speed - self._speed_before)
+            is_explained = change * dt <= self._limit(dt) and self._unexplained_speed > 0
+            self._unexplained_speed = 0.0 if is_explained else change
+            self._unexplained_time = 0.0
+            self.speed = row_speed if deviation > self._limit(dt) else self.speed
+        elif stops:
             self.notes.append(f'the counter stops abruptly from {self.speed:.1f} m/s: it hangs, '
                               'or the wheel locks; sigma increased')
-            self._unsure, self._sure_speed = abs(self.speed), self.speed
-            self._unsure_travel = self._unsure_time = 0.0
-        elif off > self._limit(dt, SPEED_CHANGE):
-            self._add_variance(off**2)
+            self._unexplained_speed, self._speed_before = abs(self.speed), self.speed
+            self._unexplained_travel = self._unexplained_time = 0.0
+        elif deviation > self._limit(dt, SPEED_CHANGE):
+            self._add_variance(deviation**2)
         self._refused = 0
         if self.form.quantity != 'rate':
-            late = min(off / max(abs(self.speed), 1.0), LATEST_ROW * self._jitter + LATE_FLOOR)
+            late = min(deviation / max(abs(self.speed), 1.0),
+                       LATEST_ROW * self._jitter + LATE_FLOOR)
             self._jitter += (late - self._jitter) / JITTER_ROWS
         change = (step / dt - self.speed) * min(1.0, dt / self._speed_time())
         self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
 
     def _add_speed_variance(self, dt: float) -> None:
-        path_length = self._unsure_travel + self._unsure * dt
-        self._add_variance((path_length**2 - self._unsure_travel**2) / 3)
-        self._unsure_travel = path_length
-        self._unsure_time += dt
-        if self._unsure_time > UNSURE_TIME:      # real acceleration explains more of it
-            self._unsure = max(self._unsure - SPEED_CHANGE * dt, 0.0)
+        path_length = self._unexplained_travel + self._unexplained_speed * dt
+        self._add_variance((path_length**2 - self._unexplained_travel**2) / 3)
+        self._unexplained_travel = path_length
+        self._unexplained_time += dt
+        if self._unexplained_time > UNEXPLAINED_TIME:      # real acceleration explains more of it
+            self._unexplained_speed = max(self._unexplained_speed - SPEED_CHANGE * dt, 0.0)
 
     def _add_bend_variance(self, change: float, dt: float) -> None:
         """Add the variance of travel by a new acceleration; change : m/s, in the last dt s."""
@@ -266,13 +272,13 @@ class Wheel:
             step = (step + modulus // 2) % modulus - modulus // 2
         return step
 
-    def _bridged(self, dt: float, step: float) -> float:
+    def _travel_in_gap(self, dt: float, step: float) -> float:
         """Return the travel to add for a gap, m; add variance for speeds and increments."""
         if self.form.quantity == 'cumulative':
             self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
                              'distributed evenly')
             return 0.0
-        missing = dt - self.usual
+        missing = dt - self.mean_interval
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0
         size = max(abs(self.speed), abs(step) / dt)
         self._add_variance((min(missing / 50, 0.3) * size * missing) ** 2 / 3)

@@ -100,7 +100,7 @@ class Wheels:
 
     def still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times and no counter hangs."""
-        return all(not w.hung and abs(w.at(t_to) - w.at(t_from))
+        return all(not w.is_hung and abs(w.at(t_to) - w.at(t_from))
                    <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
@@ -175,8 +175,8 @@ class DelaySearch:
         # residuals are correlated: Newey-West covariance
         middle = scores.T @ scores
         for lag in range(1, LAGS):
-            product = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
-            middle += product + product.T
+            quaternion_product = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
+            middle += quaternion_product + quaternion_product.T
         C = np.linalg.inv(N)
         white = np.sum((y - X @ fit)**2) / (len(y) - 2) * C[0, 0]
         variance = max(white, (C @ middle @ C)[0, 0])

@@ -16,7 +16,7 @@ from odocal_ros.screening.clocks import offsets, remedy
 from odocal_ros.screening.leg_kind import has_accelerometer
 from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import CLOCK_APART, DAY_NS, FASTEST
+from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT, DAY_NS, FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
 IMU_BLOCKS = 40       # judgement: newest IMU blocks to compare other topics with: some seconds
@@ -52,7 +52,7 @@ class Clocks:
         received, stamps = received - first_received, stamps - first_stamp
         # messages that queue for a node in simulated time arrive late, those of the IMU more than
         # others: then it is not known which of them belong together
-        queued = self._simulated and np.ptp(received - stamps) > CLOCK_APART * 1e9
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_DIFFERENCE_LIMIT * 1e9
         for name, (row_ns, stamp_ns) in list(self._waiting.items()):
             row = row_ns - first_received
             if row > received.max():
@@ -70,7 +70,7 @@ class Clocks:
             # latency makes a row look older: a clock is only behind if its newest row is; latency
             # of IMU rows makes others look newer: a clock is ahead if most of its rows are
             value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
-            if abs(value) > CLOCK_APART:
+            if abs(value) > CLOCK_DIFFERENCE_LIMIT:
                 result.append((slot, value))
         return result
 

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from odocal_ros.apply.odometry import Odometry, RESTARTS
+from odocal_ros.apply.odometry import clock_difference_text, Odometry, RESTARTS
 from odocal_ros.apply.pose import Pose, TWIST
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.inputs import WHEELS
@@ -88,7 +88,7 @@ class OdometryNode(SettledNode):
             raise BadConfig(f'{why}: start with --ros-args --params-file FILE, a calibration.yaml '
                             'that odocal replay or the calibrator wrote')
         vehicle = vehicle_of(kept.estimates, self.config)
-        for text in vehicle.guessed:
+        for text in vehicle.assumptions:
             self.get_logger().warning(text)
         self._odometry = Odometry(vehicle, self.config)
         wheels = WHEELS[:2] if self.config.odometer.own_topics else WHEELS[:1]
@@ -158,7 +158,7 @@ class OdometryNode(SettledNode):
         for slot, source in self._inputs.items():
             if slot != 'imu':
                 self._pump(source)
-        if self._odometry.lacking_s() > 0 and now_ns - self._reckoned_ns < SILENT_S * 1e9:
+        if self._odometry.missing_odometer_s() > 0 and now_ns - self._reckoned_ns < SILENT_S * 1e9:
             return []
         self._reckoned_ns = now_ns
         self._pump(self._inputs['imu'])
@@ -190,11 +190,9 @@ class OdometryNode(SettledNode):
                                       [one.doubled() for one in inputs]):
             self.get_logger().warning(text)
         missing = list(filter(None, (one.why() for one in inputs)))
-        apart = self._odometry.apart()
-        if not missing and apart:
-            missing = [f'odometer stamps differ by {apart:+.3g} s from the IMU stamps. Likely '
-                       'cause: two clocks. Check the drivers, or set use_sim_time if a bag is '
-                       'played']
+        clock_difference_s = self._odometry.clock_difference_s()
+        if not missing and clock_difference_s:
+            missing = [clock_difference_text(clock_difference_s)]
         if not missing:
             self._silent_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         elif not self._silent_ns:

@@ -14,7 +14,7 @@ from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import CLOCK_APART
+from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 
 OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
 # judgement, s: least step of a clock that is detected; rows on each side that give the lag
@@ -47,12 +47,13 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
             continue
         ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
         ahead += offset[slot]
-        if abs(ahead) > CLOCK_APART:
+        if abs(ahead) > CLOCK_DIFFERENCE_LIMIT:
             group = INPUTS[slot].clock
             hint = f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
             found.append(Reason(
                 Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
-                f'from IMU stamps that arrive at the same time; the limit is {CLOCK_APART:g} s'
+                'from IMU stamps that arrive at the same time; the limit is '
+                f'{CLOCK_DIFFERENCE_LIMIT:g} s'
                 f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', remedy(ahead)))
     return found
 

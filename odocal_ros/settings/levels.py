@@ -31,7 +31,8 @@ INFORMED_SHARE = 0.5
 SWAY = 0.05
 # judgement: a larger backward step, of this number of stamps in sequence, is a restart of time
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
-CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: drivers have smaller delays
+# s between the stamps of two topics, judgement: drivers have smaller delays
+CLOCK_DIFFERENCE_LIMIT = 0.5
 # definition: units
 DAY_NS = 86_400 * 10**9
 RAD_PER_DEG = math.pi / 180

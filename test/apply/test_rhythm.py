@@ -9,7 +9,7 @@ from faulty_streams import columns_of, run, started
 import numpy as np
 import pytest
 
-from odocal_ros.apply.arrivals import Rhythm
+from odocal_ros.apply.arrivals import RowTimes
 from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.apply.wheels import DelaySearch, LEAST_DELAY_ROWS
 from odocal_ros.data.samples import take
@@ -24,9 +24,9 @@ REPORT = 'relative to the odometer'
 
 def placed(arrivals, travel, speed=10.0, quantum=0.0):
     """Return the times of rows, s, and the rhythm after them."""
-    rhythm = Rhythm()
-    return np.array([rhythm.place(t, s, speed, quantum) for t, s in zip(
-        arrivals.tolist(), travel.tolist(), strict=True)]), rhythm
+    row_times = RowTimes()
+    return np.array([row_times.next_time(t, s, speed, quantum) for t, s in zip(
+        arrivals.tolist(), travel.tolist(), strict=True)]), row_times
 
 
 def in_order(t):
@@ -44,13 +44,13 @@ def even():
 
 def test_late_rows_are_put_on_the_rhythm(even):
     t, arrivals = even
-    times, rhythm = placed(arrivals, 10.0 * t)
+    times, row_times = placed(arrivals, 10.0 * t)
     off = (times - t)[500:]
     # 500 rows of 5 ms on average: the earliest is late by 0.01 ms, that of 50 by 0.1 ms
     assert np.std(off) < 2e-4
     assert np.median(np.abs(np.diff(off))) < 5e-5
     assert (np.diff(times) > 0).all()
-    assert rhythm.error_s < 1e-3
+    assert row_times.error_s < 1e-3
 
 
 def starved(t, stalls, seed):
@@ -68,9 +68,9 @@ def test_a_sender_that_stalls_keeps_its_rhythm(even, stalls):
     t, _ = even
     arrivals = starved(t, stalls, 5)
     assert np.quantile(arrivals - t, 0.9) > 0.2
-    times, rhythm = placed(arrivals, 10.0 * t)
+    times, row_times = placed(arrivals, 10.0 * t)
     assert np.abs(times - t)[500:].max() < 2e-3
-    assert rhythm.error_s < 1e-3
+    assert row_times.error_s < 1e-3
 
 
 # rows that are lost, others that are late until a time, speed, and the largest error of the rows
@@ -109,9 +109,9 @@ def test_another_rate_is_another_rhythm(even):
 def test_uneven_times_and_even_stamps_are_kept():
     rng = np.random.default_rng(3)
     t = np.sort(np.arange(3000) / RATE + rng.uniform(-5e-3, 5e-3, 3000))
-    times, rhythm = placed(t, 10.0 * t)
+    times, row_times = placed(t, 10.0 * t)
     np.testing.assert_array_equal(times[500:], t[500:])
-    assert rhythm.error_s < 1e-5
+    assert row_times.error_s < 1e-5
     t = np.arange(1000) / RATE
     times, _ = placed(t, 10.0 * t)
     np.testing.assert_array_equal(times, t)
@@ -121,10 +121,10 @@ def test_what_no_rhythm_explains_is_in_the_error():
     rng = np.random.default_rng(4)
     t = np.cumsum(rng.uniform(0.01, 0.03, 3000))            # no rhythm, and late
     late = in_order(t + rng.exponential(3e-3, len(t)))
-    times, rhythm = placed(late, 10.0 * t)
+    times, row_times = placed(late, 10.0 * t)
     assert np.mean(times == late) > 0.98      # chance may favour a line for some rows
     # rows 20 ms apart are off their neighbours by somewhat more or less than evenly spaced ones
-    assert rhythm.error_s == pytest.approx(3e-3, rel=0.4)
+    assert row_times.error_s == pytest.approx(3e-3, rel=0.4)
 
 
 def twists(mean_late_s, seed):
@@ -166,9 +166,9 @@ def test_the_twist_of_a_late_counter_is_within_its_covariance(late_s):
 
 def test_times_rise_far_from_zero():
     """A counter stamped at arrival beside an IMU that counts from its start: 1.7e9 s."""
-    rng, rhythm = np.random.default_rng(1), Rhythm()
+    rng, row_times = np.random.default_rng(1), RowTimes()
     arrival = np.maximum.accumulate(1.7e9 + np.arange(0, 60, 0.02) + rng.exponential(0.02, 3000))
-    placed = [rhythm.place(t, 0.2 * k, 10.0, 0.01) for k, t in enumerate(arrival.tolist())]
+    placed = [row_times.next_time(t, 0.2 * k, 10.0, 0.01) for k, t in enumerate(arrival.tolist())]
     assert (np.diff(placed) > 0).all()
 
 

@@ -23,13 +23,13 @@ def test_they_agree_to_the_last_digits(size):
     q, r = q / np.linalg.norm(q), r / np.linalg.norm(r)
     phi, a = rng.standard_normal((2, 3)) * [[size], [1.0]]
     np.testing.assert_allclose(attitude.rotation(phi), quat_from_rotvec(phi), atol=1e-15)
-    np.testing.assert_allclose(attitude.product(q, r), quat_multiply(q, r), atol=1e-15)
-    np.testing.assert_allclose(attitude.matrix_of(3 * q), matrix_from_quat(q), atol=1e-15)
-    np.testing.assert_array_equal(attitude.skewed(a), skew(a))
+    np.testing.assert_allclose(attitude.quaternion_product(q, r), quat_multiply(q, r), atol=1e-15)
+    np.testing.assert_allclose(attitude.rotation_matrix(3 * q), matrix_from_quat(q), atol=1e-15)
+    np.testing.assert_array_equal(attitude.cross_matrix(a), skew(a))
     np.testing.assert_allclose(attitude.cross(a, phi), np.cross(a, phi), atol=1e-15 * size)
-    np.testing.assert_allclose(attitude.rotated(attitude.matrix_of(q), a),
+    np.testing.assert_allclose(attitude.rotate_vector(attitude.rotation_matrix(q), a),
                                matrix_from_quat(q) @ a, atol=1e-15)
-    np.testing.assert_array_equal(attitude.plus(a, phi, 0.5), a + phi * 0.5)
+    np.testing.assert_array_equal(attitude.add_scaled(a, phi, 0.5), a + phi * 0.5)
 
 
 @pytest.mark.parametrize('uneven', [0.0, 0.3, 0.9])

@@ -7,7 +7,7 @@ from faulty_streams import columns_of, drive_of, run, SIGMAS, started, stream, w
 import numpy as np
 import pytest
 
-from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
+from odocal_ros.apply.arrivals import PERMANENT_ROWS, StampScreen, STEP_ROWS
 from odocal_ros.apply.stream import Row, SpikeScreen
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
@@ -149,7 +149,7 @@ def sifted(rows, block):
     """Return the rows that a screen keeps where they come in blocks."""
     screen, held, kept = SpikeScreen(), [], []
     for begin in range(0, len(rows), block):
-        new, held = screen.sift(held + rows[begin:begin + block])
+        new, held = screen.screen(held + rows[begin:begin + block])
         kept += new
     return kept
 
@@ -162,7 +162,7 @@ def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
         z = w[:, 2] + add
         rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
         for block in (1, 7, 200):
-            found = [row.stamp_ns for row in sifted(rows, block) if any(row.strange)]
+            found = [row.stamp_ns for row in sifted(rows, block) if any(row.implausible)]
             assert found[:odd] == [100] * odd
             assert bool(found) is bool(odd)
 
@@ -179,7 +179,7 @@ def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
     first, *others = (sifted(rows, block) for block in (1, 2, 7, n))
     assert [row.stamp_ns for row in first] == [
         k for k in range(n) if k not in (100, 200, 201, 202) and not 160 <= k < 180]
-    assert {row.stamp_ns for row in first if any(row.strange)} >= {300, 400}
+    assert {row.stamp_ns for row in first if any(row.implausible)} >= {300, 400}
     assert all(kept == first for kept in others)
 
 
@@ -199,7 +199,7 @@ def test_a_turn_that_no_vehicle_begins_is_doubted():
 def usable(arrivals, stamp_ns, received_ns):
     """Return a mask of the usable rows."""
     rows = list(zip(stamp_ns.tolist(), received_ns.tolist(), range(len(stamp_ns)), strict=True))
-    return np.isin(np.arange(len(rows)), [row for *_, row in arrivals.usable(rows)])
+    return np.isin(np.arange(len(rows)), [row for *_, row in arrivals.select_usable(rows)])
 
 
 def shifted(stamp, by_ns, until=None):
@@ -214,29 +214,29 @@ def test_a_clock_that_moved_a_little_shows_and_late_messages_do_not(by_s):
     stamp = 10**18 + np.arange(0, 20 * SECOND, SECOND // 50)
     late = np.random.default_rng(1).exponential(5e6, len(stamp)).astype(np.int64)
     received, odd = np.maximum.accumulate(stamp + late), shifted(stamp, by_s * SECOND)
-    arrivals = Arrivals()
-    assert by_s or usable(Arrivals(), odd, received).all()
-    for first, last, rows in ((0, 510, MOVED_ROWS), (510, 560, STAYS_ROWS)):
-        assert arrivals.moved_s(STAYS_ROWS) == 0.0
+    arrivals = StampScreen()
+    assert by_s or usable(StampScreen(), odd, received).all()
+    for first, last, rows in ((0, 510, STEP_ROWS), (510, 560, PERMANENT_ROWS)):
+        assert arrivals.clock_step_s(PERMANENT_ROWS) == 0.0
         usable(arrivals, odd[first:last], received[first:last])
-        assert arrivals.moved_s(rows) == pytest.approx(abs(by_s), abs=0.015 * bool(by_s))
+        assert arrivals.clock_step_s(rows) == pytest.approx(abs(by_s), abs=0.015 * bool(by_s))
 
 
 def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
     stamp = 10**18 + np.arange(0, 60 * SECOND, SECOND // 25)
-    arrivals = Arrivals()
+    arrivals = StampScreen()
     assert usable(arrivals, stamp, 10**18 + (stamp - stamp[0]) // 20).all()
-    assert not arrivals.jumped
+    assert not arrivals.clock_jumped
     for by_s in (3, -3):
-        arrivals = Arrivals()
+        arrivals = StampScreen()
         good = usable(arrivals, shifted(stamp, by_s * SECOND)[:510], stamp[:510])
         assert good[:500].all()
         assert not good[500:509].any()
-        assert arrivals.jumped
-        assert abs(arrivals.off_s) == pytest.approx(3.0, abs=0.4)
-    arrivals, few = Arrivals(), shifted(stamp, 29 * SECOND, 503)
+        assert arrivals.clock_jumped
+        assert abs(arrivals.excess_s) == pytest.approx(3.0, abs=0.4)
+    arrivals, few = StampScreen(), shifted(stamp, 29 * SECOND, 503)
     assert (~usable(arrivals, few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
-    assert not arrivals.jumped
+    assert not arrivals.clock_jumped
 
 
 @pytest.mark.core
