@@ -18,7 +18,7 @@ from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.rosbags_readers import Rosbag1File
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag
-from odocal_ros.messages.raws import Raws
+from odocal_ros.messages.raws import RawMessages
 from odocal_ros.safe_io.limits import Allowance, Damaged, LimitReached
 
 BLOCK = 20_000         # judgement: messages in a batch
@@ -111,5 +111,5 @@ def next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
         size -= len(raw)
         if messages <= 0 or size <= 0:
             break
-    return {topic: (np.array(times, np.int64), Raws.of(raws))
+    return {topic: (np.array(times, np.int64), RawMessages.of(raws))
             for topic, (times, raws) in found.items()}

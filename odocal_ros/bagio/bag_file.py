@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.messages.raws import Raws
+from odocal_ros.messages.raws import RawMessages
 from odocal_ros.safe_io.limits import LATEST_NS
 
 PREALLOCATED_BYTES = 2**23      # judgement: bytes
@@ -62,7 +62,7 @@ class Channel:
 
 
 # topic -> bag times and messages, in order of time
-Batch = dict[str, tuple[Ints, Raws]]
+Batch = dict[str, tuple[Ints, RawMessages]]
 
 
 class BagFile:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from odocal_ros.bagio.bag_file import Batch, Channel
 from odocal_ros.bagio.mcap_records import Chunk, ChunkIndex, MESSAGE, MESSAGE_INDEX, RECORD
 from odocal_ros.data.arrays import Bools, Ints
-from odocal_ros.messages.raws import Raws, Rows
+from odocal_ros.messages.raws import RawMessages, Rows
 from odocal_ros.safe_io.limits import Damaged, LATEST_NS
 
 BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
@@ -34,7 +34,7 @@ class Columns(NamedTuple):
 
     time_ns: Ints
     channel: NDArray[np.uint16]
-    raws: Raws
+    raws: RawMessages
 
     def take(self, rows: Rows) -> 'Columns':
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
@@ -141,7 +141,7 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
     for chunk, a, b in zip(chunks, least.tolist(), most.tolist(), strict=True):
         if not chunk.start_ns <= a <= b <= max(chunk.end_ns, chunk.start_ns) or b >= LATEST_NS:
             return None
-    return Columns(time_ns, channel, Raws(data, start + HEAD.itemsize, size - BODY))
+    return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - BODY))
 
 
 def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
@@ -172,7 +172,7 @@ def _record_offsets(chunk: Chunk) -> Ints:
 def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
-                   Raws.of([entry[2] for entry in entries]))
+                   RawMessages.of([entry[2] for entry in entries]))
 
 
 def _join(*parts: Columns) -> Columns:
@@ -183,9 +183,10 @@ def _join(*parts: Columns) -> Columns:
     return Columns(
         np.concatenate([part.time_ns for part in parts]),
         np.concatenate([part.channel for part in parts]),
-        Raws(b''.join([raws.data for raws in packed]),
-             np.concatenate([raws.start + at for raws, at in zip(packed, base, strict=False)]),
-             np.concatenate([raws.size for raws in packed])))
+        RawMessages(b''.join([raws.data for raws in packed]),
+                    np.concatenate([raws.start + at for raws,
+                                    at in zip(packed, base, strict=False)]),
+                    np.concatenate([raws.size for raws in packed])))
 
 
 def _by_time(found: Columns) -> Columns:

@@ -20,7 +20,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.library import asked
 from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
 from odocal_ros.messages.decode import make_reader, Reader
-from odocal_ros.messages.transforms import with_static
+from odocal_ros.messages.transforms import add_static_readers
 from odocal_ros.pipeline.floor_marks import (
     check_points,
     FloorMark,
@@ -171,7 +171,7 @@ def recorded(bag: Bag, chosen: dict[str, str], readers: dict[str, Reader],
              progress: asked.Progress | None = None) -> LegRecorder:
     """Return the rows of the chosen topics, slot -> topic, by their readers."""
     recorder = LegRecorder()
-    bag.read(with_static(readers, bag.topics), recorder.feed, progress)
+    bag.read(add_static_readers(readers, bag.topics), recorder.feed, progress)
     recorder.form = readers[chosen['odometer']].form or recorder.form
     if 'odometer_right' in chosen:
         recorder.form_right = readers[chosen['odometer_right']].form

@@ -27,16 +27,16 @@ NUMBERS = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', '
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
-def _each(prefix: str, names: str = 'xyz') -> tuple[str, ...]:
+def _vector_fields(prefix: str, names: str = 'xyz') -> tuple[str, ...]:
     return tuple(f'float64 {prefix}.{name}' for name in names)
 
 
 def _twist(prefix: str) -> tuple[str, ...]:
-    return _each(f'{prefix}.linear') + _each(f'{prefix}.angular')
+    return _vector_fields(f'{prefix}.linear') + _vector_fields(f'{prefix}.angular')
 
 
 def _pose(prefix: str) -> tuple[str, ...]:
-    return _each(f'{prefix}.position') + _each(f'{prefix}.orientation', 'xyzw')
+    return _vector_fields(f'{prefix}.position') + _vector_fields(f'{prefix}.orientation', 'xyzw')
 
 
 HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
@@ -47,26 +47,26 @@ _DIM = ('string label', 'uint32 size', 'uint32 stride')
 # 'kind path', in order; kind[n] is an array, kind[] a list
 SCHEMAS: dict[str, tuple[str, ...]] = {
     'sensor_msgs/msg/Imu': (
-        *HEADER, *_each('orientation', 'xyzw'), 'float64[9] orientation_covariance',
-        *_each('angular_velocity'), 'float64[9] angular_velocity_covariance',
-        *_each('linear_acceleration'), 'float64[9] linear_acceleration_covariance'),
+        *HEADER, *_vector_fields('orientation', 'xyzw'), 'float64[9] orientation_covariance',
+        *_vector_fields('angular_velocity'), 'float64[9] angular_velocity_covariance',
+        *_vector_fields('linear_acceleration'), 'float64[9] linear_acceleration_covariance'),
     'sensor_msgs/msg/NavSatFix': (
         *HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
         'float64 longitude', 'float64 altitude', 'float64[9] position_covariance',
         'uint8 position_covariance_type'),
     'sensor_msgs/msg/JointState': (
         *HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
-    'geometry_msgs/msg/Twist': _each('linear') + _each('angular'),
+    'geometry_msgs/msg/Twist': _vector_fields('linear') + _vector_fields('angular'),
     'geometry_msgs/msg/TwistStamped': (*HEADER, *_twist('twist')),
     'geometry_msgs/msg/TwistWithCovarianceStamped': (
         *HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
-    'geometry_msgs/msg/PointStamped': (*HEADER, *_each('point')),
+    'geometry_msgs/msg/PointStamped': (*HEADER, *_vector_fields('point')),
     'geometry_msgs/msg/PoseStamped': (*HEADER, *_pose('pose')),
     'geometry_msgs/msg/PoseWithCovarianceStamped': (
         *HEADER, *_pose('pose.pose'), 'float64[36] pose.covariance'),
     'geometry_msgs/msg/TransformStamped': (
-        *HEADER, 'string child_frame_id', *_each('transform.translation'),
-        *_each('transform.rotation', 'xyzw')),
+        *HEADER, 'string child_frame_id', *_vector_fields('transform.translation'),
+        *_vector_fields('transform.rotation', 'xyzw')),
     'nav_msgs/msg/Odometry': (
         *HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
@@ -81,12 +81,12 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 Unpacker = Callable[[bytes], tuple[Any, ...]]
 
 
-class Run(NamedTuple):
+class AdjacentValues(NamedTuple):
     """Adjacent values of one type: their bytes, type, type of all as one item, number."""
 
     place: slice
     dtype: np.dtype[Any]
-    together: np.dtype[Any]
+    packed_type: np.dtype[Any]
     width: int
 
 
@@ -100,7 +100,7 @@ class Layout:
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     size: int = 4
     values: list[bytes] = field(default_factory=list)      # content of the fixed bytes
-    _runs: dict[tuple[str, ...], list[Run] | None] = field(default_factory=dict)
+    _runs: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -120,9 +120,9 @@ class Layout:
             return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
         return None
 
-    def _places(self, paths: tuple[str, ...]) -> list[Run] | None:
+    def _places(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
         if paths not in self._runs:
-            self._runs[paths] = _side_by_side([self.find(path) for path in paths])
+            self._runs[paths] = _adjacent_values([self.find(path) for path in paths])
         return self._runs[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
@@ -135,7 +135,7 @@ class Layout:
         runs = self._places(tuple(paths))
         if runs is None:
             return None
-        values = [table[:, run.place].view(run.together).copy().view(run.dtype).reshape(
+        values = [table[:, run.place].view(run.packed_type).copy().view(run.dtype).reshape(
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
 
@@ -146,11 +146,11 @@ class Layout:
         None if a path is missing, or if the paths of a field are not adjacent.
         """
         runs = [self._places(tuple(paths)) if paths else None for paths in columns]
-        one = [found[0] for found in runs if found is not None and len(found) == 1]
-        return None if len(one) < len(runs) else np.dtype({
-            'names': [str(k) for k in range(len(one))], 'itemsize': self.size,
-            'formats': [(run.dtype, (run.width,)) for run in one],
-            'offsets': [run.place.start for run in one]})
+        single_runs = [found[0] for found in runs if found is not None and len(found) == 1]
+        return None if len(single_runs) < len(runs) else np.dtype({
+            'names': [str(k) for k in range(len(single_runs))], 'itemsize': self.size,
+            'formats': [(run.dtype, (run.width,)) for run in single_runs],
+            'offsets': [run.place.start for run in single_runs]})
 
     def unpackers(self, columns: Sequence[Sequence[str] | None]) -> list[Unpacker]:
         """Return functions for the values at some paths each, as ``record``; [] for its None."""
@@ -165,10 +165,11 @@ class Layout:
             raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
 
-_before: dict[str, Layout] = {}      # newest layout of each type: most topics have only one
+# newest layout of each type: most topics have only one
+_latest_layouts: dict[str, Layout] = {}
 
 
-def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
+def _adjacent_values(places: Sequence[tuple[int, str] | None]) -> list[AdjacentValues] | None:
     """Return offsets of values as runs; None if one of them is missing."""
     found: list[tuple[int, str, int]] = []
     for place in places:
@@ -180,8 +181,8 @@ def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
             found[-1] = first, kind, count + 1
         else:
             found.append((offset, dtype, 1))
-    return [Run(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
-                np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
+    return [AdjacentValues(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
+                           np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
             for first, kind, count in found]
 
 
@@ -189,19 +190,19 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     """Return the layout of one message; None if it cannot be read as columns."""
     if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
         return None
-    before = _before.get(msgtype)
+    before = _latest_layouts.get(msgtype)
     if before and before.fits(raw):
         return before
-    walk = _Walk(raw)
-    layout = walk.layout
+    scan = _LayoutScan(raw)
+    layout = scan.layout
     try:
-        walk.fields(SCHEMAS[msgtype], '')
+        scan.fields(SCHEMAS[msgtype], '')
     except (struct.error, ValueError):
         return None
     if layout.size > len(raw):
         return None     # longer is common: serialize_message leaves bytes after the message
     layout.values = [raw[a:b] for a, b in layout.fixed]
-    _before[msgtype] = layout
+    _latest_layouts[msgtype] = layout
     return layout
 
 
@@ -215,15 +216,15 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
 
 def damaged_field(msgtype: str, raw: bytes) -> str:
     """Return the field in which a message ends or has an impossible length; '' if unknown."""
-    walk = _Walk(raw)
+    scan = _LayoutScan(raw)
     try:
-        walk.fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
+        scan.fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
     except (struct.error, ValueError):
-        return walk.path
+        return scan.path
     return ''
 
 
-class _Walk:
+class _LayoutScan:
     """Sequential scan of one message that stores the offsets of all fields."""
 
     def __init__(self, raw: bytes) -> None:

@@ -30,11 +30,11 @@ from odocal_ros.messages.message_fields import (
     View,
 )
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
+from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, RawMessages, Table, tables
 from odocal_ros.settings.config import Config
 
 # judgement: unreadable messages after which messages without a layout are skipped
-HOPELESS = 20_000
+UNREADABLE_LIMIT = 20_000
 Deserialize = Callable[[bytes], object]
 Feed = Callable[[str, Samples], None]
 
@@ -99,11 +99,11 @@ class Reader:
 
         Raises BadData: the message type cannot have the value: no such field, not a number.
         """
-        other, raws = None, raws if len(raws) <= FEW_ROWS else Raws.of(raws)
+        other, raws = None, raws if len(raws) <= FEW_ROWS else RawMessages.of(raws)
         if self.frames is not None and len(raws):
             keep, other = self.frames.sort(raws, received_ns, deserialize)
             if other is not None:
-                raws = Raws.of(raws).take(keep)
+                raws = RawMessages.of(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         found = self._rows(raws, received_ns, deserialize)
         if self.by_arrival:
@@ -117,8 +117,8 @@ class Reader:
 
         A reading has stamp and arrival, ns, then the first columns of the samples.
         """
-        fits = self._layout.fits if self._layout and self._unpackers else None
-        if fits and not self.by_arrival and all(map(fits, raws)) and (
+        layout_fits = self._layout.fits if self._layout and self._unpackers else None
+        if layout_fits and not self.by_arrival and all(map(layout_fits, raws)) and (
                 self.frames is None or all(map(self.frames.is_used, raws))):
             return self._plan.readings(received_ns, [
                 [unpack(raw) for unpack in self._unpackers] for raw in raws])
@@ -128,36 +128,37 @@ class Reader:
     def _rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
               deserialize: Deserialize) -> Pairs:
         plan = self._plan
-        first = 0 if plan.columns else self._settled(raws, deserialize)
+        first = 0 if plan.columns else self._complete_plan(raws, deserialize)
         if first:
             raws, received_ns = raws[first:], received_ns[first:]
         n = len(raws)
         if not n:
             return []
-        if few := self._few(raws):
-            return plan.build(np.array(received_ns, np.int64), few)
-        out: list[NDArray[Any]] = []
-        good = np.ones(n, bool)
+        if columns := self._read_few(raws):
+            return plan.build(np.array(received_ns, np.int64), columns)
+        arrays: list[NDArray[Any]] = []
+        has_row = np.ones(n, bool)
         for layout, rows, table in tables(self.msgtype, raws):
-            values = self._values(layout, table) if layout else None
+            values = self._columns_of(layout, table) if layout else None
             if values and isinstance(rows, slice):       # all of them: no copy
-                out = values
+                arrays = values
                 break
-            out = out or [np.empty((n, column.width), column.dtype) for column in plan.columns]
+            arrays = arrays or [np.empty((n, column.width), column.dtype)
+                                for column in plan.columns]
             if layout is None:
                 for i in np.arange(n)[rows].tolist():
-                    good[i] = self._one(out, i, raws[i], deserialize)
+                    has_row[i] = self._read_into_row(arrays, i, raws[i], deserialize)
             elif values is None:
-                good[rows] = False
+                has_row[rows] = False
             else:
-                for target, value in zip(out, values, strict=True):
+                for target, value in zip(arrays, values, strict=True):
                     target[rows] = value
         received = np.array(received_ns, np.int64)
-        if not good.all():
-            out, received = [values[good] for values in out], received[good]
-        return plan.build(received, out) if len(received) else []
+        if not has_row.all():
+            arrays, received = [values[has_row] for values in arrays], received[has_row]
+        return plan.build(received, arrays) if len(received) else []
 
-    def _few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
+    def _read_few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
         """Return the columns of a few messages of one layout; [] if they have several or none."""
         layout = cdr.layout_of(self.msgtype, raws[0])
         if len(raws) > FEW_ROWS or layout is None or not all(map(layout.fits, raws)):
@@ -174,24 +175,24 @@ class Reader:
         return [table[name].astype(column.dtype) for name, column in zip(
             self._record.names or (), columns, strict=True)]
 
-    def _values(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
+    def _columns_of(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
         """Return the columns of messages of one layout; None if one is missing."""
         values: list[NDArray[Any]] = []
         for column in self._plan.columns:
             paths = column.pick(layout)
             value = layout.columns(table, paths) if paths else None
             if value is None:
-                self._lost(len(table), self._plan.missing(layout))
+                self._count_unreadable(len(table), self._plan.missing(layout))
                 return None
             values.append(np.asarray(value, column.dtype))
         return values
 
-    def _settled(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
+    def _complete_plan(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
         """Pass messages to the plan until it is complete; return the number of skipped ones."""
         for k, raw in enumerate(raws):
             view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
             if view is None:
-                view = self._view(raw, deserialize)
+                view = self._message_view(raw, deserialize)
             if view is not None and self._plan.ready(view):
                 self.unreadable += k
                 return k
@@ -200,26 +201,27 @@ class Reader:
         self.unreadable += len(raws)
         return len(raws)
 
-    def _view(self, raw: bytes, deserialize: Deserialize) -> MessageView | None:
+    def _message_view(self, raw: bytes, deserialize: Deserialize) -> MessageView | None:
         try:
             return MessageView(deserialize(raw))
         except OdocalError:
             raise
         except Exception as error:   # rclpy and rosbags raise different errors
             field = cdr.damaged_field(self.msgtype, raw)
-            why = f'too short or damaged from {field} on' if field else (
+            reason = f'too short or damaged from {field} on' if field else (
                 'too short or damaged' if isinstance(error, struct.error | ValueError | IndexError)
                 else ' '.join(str(error).split())[:200])
             self.trouble = (f'a message of {len(raw)} bytes cannot be read as {self.msgtype}: '
-                            f'{why}')
+                            f'{reason}')
             return None
 
-    def _one(self, out: list[NDArray[Any]], i: int, raw: bytes, deserialize: Deserialize) -> bool:
+    def _read_into_row(self, arrays: list[NDArray[Any]], i: int, raw: bytes,
+                       deserialize: Deserialize) -> bool:
         """Read one message into row i; False: it has no row."""
-        if self.unreadable > HOPELESS:      # deserialising takes a hundred times as long
+        if self.unreadable > UNREADABLE_LIMIT:      # deserialising takes a hundred times as long
             self.unreadable += 1
             return False
-        view = self._view(raw, deserialize)
+        view = self._message_view(raw, deserialize)
         if view is None:
             self.unreadable += 1
             return False
@@ -228,15 +230,15 @@ class Reader:
         except (AttributeError, LookupError, TypeError, ValueError):
             values = [None]
         if any(value is None for value in values):
-            self._lost(1, self._plan.missing(view))
+            self._count_unreadable(1, self._plan.missing(view))
             return False
-        for target, value in zip(out, values, strict=True):
+        for target, value in zip(arrays, values, strict=True):
             target[i] = value
         return True
 
-    def _lost(self, count: int, why: str) -> None:
+    def _count_unreadable(self, count: int, reason: str) -> None:
         self.unreadable += count
-        self.trouble = why
+        self.trouble = reason
 
 
 def make_reader(slot: str, msgtype: str, config: Config) -> Reader:

@@ -59,14 +59,14 @@ class MessageView:
 
         Raises AttributeError, LookupError: it is missing.
         """
-        here: Any = self.message
-        owner = here
+        value: Any = self.message
+        owner = value
         for name, key in parts(path):
             if name:
-                here, owner = getattr(here, name), here
+                value, owner = getattr(value, name), value
             else:
-                here = here[self._index(owner, key)]
-        return here
+                value = value[self._index(owner, key)]
+        return value
 
     @staticmethod
     def _index(owner: object, key: str) -> int:
@@ -79,18 +79,18 @@ class MessageView:
 
     def fields(self) -> list[str]:
         """Return the names of the message's fields, for error messages."""
-        given = getattr(type(self.message), '__dataclass_fields__', None)
-        if given is None and hasattr(self.message, 'get_fields_and_field_types'):
-            given = self.message.get_fields_and_field_types()
-        return [name for name in (given or ()) if not name.startswith('__')]
+        field_names = getattr(type(self.message), '__dataclass_fields__', None)
+        if field_names is None and hasattr(self.message, 'get_fields_and_field_types'):
+            field_names = self.message.get_fields_and_field_types()
+        return [name for name in (field_names or ()) if not name.startswith('__')]
 
 
 @lru_cache
 def parts(path: str) -> tuple[tuple[str, str], ...]:
     """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
     found = tuple(PART.findall(path))
-    whole = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
-    return found if whole.lstrip('.') == path else ()
+    rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
+    return found if rebuilt.lstrip('.') == path else ()
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
 Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
-NONE_SENT = np.float64(-1).view(np.int64)
+NOT_SENT_BITS = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
 _COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
 # columns of each type: position, and its covariance if the type has one
@@ -184,9 +184,9 @@ class SensorPlan:
 
 def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
          f_i: Floats, of_force: Floats) -> samples.ImuSamples:
-    none = of_force.view(np.int64)[:, 0] == NONE_SENT
-    if none.any():
-        f_i[none] = np.nan
+    has_no_force = of_force.view(np.int64)[:, 0] == NOT_SENT_BITS
+    if has_no_force.any():
+        f_i[has_no_force] = np.nan
     return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
                               _yaw_variance(q_ni, of_roll, of_yaw))
 
@@ -198,8 +198,9 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
     """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
-    some = across(np.logical_or, q_ni != 0) & (of_roll.view(np.int64)[:, 0] != NONE_SENT)
-    return np.where(some, of_yaw[:, 0], np.nan)
+    is_sent = of_roll.view(np.int64)[:, 0] != NOT_SENT_BITS
+    has_orientation = across(np.logical_or, q_ni != 0) & is_sent
+    return np.where(has_orientation, of_yaw[:, 0], np.nan)
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
@@ -242,7 +243,7 @@ def types_of(slot: str, odometer: OdometerConfig) -> tuple[str, ...]:
     """Return the message types that an input can have; empty: any type (odometer)."""
     if slot in WHEELS:
         return () if odometer.type == 'auto' else (odometer.type,)
-    types = tuple(kind for own, kind in SENSORS if own == slot)
+    types = tuple(kind for sensor_slot, kind in SENSORS if sensor_slot == slot)
     return (*types, *LOCAL_TYPES, TRANSFORMS) if slot == 'fix' else types
 
 

@@ -17,7 +17,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, R
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.message_fields import Column, MessageView, parts, STAMP, stamp_ns, View
-from odocal_ros.messages.wheel_choice import choose, sided
+from odocal_ros.messages.wheel_choice import key_on_side, select_wheels
 from odocal_ros.settings.config import Config
 
 JOINTS = 'sensor_msgs/msg/JointState'
@@ -54,9 +54,10 @@ class OdometerPlan:
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
-        self.unclear = ''        # reason why the last message did not determine the wheels
+        self.unclear_reason = ''        # reason why the last message did not determine the wheels
         self._check()
-        self.choosing = self._listed() and not _base(self.field)[1] and not self.keys[0]
+        has_key = _split_key(self.field)[1] or self.keys[0]
+        self.selects_wheels = self._is_list() and not has_key
         if msgtype == JOINTS and not self.field:
             self.fields: tuple[str, ...] = {
                 'auto': ('position', 'velocity'), 'rate': ('velocity',)}.get(
@@ -64,9 +65,9 @@ class OdometerPlan:
         else:
             self.fields = (self.field,)
         if self.known:
-            self.form = self._meaning(self.fields[0])
-            if len(self.fields) == 1 and not self.choosing:
-                self._settle(self.field or self.fields[0])
+            self.form = self._odometer_form(self.fields[0])
+            if len(self.fields) == 1 and not self.selects_wheels:
+                self._set_columns(self.field or self.fields[0])
 
     def _check(self) -> None:
         """Raise an error for settings that must fail, before the first message."""
@@ -80,23 +81,23 @@ class OdometerPlan:
                             'twist.linear.x, data[0] or position[joint]')
         if not self.known:
             return
-        kinds = _kinds(self.msgtype)
-        base, key = _base(self.field)
+        kinds = _value_types(self.msgtype)
+        base, key = _split_key(self.field)
         if self.field and base not in kinds:
             raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; values: '
                           f'{", ".join(kinds)}')
-        several = len(self.keys) > 1
-        if several and not self._listed():
+        has_several_wheels = len(self.keys) > 1
+        if has_several_wheels and not self._is_list():
             raise BadConfig(f'odometer.wheels: {self.msgtype} holds one value ({self.field}); '
                             "use 'topic' for odometer.left and odometer.right on two topics")
-        if self.odometer.field and self._listed() and not (
-                key or several or self.msgtype == JOINTS):
+        if self.odometer.field and self._is_list() and not (
+                key or has_several_wheels or self.msgtype == JOINTS):
             raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value, such as '
                             f'{base}[0], or set odometer.wheels')
 
-    def _listed(self) -> bool:
-        base, _ = _base(self.field)
-        return self.known and (not base or '[' in _kinds(self.msgtype)[base])
+    def _is_list(self) -> bool:
+        base, _ = _split_key(self.field)
+        return self.known and (not base or '[' in _value_types(self.msgtype)[base])
 
     def ready(self, view: View) -> bool:
         """Complete the plan from a message; return False to repeat with the next one."""
@@ -104,36 +105,36 @@ class OdometerPlan:
             return True
         if not self.known:
             assert isinstance(view, MessageView)
-            self._learn(view)
+            self._complete_unknown_type(view)
             return True
         for field in self.fields:
-            if self.choosing and view.count(field):
-                self._choose(field, view)
+            if self.selects_wheels and view.count(field):
+                self._select_wheels(field, view)
                 return bool(self.columns)
-            if not self.choosing and self._pick(field, self.keys[0])(view):
-                self._settle(field)
+            if not self.selects_wheels and self._paths_of_wheel(field, self.keys[0])(view):
+                self._set_columns(field)
                 return True
         return False
 
-    def _choose(self, field: str, view: View) -> None:
-        found = choose(view.names, view.count(field))
+    def _select_wheels(self, field: str, view: View) -> None:
+        found = select_wheels(view.names, view.count(field))
         if isinstance(found, str):
-            self.unclear = found
+            self.unclear_reason = found
             return
-        own = {'odometer_right': 'right'}.get(
+        side = {'odometer_right': 'right'}.get(
             self.slot, 'left' if self.odometer.own_topics else '')
-        if own:
-            key = sided(found, own)
+        if side:
+            key = key_on_side(found, side)
             if not key:
-                self.unclear = found.about
+                self.unclear_reason = found.about
                 return
             self.keys = (key,)
         else:
             self.keys = found.keys
-        self._settle(field)
+        self._set_columns(field)
         self.form = replace(self.form, sides=found.sides, chosen=found.about)
 
-    def _learn(self, view: MessageView) -> None:
+    def _complete_unknown_type(self, view: MessageView) -> None:
         """Determine columns and meaning of an unknown type from its first message."""
         value = None
         for key in self.keys:
@@ -147,46 +148,46 @@ class OdometerPlan:
                 raise BadData(f'odometer.field: {path!r} of {self.msgtype} is not a number but '
                               f'{type(value).__name__}; name one value, such as path.to.value[0]')
         self.stamped = hasattr(view.message, 'header')
-        self._settle(self.field, 'int64' if isinstance(value, Integral) else 'float64')
+        self._set_columns(self.field, 'int64' if isinstance(value, Integral) else 'float64')
 
-    def _settle(self, field: str, kind: str = '') -> None:
+    def _set_columns(self, field: str, kind: str = '') -> None:
         """Set columns and form for a field; ``kind`` of unknown types is that of their values."""
-        self.form = self._meaning(field, kind)
-        whole = 'int' in (kind or self._kind(field))
-        dtype = np.int64 if whole else np.float64
+        self.form = self._odometer_form(field, kind)
+        is_whole = 'int' in (kind or self._kind(field))
+        dtype = np.int64 if is_whole else np.float64
         self.columns = STAMP * self.stamped + tuple(
-            Column(dtype, 1, self._pick(field, key)) for key in self.keys)
+            Column(dtype, 1, self._paths_of_wheel(field, key)) for key in self.keys)
 
     def _kind(self, field: str) -> str:
-        return _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
+        return _value_types(self.msgtype)[_split_key(field)[0]].split('[')[0]
 
-    def _meaning(self, field: str, kind: str = '') -> OdometerForm:
+    def _odometer_form(self, field: str, kind: str = '') -> OdometerForm:
         bits = 0
         if self.known:
             kind = self._kind(field)
             bits = int(kind.lstrip('uintfloa'))
-        whole = 'int' in kind
-        joint = self.msgtype == JOINTS and _base(field)[0] in ('position', 'velocity')
+        is_whole = 'int' in kind
+        joint = self.msgtype == JOINTS and _split_key(field)[0] in ('position', 'velocity')
         quantity = self.odometer.quantity
         if quantity == 'auto':
-            quantity = 'cumulative' if whole or joint and 'position' in field else 'rate'
+            quantity = 'cumulative' if is_whole or joint and 'position' in field else 'rate'
         modulus = (self.odometer.wrap or (2**bits if bits else 0)) * (
-            whole and quantity == 'cumulative')
-        unit = 'm/rad' if joint else 'm/pulse' if whole or quantity != 'rate' else '1'
+            is_whole and quantity == 'cumulative')
+        unit = 'm/rad' if joint else 'm/pulse' if is_whole or quantity != 'rate' else '1'
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
         if not key:
             return field
-        return f'{_base(field)[0]}[{key}]' if field else key
+        return f'{_split_key(field)[0]}[{key}]' if field else key
 
-    def _pick(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
+    def _paths_of_wheel(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
         """Return a function that returns the paths of a wheel's values in a message."""
         path = self._path(field, key)
-        base, own = _base(field)
-        if not self.known or '[' not in _kinds(self.msgtype)[base]:
+        base, side = _split_key(field)
+        if not self.known or '[' not in _value_types(self.msgtype)[base]:
             return lambda view: (path,)
-        key = key or own        # not by parsing the path: a joint may have any name
+        key = key or side        # not by parsing the path: a joint may have any name
 
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)
@@ -196,11 +197,11 @@ class OdometerPlan:
         return pick
 
     def missing(self, view: View) -> str:
-        if self.unclear and not self.columns:
-            return self.unclear
-        wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
+        if self.unclear_reason and not self.columns:
+            return self.unclear_reason
+        required = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
         names = f'; names: {", ".join(view.names)}' if view.names else ''
-        return f'no {wanted} in a {self.msgtype}{names}'
+        return f'no {required} in a {self.msgtype}{names}'
 
     @property
     def _slots(self) -> tuple[str, ...]:
@@ -209,11 +210,11 @@ class OdometerPlan:
     def readings(self, received_ns: Sequence[int], values: list[Any]
                  ) -> list[tuple[str, list[Reading]]]:
         """Return (slot, rows in plain numbers) from the values of each message."""
-        first = 2 * self.stamped
+        value_from = 2 * self.stamped
         return [(slot, [
-            (row[0][0] * 10**9 + row[1][0] if first else received, received, row[wheel][0])
+            (row[0][0] * 10**9 + row[1][0] if value_from else received, received, row[wheel][0])
             for received, row in zip(received_ns, values, strict=True)])
-            for wheel, slot in enumerate(self._slots, first)]
+            for wheel, slot in enumerate(self._slots, value_from)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
@@ -225,27 +226,27 @@ class OdometerPlan:
 def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
     """Return the keys of the wheels in one message; ('',) if none is configured."""
     odometer = config.odometer
-    keys, both = odometer.keys, (odometer.left, odometer.right)
-    if odometer.wheels and any(both):
+    keys, sides_setting = odometer.keys, (odometer.left, odometer.right)
+    if odometer.wheels and any(sides_setting):
         raise BadConfig('odometer.left and odometer.right are the wheels of odometer.wheels: set '
                         'only one of both')
     if odometer.own_topics or not keys:
         return ('',)
-    if not odometer.wheels and not all(both):
+    if not odometer.wheels and not all(sides_setting):
         raise BadConfig('odometer.left and odometer.right belong together: set both or neither')
     if len(set(keys)) < len(keys) or '' in keys or len(keys) > len(WHEELS):
-        what = 'odometer.wheels' if odometer.wheels else 'odometer.left and odometer.right'
-        raise BadConfig(f'{what}: {", ".join(map(repr, keys))}; required: different wheels, '
-                        f'{len(WHEELS)} at most')
+        setting_name = 'odometer.wheels' if odometer.wheels else 'odometer.left and odometer.right'
+        raise BadConfig(f'{setting_name}: {", ".join(map(repr, keys))}; required: different '
+                        f'wheels, {len(WHEELS)} at most')
     return keys if slot == WHEELS[0] else ('',)
 
 
-def _kinds(msgtype: str) -> dict[str, str]:
+def _value_types(msgtype: str) -> dict[str, str]:
     lines = (line.split() for line in cdr.SCHEMAS[msgtype])
     return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
 
 
-def _base(path: str) -> tuple[str, str]:
+def _split_key(path: str) -> tuple[str, str]:
     """Split 'position[left]' into ('position', 'left'); without brackets the key is ''."""
     if not path.endswith(']'):
         return path, ''

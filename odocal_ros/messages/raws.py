@@ -20,20 +20,20 @@ Table = NDArray[np.uint8]
 # judgement: per call; further layouts are read message by message
 MAX_LAYOUTS = 16
 FEW_ROWS = 8      # judgement: messages up to which single reads take less time than a table
-SETTLED = 3     # judgement: messages that determine the frame, more than a damaged one
+FRAME_MESSAGES = 3     # judgement: messages that determine the frame, more than a damaged one
 TEXT_AT = cdr.FRAME_AT - 4      # format: offset of the length of the text
 
 
-class Raws(Sequence[bytes]):
+class RawMessages(Sequence[bytes]):
     """Messages: ``data``, and offset and length of each message in it."""
 
     def __init__(self, data: Bytes, start: Ints, size: Ints) -> None:
         self.data, self.start, self.size = data, start, size
 
     @classmethod
-    def of(cls, raws: Sequence[bytes]) -> 'Raws':
-        """Return Raws of separate messages, copied to one buffer."""
-        if isinstance(raws, Raws):
+    def of(cls, raws: Sequence[bytes]) -> 'RawMessages':
+        """Return RawMessages of separate messages, copied to one buffer."""
+        if isinstance(raws, RawMessages):
             return raws
         size = np.fromiter(map(len, raws), np.int64, len(raws))
         return cls(b''.join(raws), np.cumsum(size) - size, size)
@@ -45,17 +45,17 @@ class Raws(Sequence[bytes]):
     def __getitem__(self, which: int) -> bytes: ...
 
     @overload
-    def __getitem__(self, which: slice) -> 'Raws': ...
+    def __getitem__(self, which: slice) -> 'RawMessages': ...
 
-    def __getitem__(self, which: int | slice) -> 'bytes | Raws':
+    def __getitem__(self, which: int | slice) -> 'bytes | RawMessages':
         if isinstance(which, slice):
             return self.take(which)
         start = int(self.start[which])
         return bytes(self.data[start:start + int(self.size[which])])
 
-    def take(self, rows: Rows) -> 'Raws':
+    def take(self, rows: Rows) -> 'RawMessages':
         """Return the messages of some rows, without a copy of their bytes."""
-        return Raws(self.data, self.start[rows], self.size[rows])
+        return RawMessages(self.data, self.start[rows], self.size[rows])
 
     def table(self, rows: Ints) -> Table:
         """Return a copy of messages of equal length: (n, size) bytes."""
@@ -64,16 +64,16 @@ class Raws(Sequence[bytes]):
         if not size:
             return np.empty((len(rows), 0), np.uint8)
         # a view with a message at every offset of the buffer; only the selected rows are read
-        there = np.ndarray((len(self.data) - size + 1,), f'V{size}', self.data, 0, (1,))
-        return there[start].view(np.uint8).reshape(-1, size)
+        views = np.ndarray((len(self.data) - size + 1,), f'V{size}', self.data, 0, (1,))
+        return views[start].view(np.uint8).reshape(-1, size)
 
-    def packed(self) -> 'Raws':
+    def packed(self) -> 'RawMessages':
         data, start, at = [], np.empty(len(self), np.int64), 0
         for rows in self.by_size():
             data.append(self.table(rows).tobytes())
             start[rows] = at + np.arange(len(rows)) * int(self.size[rows[0]])
             at += len(data[-1])
-        return Raws(b''.join(data), start, self.size)
+        return RawMessages(b''.join(data), start, self.size)
 
     def by_size(self) -> list[Ints]:
         """Return the rows of messages of one length, for each length."""
@@ -91,40 +91,40 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | N
 
     Rows without a layout are last, with None and no messages.
     """
-    raws = Raws.of(raws)
-    odd: list[Ints] = []
+    raws = RawMessages.of(raws)
+    without_layout: list[Ints] = []
     for rows in raws.by_size():
         table = raws.table(rows)
         for _ in range(MAX_LAYOUTS):
             layout = cdr.layout_of(msgtype, table[0].tobytes())
-            alike = _same(table, layout.fixed if layout else [(0, table.shape[1])])
-            whole = bool(alike.all())
+            matches = _same_layout(table, layout.fixed if layout else [(0, table.shape[1])])
+            all_match = bool(matches.all())
             if layout is None:
-                odd.append(rows[alike])
-            elif whole:
+                without_layout.append(rows[matches])
+            elif all_match:
                 yield layout, slice(None) if len(rows) == len(raws) else rows, table
             else:
-                yield layout, rows[alike], table[alike]
-            if whole:
+                yield layout, rows[matches], table[matches]
+            if all_match:
                 break
-            rows, table = rows[~alike], table[~alike]
+            rows, table = rows[~matches], table[~matches]
         else:
-            odd.append(rows)
-    if odd:
-        yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
+            without_layout.append(rows)
+    if without_layout:
+        yield None, np.sort(np.concatenate(without_layout)), np.empty((0, 0), np.uint8)
 
 
-def _same(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
+def _same_layout(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
     """Return a mask of messages of one length whose layout bytes equal those of the first."""
-    alike = np.ones(len(table), bool)
+    matches = np.ones(len(table), bool)
     for start, stop in fixed:
         part = table[:, start:stop]
         if stop - start in (2, 4, 8):
             number = part.view(f'u{stop - start}')[:, 0]
-            alike &= number == number[0]
+            matches &= number == number[0]
         else:
-            alike &= (part == part[0]).all(axis=1)
-    return alike
+            matches &= (part == part[0]).all(axis=1)
+    return matches
 
 
 class FrameFilter:
@@ -134,21 +134,21 @@ class FrameFilter:
     Until then all messages are kept, so that block sizes have no effect.
     """
 
-    def __init__(self, msgtype: str, wanted: str) -> None:
-        self.frame = wanted
+    def __init__(self, msgtype: str, configured_frame: str) -> None:
+        self.frame = configured_frame
         self.other = ''         # the last frame that was not used
-        self._settled = bool(wanted)
-        self._begin = self._beginning()
+        self._is_determined = bool(configured_frame)
+        self._prefix = self._frame_prefix()
         self._msgtype = msgtype
-        self._seen: dict[str, int] = {}
+        self._frame_counts: dict[str, int] = {}
 
     def sort(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Callable[[bytes], Any]) -> tuple[Bools, OtherImuSamples | None]:
         """Return a mask of the messages to use, and the samples of the others."""
         keep = np.ones(len(raws), bool)
         first = 0
-        while not self._settled and first < len(raws):
-            self._count(self._frame(raws[first], deserialize))
+        while not self._is_determined and first < len(raws):
+            self._count_frame(self._frame(raws[first], deserialize))
             first += 1
         keep[first:] = self._with_frame(raws[first:])
         if keep.all():
@@ -170,20 +170,20 @@ class FrameFilter:
 
     def is_used(self, raw: bytes) -> bool:
         """Return True if the frame is determined and that of a message."""
-        return self._settled and self._has_frame(raw)
+        return self._is_determined and self._has_frame(raw)
 
     def _has_frame(self, raw: bytes) -> bool:
-        return raw[:2] + raw[TEXT_AT:TEXT_AT + len(self._begin) - 2] == self._begin
+        return raw[:2] + raw[TEXT_AT:TEXT_AT + len(self._prefix) - 2] == self._prefix
 
-    def _count(self, frame: str | None) -> None:
+    def _count_frame(self, frame: str | None) -> None:
         if frame is None:
             return
-        self._seen[frame] = self._seen.get(frame, 0) + 1
-        if self._seen[frame] >= SETTLED:
-            self.frame, self._settled = frame, True
-            self._begin = self._beginning()
+        self._frame_counts[frame] = self._frame_counts.get(frame, 0) + 1
+        if self._frame_counts[frame] >= FRAME_MESSAGES:
+            self.frame, self._is_determined = frame, True
+            self._prefix = self._frame_prefix()
 
-    def _beginning(self) -> bytes:
+    def _frame_prefix(self) -> bytes:
         """Return the first bytes of a message (CDR, little endian), and its frame_id."""
         text = self.frame.encode() + b'\0'
         return b'\0\1' + struct.pack('<I', len(text)) + text
@@ -192,13 +192,13 @@ class FrameFilter:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
         if len(raws) <= FEW_ROWS:
             return np.array([self._has_frame(raw) for raw in raws], bool)
-        pattern = self._begin
-        packed = Raws.of(raws)
+        pattern = self._prefix
+        packed = RawMessages.of(raws)
         at = np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)])
-        alike: Bools = packed.size > at[-1]
-        data, shown = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
-        alike[alike] = (data[packed.start[alike][:, None] + at] == shown).all(axis=1)
-        return alike
+        matches: Bools = packed.size > at[-1]
+        data, expected = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
+        matches[matches] = (data[packed.start[matches][:, None] + at] == expected).all(axis=1)
+        return matches
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
         try:

@@ -33,23 +33,23 @@ def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Trans
                  tuple(float(getattr(part, axis)) for part, axes in (
                      (one.transform.translation, 'xyz'), (one.transform.rotation, 'xyzw'))
                      for axis in axes)) for one in deserialize(raw).transforms]
-    found, at = [], 8
+    found, offset = [], 8
     for _ in range(struct.unpack_from('<I', raw, 4)[0]):
-        second, nanosecond = struct.unpack_from('<iI', raw, at)
-        parent, at = _text(raw, at + 8)
-        child, at = _text(raw, at)
-        at += (4 - at) % 8      # counted from after the four bytes
+        second, nanosecond = struct.unpack_from('<iI', raw, offset)
+        parent, offset = _text(raw, offset + 8)
+        child, offset = _text(raw, offset)
+        offset += (4 - offset) % 8      # counted from after the four bytes
         found.append((child, parent, second * 10**9 + nanosecond,
-                      struct.unpack_from('<7d', raw, at)))
-        at += 56
+                      struct.unpack_from('<7d', raw, offset)))
+        offset += 56
     return found
 
 
-def _text(raw: bytes, at: int) -> tuple[str, int]:
+def _text(raw: bytes, offset: int) -> tuple[str, int]:
     """Return the frame at an offset, and the offset after it."""
-    at += -at % 4
-    end = at + 4 + int(struct.unpack_from('<I', raw, at)[0])
-    return _name(raw[at + 4:end - 1].decode()), end + -end % 4
+    offset += -offset % 4
+    end = offset + 4 + int(struct.unpack_from('<I', raw, offset)[0])
+    return _name(raw[offset + 4:end - 1].decode()), end + -end % 4
 
 
 def _name(frame: str) -> str:
@@ -57,7 +57,7 @@ def _name(frame: str) -> str:
     return frame.removeprefix('/')
 
 
-def _shown(frame: str) -> str:
+def _quoted(frame: str) -> str:
     """Return a frame of a message for texts, quoted and limited in length."""
     return repr(frame[:MOST_LETTERS])
 
@@ -72,7 +72,7 @@ class TransformReader(Reader):
         self._build = build
         self._chain = FrameChain(*map(_name, config.reference.frames))
         self._messages = self._damaged = 0
-        self._found = False
+        self._has_position = False
         self.static = StaticReader(self, plan)
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
@@ -82,19 +82,19 @@ class TransformReader(Reader):
         for raw, received in zip(raws, np.asarray(received_ns, np.int64).tolist(), strict=True):
             for child, parent, stamp_ns, values in self._read(raw, deserialize):
                 self._chain.add(child, parent, stamp_ns, received, values)
-        return self.known()
+        return self.new_positions()
 
     def add_static(self, raws: Sequence[bytes], deserialize: Deserialize) -> None:
         for raw in raws:
             for child, parent, _, values in self._read(raw, deserialize):
                 self._chain.add_static(child, parent, values)
 
-    def known(self) -> Pairs:
+    def new_positions(self) -> Pairs:
         """Return the positions that can be computed now."""
         stamps, received, position = self._chain.take()
-        self._found = self._found or len(stamps) > 0
-        self.unreadable = self._damaged if self._found else self._messages
-        self.trouble = 'damaged messages' if self._found else self._why()
+        self._has_position = self._has_position or len(stamps) > 0
+        self.unreadable = self._damaged if self._has_position else self._messages
+        self.trouble = 'damaged messages' if self._has_position else self._missing_reason()
         return [('fix', self._build(stamps, received, position))] if len(stamps) else []
 
     def _read(self, raw: bytes, deserialize: Deserialize) -> list[Transform]:
@@ -104,18 +104,21 @@ class TransformReader(Reader):
             self._damaged += 1
             return []
 
-    def _why(self) -> str:
+    def _missing_reason(self) -> str:
         """Return the reason why there is no position, as text."""
         chain = self._chain
-        what = f'from {chain.parent} to {chain.child}'
+        between_frames = f'from {chain.parent} to {chain.child}'
         if chain.top() != chain.parent:
-            names = ', '.join(_shown(name) for name in chain.frames[:MOST_NAMES]) or 'none'
-            return (f'no transform {what}: {_shown(chain.top())} has no parent frame (frames '
-                    f'received: {names}); set reference.frames, or record the static transforms')
+            names = ', '.join(_quoted(name) for name in chain.frames[:MOST_NAMES]) or 'none'
+            return (f'no transform {between_frames}: {_quoted(chain.top())} has no parent frame '
+                    f'(frames received: {names}); set reference.frames, or record the static '
+                    'transforms')
         if not chain.moves():
-            return f'all transforms {what} are static; set reference.frames to a robot that moves'
-        return (f'the transforms {what} have no common time, or the one next to {chain.parent} '
-                'never changes: without corrections the positions are odometry alone')
+            return (f'all transforms {between_frames} are static; set reference.frames to a robot '
+                    'that moves')
+        return (f'the transforms {between_frames} have no common time, or the one next to '
+                f'{chain.parent} never changes: without corrections the positions are odometry '
+                'alone')
 
 
 class StaticReader(Reader):
@@ -129,11 +132,11 @@ class StaticReader(Reader):
              deserialize: Deserialize) -> Pairs:
         """Return the positions that waited for these messages."""
         self._moving.add_static(raws, deserialize)
-        return self._moving.known()
+        return self._moving.new_positions()
 
 
-def with_static(readers: Mapping[str, Reader], topics: Container[str]) -> dict[str, Reader]:
+def add_static_readers(readers: Mapping[str, Reader], topics: Container[str]) -> dict[str, Reader]:
     """Return topic -> reader, with readers of the static transforms of TF references."""
-    beside = {topic + STATIC: reader.static for topic, reader in readers.items()
-              if isinstance(reader, TransformReader) and topic + STATIC in topics}
-    return {**readers, **beside}
+    static_readers = {topic + STATIC: reader.static for topic, reader in readers.items()
+                      if isinstance(reader, TransformReader) and topic + STATIC in topics}
+    return {**readers, **static_readers}

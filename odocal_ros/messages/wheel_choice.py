@@ -14,16 +14,17 @@ from dataclasses import dataclass
 import re
 
 WORD = re.compile(r'[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+')
-WHEEL = ('wheel', 'whl', 'tire', 'tyre')
-MAY_BE = ('track', 'tread', 'drive', 'motor', 'traction', 'hub', 'encoder')
-STEER = ('steer', 'swivel', 'pivot', 'kingpin')
-NO_WHEEL = (*STEER, 'caster', 'castor', 'susp', 'shock', 'spring', 'damper', 'drop', 'brake',
-            'bogie', 'rocker', 'camber')
+WHEEL_WORDS_IN_NAME = ('wheel', 'whl', 'tire', 'tyre')
+DRIVE_WORDS_IN_NAME = ('track', 'tread', 'drive', 'motor', 'traction', 'hub', 'encoder')
+STEERING_WORDS = ('steer', 'swivel', 'pivot', 'kingpin')
+EXCLUDED_WORDS = (*STEERING_WORDS, 'caster', 'castor', 'susp', 'shock', 'spring', 'damper', 'drop',
+                  'brake', 'bogie', 'rocker', 'camber')
 # parts of a body or a machine: only as whole words, since they occur in other words
-NO_TRAVEL = ('arm', 'shoulder', 'elbow', 'wrist', 'finger', 'gripper', 'hand', 'head', 'neck',
-             'torso', 'waist', 'hip', 'knee', 'ankle', 'leg', 'pan', 'tilt', 'lift', 'servo',
-             'camera', 'mast', 'boom', 'bucket', 'door', 'throttle', 'pedal', 'flipper', 'lidar',
-             'laser', 'hinge', 'slider', 'yaw', 'pitch', 'roll')
+EXCLUDED_WHOLE_WORDS = (
+    'arm', 'shoulder', 'elbow', 'wrist', 'finger', 'gripper', 'hand', 'head', 'neck', 'torso',
+    'waist', 'hip', 'knee', 'ankle', 'leg', 'pan', 'tilt', 'lift', 'servo', 'camera', 'mast',
+    'boom', 'bucket', 'door', 'throttle', 'pedal', 'flipper', 'lidar', 'laser', 'hinge', 'slider',
+    'yaw', 'pitch', 'roll')
 REAR, FRONT = ('rear', 'back', 'aft'), ('front', 'fore')
 LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
 
@@ -37,7 +38,7 @@ class Choice:
     about: str            # explanation; '' if there was no choice
 
 
-def choose(names: Sequence[str], count: int) -> Choice | str:
+def select_wheels(names: Sequence[str], count: int) -> Choice | str:
     """
     Return the wheels among the values of a message, or the reason why they are unclear.
 
@@ -48,8 +49,8 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
     if not keys:
         return 'the list is empty'
     if len(set(keys)) < len(keys):
-        return f'two joints with the same name in {_listed(keys)}'
-    found = _by_name(names) if names else tuple(keys)
+        return f'two joints with the same name in {_list_text(keys)}'
+    found = _select_by_name(names) if names else tuple(keys)
     if len(keys) == 1:
         if not found:
             return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
@@ -58,60 +59,67 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
     if isinstance(found, Choice):
         return found
     if len(found) == 1:
-        return Choice((found[0],), True, f'joints {_listed(keys)}: only {found[0]} is used, '
+        return Choice((found[0],), True, f'joints {_list_text(keys)}: only {found[0]} is used, '
                       'selected by name')
     if len(found) == 2:
         what = 'joints' if names else 'values'
         first, second = found
-        return Choice((first, second), False, f'{what} {_listed(keys)}: the mean of {first} and '
+        return Choice((first, second), False, f'{what} {_list_text(keys)}: the mean of {first} and '
                       f'{second} is used. Left and right cannot be decided from the data; below, '
                       'the first is called left')
-    what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
+    what = f'the joints {_list_text(keys)}' if names else f'a list of {count} values'
     return (f'the wheels among {what} are not clear: set odometer.wheels'
             f'{"" if names else " (indices from 0)"}, or odometer.field for one; '
             'odocal inspect shows how each value moves')
 
 
-def sided(choice: Choice, side: str) -> str:
+def key_on_side(choice: Choice, side: str) -> str:
     """Return the key of the wheel on one side, 'left' or 'right'; '' if sides are unknown."""
     if len(choice.keys) == 1:
         return choice.keys[0]
     return choice.keys[side == 'right'] if choice.sides else ''
 
 
-def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
+def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     """Return the pair selected by name, otherwise all possible wheels."""
-    low = {name: name.lower() for name in names}
-    free = [n for n in names if not any(w in low[n] for w in NO_WHEEL)]
-    rolls = [n for n in free if any(w in low[n] for w in WHEEL)]
-    if not rolls:
-        free = [n for n in free if not set(_words(n)) & set(NO_TRAVEL)]
-        rolls = [n for n in free if any(w in low[n] for w in MAY_BE)] or free
-    places = {name: _place(name) for name in rolls}
-    left, right = ([n for n in rolls if places[n][0] == side] for side in ('left', 'right'))
+    lower_case = {name: name.lower() for name in names}
+    not_excluded = [name for name in names
+                    if not any(w in lower_case[name] for w in EXCLUDED_WORDS)]
+    candidates = [name for name in not_excluded
+                  if any(w in lower_case[name] for w in WHEEL_WORDS_IN_NAME)]
+    if not candidates:
+        not_excluded = [name for name in not_excluded
+                        if not set(_words(name)) & set(EXCLUDED_WHOLE_WORDS)]
+        candidates = [name for name in not_excluded
+                      if any(w in lower_case[name] for w in DRIVE_WORDS_IN_NAME)] or not_excluded
+    places = {name: _side_and_rest(name) for name in candidates}
+    left, right = ([name for name in candidates if places[name][0] == side]
+                   for side in ('left', 'right'))
     pairs = [(a, b) for a in left for b in right if places[a][1] == places[b][1]]
     if len(left) == len(right) == 1:
         pairs = [(left[0], right[0])]
-    if len(pairs) != len({n for pair in pairs for n in pair}) / 2:
-        return tuple(rolls)                      # one wheel in two pairs
+    if len(pairs) != len({name for pair in pairs for name in pair}) / 2:
+        return tuple(candidates)                      # one wheel in two pairs
     if len(pairs) == 1:
-        return Choice(pairs[0], True, _taken(names, pairs[0], ''))
-    steered = {_axle(_place(n)[1]) for n in names if any(w in low[n] for w in STEER)} - {''}
+        return Choice(pairs[0], True, _selection_text(names, pairs[0], ''))
+    steered = {_axle(_side_and_rest(name)[1]) for name in names
+               if any(w in lower_case[name] for w in STEERING_WORDS)} - {''}
     fixed = [p for p in pairs if steered and _axle(places[p[0]][1]) not in steered]
     rear = [p for p in pairs if _axle(places[p[0]][1]) == 'rear']
-    for some, why in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
-        if len(some) == 1:
-            every = ', '.join(name for pair in pairs for name in pair)
-            return Choice(some[0], True, f'{_taken(names, some[0], why)}; for all wheels set '
-                          f'odometer.wheels to [{every}]')
-    single = [n for n in rolls if _axle(places[n][1]) == 'rear']
-    return tuple(single) if len(rolls) == 2 and len(single) == 1 else tuple(rolls)
+    for axle_pairs, reason in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
+        if len(axle_pairs) == 1:
+            all_names = ', '.join(name for pair in pairs for name in pair)
+            about = _selection_text(names, axle_pairs[0], reason)
+            return Choice(axle_pairs[0], True,
+                          f'{about}; for all wheels set odometer.wheels to [{all_names}]')
+    single = [name for name in candidates if _axle(places[name][1]) == 'rear']
+    return tuple(single) if len(candidates) == 2 and len(single) == 1 else tuple(candidates)
 
 
-def _taken(names: Sequence[str], pair: tuple[str, str], why: str) -> str:
-    rest = '' if len(names) == 2 else f'joints {_listed(names)}: '
+def _selection_text(names: Sequence[str], pair: tuple[str, str], reason: str) -> str:
+    rest = '' if len(names) == 2 else f'joints {_list_text(names)}: '
     return (f'{rest}{pair[0]} is used as left wheel, {pair[1]} as right wheel (selected by '
-            f'name{why})')
+            f'name{reason})')
 
 
 def _words(name: str) -> list[str]:
@@ -125,11 +133,11 @@ def _words(name: str) -> list[str]:
     return words
 
 
-def _place(name: str) -> tuple[str, tuple[str, ...]]:
+def _side_and_rest(name: str) -> tuple[str, tuple[str, ...]]:
     """Return the side in a name ('' none or both), and the rest of the name."""
     sides, rest = set(), []
     for word in _words(name):
-        axle, side = _letters(word)
+        axle, side = _axle_and_side(word)
         if side:
             sides.add(side)
             rest += [axle] * bool(axle)
@@ -142,7 +150,7 @@ def _place(name: str) -> tuple[str, tuple[str, ...]]:
     return (sides.pop() if len(sides) == 1 else ''), tuple(rest)
 
 
-def _letters(word: str) -> tuple[str, str]:
+def _axle_and_side(word: str) -> tuple[str, str]:
     """Return axle and side of an abbreviation: l, rh, fl, rr; '' if there is none."""
     side = {'l': 'left', 'r': 'right'}
     if word in side or word in ('lh', 'rh'):
@@ -159,7 +167,7 @@ def _axle(rest: Sequence[str]) -> str:
         w in whole for w in FRONT) else ''
 
 
-def _listed(keys: Sequence[str]) -> str:
+def _list_text(keys: Sequence[str]) -> str:
     most_shown = 12
     more = len(keys) - most_shown
     return ', '.join(keys[:most_shown]) + (f' and {more} more' if more > 0 else '')

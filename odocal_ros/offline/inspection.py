@@ -21,7 +21,7 @@ from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.message_fields import IMU, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.transforms import with_static
+from odocal_ros.messages.transforms import add_static_readers
 from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import lacking, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
@@ -160,7 +160,7 @@ def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
     """Return the taps of static transforms; they share the recorder of their TF topic."""
     found = {}
     readers = {name: tap.reader for name, tap in taps.items()}
-    for name, reader in with_static(readers, bag.topics).items():
+    for name, reader in add_static_readers(readers, bag.topics).items():
         if name in taps:
             tap = taps[name]
         else:

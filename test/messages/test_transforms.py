@@ -13,7 +13,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.transforms import with_static
+from odocal_ros.messages.transforms import add_static_readers
 from odocal_ros.nav.local_frame import geodetic_of
 from odocal_ros.settings.config import Config, with_settings
 
@@ -195,12 +195,12 @@ def test_more_than_may_wait_is_read_in_one_block(monkeypatch):
 
 def test_damaged_messages_are_counted_and_random_bytes_raise_nothing():
     source = reader()
-    whole = [make.cdr(m) for _, m in MOVING[:100]]
+    is_whole = [make.cdr(m) for _, m in MOVING[:100]]
     rng = np.random.default_rng(4)
-    cut = [raw[:int(k)] for raw, k in zip(whole, rng.integers(0, 90, 100), strict=True)]
+    cut = [raw[:int(k)] for raw, k in zip(is_whole, rng.integers(0, 90, 100), strict=True)]
     noise = [b'\0\1\0\0' + rng.bytes(int(k)) for k in rng.integers(0, 200, 200)]
     source.static.rows([make.cdr(STATIC)], [1], DESERIALIZE)
-    assert source.rows(whole, range(100), DESERIALIZE)
+    assert source.rows(is_whole, range(100), DESERIALIZE)
     source.rows(cut + noise, range(300), DESERIALIZE)
     assert 250 < source.unreadable <= 300
     assert source.trouble == 'damaged messages'
@@ -211,7 +211,7 @@ def test_of_a_bag_both_topics_are_read(tmp_path):
         *(('/tf', at, m) for at, m in MOVING[:200]), ('/tf_static', 2 * NS, STATIC)])
     recorder, source = LegRecorder(), reader()
     with open_bag(path) as bag:
-        bag.read(with_static({'/tf': source}, bag.topics), recorder.feed)
+        bag.read(add_static_readers({'/tf': source}, bag.topics), recorder.feed)
         assert recorder.rows('fix').latitude.tobytes() == read(
             reader(), MOVING[:200])[1][0].tobytes()
         with pytest.raises(BadData, match='/tf: none of its 200 messages can be used: no transfo'):

@@ -8,7 +8,7 @@ from dataclasses import replace
 from drives import drive, everything_said, settings
 import pytest
 
-from odocal_ros.messages.wheel_choice import choose
+from odocal_ros.messages.wheel_choice import select_wheels
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 
@@ -43,17 +43,17 @@ REAL = {
 @pytest.mark.parametrize('robot', REAL)
 def test_wheels_of_real_robots(robot):
     names, pair = REAL[robot]
-    found = choose(names, len(names))
+    found = select_wheels(names, len(names))
     assert (found.keys, found.sides) == (pair, True)
     assert pair[0] in found.about
 
 
 def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
     names, _ = REAL['husky']
-    assert choose(names, 4).about.endswith(
+    assert select_wheels(names, 4).about.endswith(
         '; for all wheels set odometer.wheels to [front_left_wheel, front_right_wheel, '
         'rear_left_wheel, rear_right_wheel]')
-    assert 'and 88 more' in choose([f'j{k}' for k in range(100)], 100)
+    assert 'and 88 more' in select_wheels([f'j{k}' for k in range(100)], 100)
 
 
 @pytest.mark.parametrize(('names', 'keys'), [
@@ -62,12 +62,12 @@ def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
     (['front_wheel', 'rear_wheel'], ('rear_wheel',)),       # the front wheel of a bicycle steers
 ])
 def test_one_wheel(names, keys):
-    assert choose(names, len(names)).keys == keys
+    assert select_wheels(names, len(names)).keys == keys
 
 
 @pytest.mark.parametrize('names', [['a', 'b'], ['motor_1', 'motor_2', 'mast'], []])
 def test_two_of_unknown_sides(names):
-    found = choose(names, len(names) or 2)
+    found = select_wheels(names, len(names) or 2)
     assert found.keys == tuple(names[:2] or '01')
     assert not found.sides
     assert 'the mean of' in found.about
@@ -79,7 +79,7 @@ def test_two_of_unknown_sides(names):
     (['left_wheel', 'l_wheel', 'right_wheel'], 3),
     (['shoulder', 'elbow', 'wrist'], 3), (['steering'], 1), (['a', 'a'], 2), ([], 4), ([], 0)])
 def test_what_cannot_be_told_is_not_guessed(names, count):
-    assert isinstance(choose(names, count), str)
+    assert isinstance(select_wheels(names, count), str)
 
 
 def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
