@@ -40,7 +40,7 @@ from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
 from odocal_ros.settings.levels import SWAY
-from odocal_ros.settings.nominal import Grade, with_turn_on_level
+from odocal_ros.settings.nominal import Grade, grade_with_turn_on_bias
 
 SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
 OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
@@ -212,7 +212,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
     m, for a course.   spans : list of (begin, end) standstills, s.
     """
-    grade = with_turn_on_level(config.imu)
+    grade = grade_with_turn_on_bias(config.imu)
     span = choose_standstill(spans)
     found: tuple[Reason, ...] = ()
     if span is not None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
+from odocal_ros.settings.levels import TIME_RESTART_NS, TIME_RESTART_ROWS
 
 # judgement: time span and number of blocks of a rate; silence of a lost topic
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
@@ -76,7 +76,7 @@ class Health:
             self.delay_s = (int(received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
             for row in rows:
                 newest = max(newest, stamps[row])
-                sound[row] = stamps[row] >= newest - TIME_ANEW_NS
+                sound[row] = stamps[row] >= newest - TIME_RESTART_NS
         return sound
 
     def _not_ahead(self, stamps: list[int]) -> list[bool]:
@@ -89,7 +89,7 @@ class Health:
             if sound[row] and last and stamp - last >= WILD_STAMP_NS:
                 near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_STAMP_NS
                 self._ahead = [*self._ahead, stamp] if near else [stamp]
-                sound[row] = len(self._ahead) >= TIME_ANEW_ROWS
+                sound[row] = len(self._ahead) >= TIME_RESTART_ROWS
             if sound[row]:
                 last, self._ahead = stamp, []
         return sound
@@ -113,18 +113,18 @@ class Health:
         # one or two stale stamps are a driver error, more a restart of time; if a block ends with
         # few of them, or has one row only, the next block decides
         behind, self._behind = self._behind, 0
-        if not steps or min(steps) >= -TIME_ANEW_NS:
+        if not steps or min(steps) >= -TIME_RESTART_NS:
             return known[-1]
         at = steps.index(min(steps))
         after = max(known[at + 1:])
-        fell = after < known[at] - TIME_ANEW_NS
+        fell = after < known[at] - TIME_RESTART_NS
         # back to the stamps before a wild one
-        after_wild = at and steps[at - 1] > TIME_ANEW_NS and after >= known[at - 1] - TIME_ANEW_NS
-        after_wild = after_wild or not (at or self.newest_ns)
+        after_wild = (steps[at - 1] > TIME_RESTART_NS and after >= known[at - 1] - TIME_RESTART_NS
+                      if at else not self.newest_ns)
         if not fell or after_wild:
             return known[-1]
         rows = len(known) - 1 - at
-        if rows < TIME_ANEW_ROWS if at else rows + behind < 2:
+        if rows < TIME_RESTART_ROWS if at else rows + behind < 2:
             self._behind = rows
             return known[at]
         self.jumped_back = True

@@ -65,8 +65,8 @@ def select_wheels(names: Sequence[str], count: int) -> Choice | str:
         what = 'joints' if names else 'values'
         first, second = found
         return Choice((first, second), False, f'{what} {_list_text(keys)}: the mean of {first} '
-                      f'and {second} is used. Left and right cannot be decided from the data; below, '
-                      'the first is called left')
+                      f'and {second} is used. Left and right cannot be decided from the data; '
+                      'below, the first is called left')
     what = f'the joints {_list_text(keys)}' if names else f'a list of {count} values'
     return (f'the wheels among {what} are not clear: set odometer.wheels'
             f'{"" if names else " (indices from 0)"}, or odometer.field for one; '

@@ -39,7 +39,13 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.nominal import G, Grade, grade_of, imu_as_seen, with_turn_on_level
+from odocal_ros.settings.nominal import (
+    G,
+    Grade,
+    grade_of,
+    grade_with_turn_on_bias,
+    with_grade_by_noise,
+)
 
 FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
@@ -52,7 +58,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """Return the alignment of a leg, and reasons; spans: (k, 2) s, fixes_n: (n, 3) m."""
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
-    grade = with_turn_on_level(imu_as_seen(config.imu, {
+    grade = grade_with_turn_on_bias(with_grade_by_noise(config.imu, {
         name: sigma**2 for name, sigma in noise.items() if sigma}))
     if not inputs.has_accelerometer:
         grade = replace(grade, accel_bias=TILT_SIGMA * G)

@@ -22,13 +22,14 @@ from odocal_ros.settings.setting import with_settings
 
 NODE = '/calibrator'
 PARAMETERS = 'ros__parameters'
-WANTED = "'/**', '/**/calibrator', '/calibrator' or 'calibrator'"
+VALID_KEYS = "'/**', '/**/calibrator', '/calibrator' or 'calibrator'"
 # other parameters of a node, written by ros2 param dump and by ~/save
-NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_description_service)$')
+FOREIGN_PARAMETERS = re.compile(
+    r'(result|qos_overrides)\.|(use_sim_time|start_type_description_service)$')
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
-WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
-LONGEST = 100        # judgement: characters of a number
+WHOLE_NUMBER = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
+MAX_NUMBER_LENGTH = 100        # judgement: characters of a number
 Node = Any           # of PyYAML
 DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
@@ -56,16 +57,17 @@ def _root(path: Path) -> Node:
 
 def _settings(path: Path, root: Node) -> dict[str, object]:
     blocks = _blocks(root, '')
-    ours = [block for key, block in blocks.items() if _means_us(key)]
-    if not ours:
-        there = f'; it has {", ".join(blocks)}' if blocks else ''
-        raise BadConfig(f'{path}: no block for the calibrator{there}; required: a top-level key '
-                        f'{WANTED} that contains {PARAMETERS}')
+    matching = [block for key, block in blocks.items() if _matches_calibrator(key)]
+    if not matching:
+        found_keys = f'; it has {", ".join(blocks)}' if blocks else ''
+        raise BadConfig(f'{path}: no block for the calibrator{found_keys}; required: a top-level '
+                        f'key {VALID_KEYS} that contains {PARAMETERS}')
     values: dict[str, object] = {}
-    for name, node in (pair for block in ours for part in block for pair in _leaves(part, '')):
-        if not NOT_OURS.match(name):
+    for name, node in (pair for block in matching for part in block
+                       for pair in _dotted_values(part, '')):
+        if not FOREIGN_PARAMETERS.match(name):
             where = f'{path}, line {node.start_mark.line + 1}: '
-            values[name] = _checked(name, _value(node), where)
+            values[name] = _check_value(name, _value(node), where)
     return values
 
 
@@ -74,7 +76,7 @@ def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[s
     root = _root(path)
     about = list(_blocks(root, '').get(block, ()))
     return _settings(path, root), {
-        name: node.value for part in about for name, node in _leaves(part, '')
+        name: node.value for part in about for name, node in _dotted_values(part, '')
         if isinstance(node.value, str)}
 
 
@@ -94,9 +96,10 @@ def parse_set(text: str) -> tuple[str, object]:
     except BadConfig as error:
         raise BadUsage(str(error)) from None
     if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):
-        return name, _checked(name, value.strip(), '--set ')      # a joint may be named 0 or on
+        # a joint may be named 0 or on
+        return name, _check_value(name, value.strip(), '--set ')
     where = '--set ' if name in SETTINGS else '--set: '           # followed by the setting's name
-    return name, _checked(name, '' if node is None else _value(node), where)
+    return name, _check_value(name, '' if node is None else _value(node), where)
 
 
 def _is_quoted(node: Node) -> bool:
@@ -128,22 +131,22 @@ def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
     return found
 
 
-def _means_us(key: str) -> bool:
+def _matches_calibrator(key: str) -> bool:
     """Return True if a node key, with the wildcards * and **, matches /calibrator."""
-    if len(key) > LONGEST:
+    if len(key) > MAX_NUMBER_LENGTH:
         return False
     parts = {'**': r'(?:/\w+)*', '*': r'/\w+'}
     pattern = ''.join(parts.get(p, '/' + re.escape(p)) for p in key.strip('/').split('/'))
     return re.fullmatch(pattern, NODE) is not None
 
 
-def _leaves(node: Node, prefix: str) -> Iterator[tuple[str, Node]]:
+def _dotted_values(node: Node, prefix: str) -> Iterator[tuple[str, Node]]:
     """Yield (dotted name, value node) of nested and dotted keys."""
     import yaml
     for key, value in _pairs(node):
         name = f'{prefix}{key}'
         if isinstance(value, yaml.MappingNode):
-            yield from _leaves(value, f'{name}.')
+            yield from _dotted_values(value, f'{name}.')
         else:
             yield name, value
 
@@ -161,9 +164,9 @@ def scalar(text: str) -> bool | int | float | str:
     """Return a plain scalar with the type that rcl gives it (measured on rcl 9.2)."""
     if text in TRUE or text in FALSE:
         return text in TRUE
-    if len(text) > LONGEST:
+    if len(text) > MAX_NUMBER_LENGTH:
         return text
-    if whole := WHOLE.fullmatch(text):
+    if whole := WHOLE_NUMBER.fullmatch(text):
         number = int(text, 16 if whole[1] else 8 if whole[2] else 10)
         if -2**63 <= number < 2**63:
             return number
@@ -174,7 +177,7 @@ def scalar(text: str) -> bool | int | float | str:
         return text
 
 
-def _checked(name: str, value: object, where: str) -> Any:
+def _check_value(name: str, value: object, where: str) -> Any:
     try:
         with_settings(Config(), {name: value})
     except BadConfig as error:

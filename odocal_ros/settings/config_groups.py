@@ -14,8 +14,8 @@ FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'covari
            'track', 'legs', 'report')
 # results that can have limits
 ACCEPTED = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
-WANTED = ('--accept NAME=LOW:HIGH, such as --accept scale_ratio=0.995:1.005; either limit can be '
-          'omitted')
+ACCEPT_FORM = ('--accept NAME=LOW:HIGH, such as --accept scale_ratio=0.995:1.005; either limit '
+               'can be omitted')
 DEG = '_deg'
 
 
@@ -35,13 +35,13 @@ class ReferenceConfig:
     frames: tuple[str, ...] = setting(('map', 'base_link'), item=str, ro=True, about=(
         'With TF as position reference: the fixed frame, and the frame of the tracked point on '
         'the robot.'))
-    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, ro=True, many=True, about=(
+    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, ro=True, any_length=True, about=(
         'Points on the floor where the robot stands at the marks: x and y of each, in the order '
         'of the marks; after the last point the list starts again. The node then uses ~/mark '
         'instead of the topic fix.'))
     points_sigma: float = setting(0.005, 'm', 1e-4, 1.0, about='Uncertainty of points and of '
                                   'the robot on them, each axis.')
-    marks: tuple[float, ...] = setting((), 's', 0.0, 1e6, many=True, about=(
+    marks: tuple[float, ...] = setting((), 's', 0.0, 1e6, any_length=True, about=(
         'Times at which the robot stands on the points, from the first message of the bag; they '
         'replace fixes and poses. The same as --mark.'))
     min_distance: float = setting(2.0, 'm', 0.1, 1e5, about='leg.min_distance with positions in a '
@@ -133,23 +133,23 @@ def parse_accept(text: str) -> dict[str, float]:
     """
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')
-    plain, factor = name, 1.0
+    parameter, factor = name, 1.0
     if name.endswith(f'angle{DEG}'):
-        plain, factor = name.removesuffix(DEG), math.radians(1.0)
-    if plain not in ACCEPTED:
+        parameter, factor = name.removesuffix(DEG), math.radians(1.0)
+    if parameter not in ACCEPTED:
         raise BadUsage(f'--accept {text}: required: one of '
                        + ', '.join(n + f' (or {n}{DEG})' * n.endswith('angle') for n in ACCEPTED))
     if not (equals and colon and limits != ':'):
-        raise BadUsage(f'--accept {text}: required: {WANTED}')
+        raise BadUsage(f'--accept {text}: required: {ACCEPT_FORM}')
     try:
-        found = {f'accept.{plain}_{side}': float(value) * factor
+        found = {f'accept.{parameter}_{side}': float(value) * factor
                  for side, value in (('min', low), ('max', high)) if value.strip()}
         if any(map(math.isnan, found.values())):
             raise ValueError
         return found
     except ValueError:
         raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
-                       f'{WANTED}') from None
+                       f'{ACCEPT_FORM}') from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,7 @@ INFORMED_SHARE = 0.5
 # m/s, judgement: to the side and up, of a sprung body, not measured by wheels
 SWAY = 0.05
 # judgement: a larger backward step, of this number of stamps in sequence, is a restart of time
-TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
+TIME_RESTART_NS, TIME_RESTART_ROWS = 10**9, 3
 # s between the stamps of two topics, judgement: drivers have smaller delays
 CLOCK_DIFFERENCE_LIMIT = 0.5
 # definition: units

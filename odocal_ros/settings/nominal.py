@@ -105,23 +105,24 @@ TURN_ON = {'consumer': (math.radians(1.0), 25e-3 * G), 'industrial': (math.radia
 def turn_on_bias(imu: ImuConfig) -> tuple[float, float]:
     """Return the usual turn-on bias of a gyro, rad/s, and an accelerometer, m/s^2: 1 sigma."""
     grade = grade_of(imu)
-    usual = TURN_ON.get(imu.grade, (0.0, 0.0))
-    return (max(grade.gyro_bias, usual[0] if math.isnan(imu.gyro_bias) else 0.0),
-            max(grade.accel_bias, usual[1] if math.isnan(imu.accel_bias) else 0.0))
+    turn_on = TURN_ON.get(imu.grade, (0.0, 0.0))
+    return (max(grade.gyro_bias, turn_on[0] if math.isnan(imu.gyro_bias) else 0.0),
+            max(grade.accel_bias, turn_on[1] if math.isnan(imu.accel_bias) else 0.0))
 
 
-def with_turn_on_level(imu: ImuConfig) -> Grade:
+def grade_with_turn_on_bias(imu: ImuConfig) -> Grade:
     """Return the grade with the usual turn-on bias of its accelerometer, which tilts the level."""
     return dataclasses.replace(grade_of(imu), accel_bias=turn_on_bias(imu)[1])
 
 
-SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
-            'accel_scale_error': 'accel_scale_sigma',
-            'misalignment': 'misalignment_sigma',
-            'gyro_by_force': 'gyro_by_force_sigma'}     # setting of a figure, if its name differs
+# setting of a figure, if its name differs
+SETTING_OF_FIGURE = {'gyro_scale_error': 'gyro_scale_sigma',
+                     'accel_scale_error': 'accel_scale_sigma',
+                     'misalignment': 'misalignment_sigma',
+                     'gyro_by_force': 'gyro_by_force_sigma'}
 
 
-def imu_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> ImuConfig:
+def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuConfig:
     """
     Return the imu settings, with a worse grade if that fits the noise at rest better.
 
@@ -131,21 +132,21 @@ def imu_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> ImuConfig:
     """
     if not variance:
         return imu
-    worse = [dataclasses.replace(imu, grade=name) for name in GRADES][:list(GRADES).index(
+    candidates = [dataclasses.replace(imu, grade=name) for name in GRADES][:list(GRADES).index(
         imu.grade) + 1]
 
-    def misfit(one: ImuConfig) -> float:
-        grade = grade_of(one)
+    def misfit(candidate: ImuConfig) -> float:
+        grade = grade_of(candidate)
         return sum(abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
                    for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))
                    if name in variance)
 
-    return min(reversed(worse), key=misfit)
+    return min(reversed(candidates), key=misfit)
 
 
 def grade_of(imu: ImuConfig) -> Grade:
     """Return the grade of the imu settings, with the single figures that the settings give."""
     grade = GRADES[imu.grade]
     names = [f.name for f in dataclasses.fields(Grade)]
-    given = {name: getattr(imu, SETTINGS.get(name, name)) for name in names}
-    return dataclasses.replace(grade, **{k: v for k, v in given.items() if not math.isnan(v)})
+    configured = {name: getattr(imu, SETTING_OF_FIGURE.get(name, name)) for name in names}
+    return dataclasses.replace(grade, **{k: v for k, v in configured.items() if not math.isnan(v)})

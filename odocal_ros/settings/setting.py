@@ -36,10 +36,10 @@ class Setting:
     high: float | None = None
     about: str = ''
     choices: Sequence[str] = ()
-    ro: bool = False          # fixed at start-up
+    ro: bool = False          # read-only after start-up
     frame: bool = False       # the value is the name of a coordinate frame
     item: type = float        # type of the values of a list
-    many: bool = False        # of any length
+    any_length: bool = False        # a list of any length
 
     @property
     def kind(self) -> str:
@@ -54,15 +54,15 @@ class Setting:
             if isinstance(value, str) or not hasattr(value, '__len__'):
                 raise BadConfig(f'{self.name}: {value!r} is not a list')
             if self.item is str:        # an index is a name too
-                return tuple(self._one(str(v) if type(v) is int else v, str) for v in value)
-            items = tuple(self._one(v, float) for v in value)
+                return tuple(self._check_item(str(v) if type(v) is int else v, str) for v in value)
+            items = tuple(self._check_item(v, float) for v in value)
             lengths = (3,) if self.default else (0, 4)
-            if len(items) not in lengths and not self.many:
+            if len(items) not in lengths and not self.any_length:
                 raise BadConfig(f'{self.name}: {len(items)} values; required: {lengths[-1]}')
             return items
-        return self._one(value, type(self.default))
+        return self._check_item(value, type(self.default))
 
-    def _one(self, value: Any, kind: type[Any]) -> Any:
+    def _check_item(self, value: Any, kind: type[Any]) -> Any:
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not kind:

@@ -18,7 +18,7 @@ from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.nominal import GRADES, imu_as_seen, TURN_ON
+from odocal_ros.settings.nominal import GRADES, TURN_ON, with_grade_by_noise
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
@@ -157,7 +157,7 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
             ('navigation', tactical, 'tactical'), ('tactical', tactical, 'tactical'),
             ('consumer', tactical, 'consumer'), ('tactical', vibrating, 'consumer'),
             ('navigation', {}, 'navigation')):
-        assert imu_as_seen(replace(imu, grade=given), noise).grade == seen
+        assert with_grade_by_noise(replace(imu, grade=given), noise).grade == seen
 
 
 @pytest.mark.parametrize(('set_to', 'found', 'ratio', 'text', 'do'), [
