@@ -28,7 +28,7 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
 from odocal_ros.screening.leg_kind import TILT_SIGMA
-from odocal_ros.settings.grades import G, Grade
+from odocal_ros.settings.nominal import G, Grade
 
 # s. Tuned: with 0.02 s the results of six drives differ by 0.04 sigma rms, at most 0.19, and a fit
 # takes 1.6 times the time (docs/decisions/0020)

@@ -83,7 +83,8 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     t = imu.t[imu.key]
     still = is_standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    config = replace(config, imu=with_grade_by_noise(config.imu, white_noise_at_rest(imu, leg, still)))
+    at_rest = white_noise_at_rest(imu, leg, still)
+    config = replace(config, imu=with_grade_by_noise(config.imu, at_rest))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
     within = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}

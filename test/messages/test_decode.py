@@ -91,7 +91,7 @@ def span(name):
 @pytest.mark.parametrize('name', STD)
 def test_counters(name):
     low, high = span(name)
-    found, reader = read('odometer', [make.is_whole(v, name) for v in (low, 5, high)])
+    found, reader = read('odometer', [make.whole(v, name) for v in (low, 5, high)])
     assert dataclasses.astuple(reader.form)[:3] == ('cumulative', high - low + 1, 'm/pulse')
     block = found['odometer']
     assert block.value.dtype == np.int64
@@ -107,9 +107,9 @@ TWO, FIVE = make.joints(1, ['l', 'r'], [1, 2]), make.joints(1, list('xabcd'), [0
 ARM, WHEEL = ['elbow', 'wrist'], ['left_wheel', 'right_wheel']
 # message or messages, settings, values by wheel, quantity with modulus and unit, stamps
 ODOMETERS = {
-    'a span': (make.is_whole(3, 'Int32'), {'odometer__wrap': 9000}, [[3]],
+    'a span': (make.whole(3, 'Int32'), {'odometer__wrap': 9000}, [[3]],
                ('cumulative', 9000, 'm/pulse'), [7]),
-    'increments': (make.is_whole(3), {'odometer__quantity': 'increment'}, [[3]],
+    'increments': (make.whole(3), {'odometer__quantity': 'increment'}, [[3]],
                    ('increment', 0, 'm/pulse'), [7]),
     'a sum': (make.real(1.0), {'odometer__quantity': 'cumulative'}, [[1.0]], COUNTER, [7]),
     'double': (make.real(1.5), {}, [[1.5]], SPEED, [7]),
@@ -129,7 +129,7 @@ ODOMETERS = {
         [1, 2, 3, 4], [7, 7, 7, 7]), {}, [[3.0], [4.0]], ANGLE, [9]),
     'velocities': ([make.joints(9, 'ab', velocity=[1, 2]), make.joints(10, 'ab', [5, 5], [3, 4])],
                    {}, [[1, 3], [2, 4]], TURNING, [9, 10]),
-    'two topics': (make.is_whole(1, 'Int32'), BOTH, [[1]], ('cumulative', 2**32, 'm/pulse'), [7]),
+    'two topics': (make.whole(1, 'Int32'), BOTH, [[1]], ('cumulative', 2**32, 'm/pulse'), [7]),
     'left and right': (TWO, {'odometer__left': 'l', 'odometer__right': 'r'}, [[1], [2]], ANGLE,
                        [1]),
     'two as a list': (TWO, {'odometer__wheels': ('l', 'r')}, [[1], [2]], ANGLE, [1]),

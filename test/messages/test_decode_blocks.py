@@ -71,7 +71,7 @@ MESSAGES = {
     'odometer two joints': (joint_states(), {'odometer.left': 'l', 'odometer.right': 'r'}),
     'odometer Float32': (st.builds(make.real, st.floats(width=32), st.just('Float32')), {}),
     'odometer Float64': (st.builds(make.real, floats), {}),
-} | {f'odometer {name}': (st.builds(make.is_whole, st.integers(*span(name)), st.just(name)), {})
+} | {f'odometer {name}': (st.builds(make.whole, st.integers(*span(name)), st.just(name)), {})
      for name in STD} | {f'odometer {name} array': (st.builds(
         make.whole_array, st.lists(st.integers(-2**31, 2**31 - 1), max_size=3), st.just(name),
         st.sampled_from([(), ('a',), ('b', 'cd')])), {}) for name in ('Int32', 'Int64')}
@@ -141,7 +141,7 @@ def test_alike_messages_are_read_without_arrays(monkeypatch):
     """The property above would hold if readings were always made of rows."""
     for slot, message, row in (
             ('imu', make.imu(7, w=(1, 2, 3), f=(4, 5, 6)), (7, 1, (1, 2, 3), (4, 5, 6))),
-            ('odometer', make.is_whole(3), (1, 1, 3)),
+            ('odometer', make.whole(3), (1, 1, 3)),
             ('odometer', make.joints(7, ['l', 'r'], [5, 6]), (7, 1, 5))):
         raw = make.cdr(message)
         reader = make_reader(slot, message.__msgtype__, Config())
@@ -169,7 +169,7 @@ def test_layouts_do_read_columns():
     """The property above would hold if the block path never ran: here it must."""
     for slot, message in (('imu', make.imu(1)), ('fix', make.fix(1, 2, 3)),
                           *(('odometer', one) for one in (
-                              make.joints(1, ['a'], [1]), make.odometry(1, 2), make.is_whole(3),
+                              make.joints(1, ['a'], [1]), make.odometry(1, 2), make.whole(3),
                               make.twist_stamped(1, 2), make.whole_array([1], labels=['x'])))):
         reader = make_reader(slot, message.__msgtype__, Config())
         # None: any deserialising would fail
@@ -191,7 +191,7 @@ def test_a_recorder_gets_one_leg_from_any_blocks():
 
 @pytest.mark.parametrize('message', [
     make.imu(1_700_000_000_123_456_789, w=(1, 2, 3)), make.fix(1, 2, 3),
-    make.is_whole(-5, 'Int16'),
+    make.whole(-5, 'Int16'),
     make.joints(1, ['l', 'right'], [], [1.0, 2.0]), make.joints(1, ['l'], [1.0], []),
     make.whole_array([1, 2], labels=['abc']), make.odometry(1, 2.5, 'b'), make.twist(1.0),
     make.twist_covariance(1, 2.0)], ids=lambda m: m.__msgtype__)

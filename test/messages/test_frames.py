@@ -47,19 +47,19 @@ def read(frames, pieces=(), wanted='', little_endian=True):
 @pytest.mark.parametrize('little_endian', [True, False])
 def test_one_frame_is_used_however_the_stream_is_chopped(little_endian):
     frames = ['front', 'rear_imu'] * 10
-    is_whole, reader = read(frames, little_endian=little_endian)
+    whole, reader = read(frames, little_endian=little_endian)
     assert reader.frame == 'front'
-    assert is_whole['imu'].received_ns.tolist() == [0, 1, 2, 3, *range(4, 20, 2)]
-    assert is_whole['imu_other'].received_ns.tolist() == [*range(5, 20, 2)]
-    assert set(is_whole['imu_other'].frame.tolist()) == {b'rear_imu'}
-    assert set(is_whole['imu_other'].used.tolist()) == {b'front'}
+    assert whole['imu'].received_ns.tolist() == [0, 1, 2, 3, *range(4, 20, 2)]
+    assert whole['imu_other'].received_ns.tolist() == [*range(5, 20, 2)]
+    assert set(whole['imu_other'].frame.tolist()) == {b'rear_imu'}
+    assert set(whole['imu_other'].used.tolist()) == {b'front'}
     if little_endian:
-        assert is_whole['imu_other'].stamp_ns.tolist() == [10**9 + k for k in range(5, 20, 2)]
+        assert whole['imu_other'].stamp_ns.tolist() == [10**9 + k for k in range(5, 20, 2)]
     for pieces in ([1], [2, 5, 7], range(1, 20)):
         found, _ = read(frames, pieces, little_endian=little_endian)
-        assert found.keys() == is_whole.keys()
-        for slot in is_whole:
-            for one, other in zip(columns_of(found[slot]), columns_of(is_whole[slot]),
+        assert found.keys() == whole.keys()
+        for slot in whole:
+            for one, other in zip(columns_of(found[slot]), columns_of(whole[slot]),
                                   strict=True):
                 assert one.tobytes() == other.tobytes()
 
@@ -188,12 +188,12 @@ def test_each_type_gives_its_position_and_no_covariance(message):
 
 
 def test_a_stated_covariance_is_the_block_of_the_position():
-    is_whole = np.diag([0.04, 0.09, 0.25, 7.0, 8.0, 9.0])
-    is_whole[0, 1] = is_whole[1, 0] = 0.01
-    block = fixes_of([make.pose_covariance(1, (1, 2, 3), is_whole)])
+    whole = np.diag([0.04, 0.09, 0.25, 7.0, 8.0, 9.0])
+    whole[0, 1] = whole[1, 0] = 0.01
+    block = fixes_of([make.pose_covariance(1, (1, 2, 3), whole)])
     covariance, unknown = covariances(block, 2.5)
     assert not unknown.any()
-    np.testing.assert_array_equal(covariance[0], is_whole[:3, :3])
+    np.testing.assert_array_equal(covariance[0], whole[:3, :3])
 
 
 def test_an_odometry_as_reference_is_its_pose():

@@ -195,12 +195,12 @@ def test_more_than_may_wait_is_read_in_one_block(monkeypatch):
 
 def test_damaged_messages_are_counted_and_random_bytes_raise_nothing():
     source = reader()
-    is_whole = [make.cdr(m) for _, m in MOVING[:100]]
+    whole = [make.cdr(m) for _, m in MOVING[:100]]
     rng = np.random.default_rng(4)
-    cut = [raw[:int(k)] for raw, k in zip(is_whole, rng.integers(0, 90, 100), strict=True)]
+    cut = [raw[:int(k)] for raw, k in zip(whole, rng.integers(0, 90, 100), strict=True)]
     noise = [b'\0\1\0\0' + rng.bytes(int(k)) for k in rng.integers(0, 200, 200)]
     source.static.rows([make.cdr(STATIC)], [1], DESERIALIZE)
-    assert source.rows(is_whole, range(100), DESERIALIZE)
+    assert source.rows(whole, range(100), DESERIALIZE)
     source.rows(cut + noise, range(300), DESERIALIZE)
     assert 250 < source.unreadable <= 300
     assert source.trouble == 'damaged messages'

@@ -25,7 +25,7 @@ from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, FAST_SPEED, LN_K, SPEED_OFFSET, State
 from odocal_ros.settings.config import SIDES
-from odocal_ros.settings.grades import G, Grade
+from odocal_ros.settings.nominal import G, Grade
 
 AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
 

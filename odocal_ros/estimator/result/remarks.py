@@ -24,9 +24,8 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.earth import A
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS, FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS
-from odocal_ros.settings.nominal import G, Grade, grade_of
+from odocal_ros.settings.nominal import grade_of
 
 CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
