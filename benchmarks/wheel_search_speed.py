@@ -16,9 +16,9 @@ import time
 from harness import parsed
 import numpy as np
 
+from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
 from odocal_ros.calib.wheel_search.planar import course_pieces, PlanarLeg, score
 from odocal_ros.calib.wheel_search.search import search
-from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.settings.config import WheelsConfig
 
 RATE, FIX_EVERY, TRACK = 50, 10, 1.6     # Hz, epochs, m

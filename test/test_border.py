@@ -93,7 +93,7 @@ def test_a_method_that_does_not_run_is_not_imported():
              "rooms = ('odocal_ros.estimator', 'odocal_ros.calib.wheel_search', "
              "'odocal_ros.calib.wheels.')\n"
              'print([m for m in sys.modules if m.startswith(rooms)'
-             " and m != 'odocal_ros.calib.wheels.wheel_slips'])")
+             " and m != 'odocal_ros.calib.slip'])")
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.wheels.wheel_slips import of_axles, WheelSlips
+from odocal_ros.calib.slip import join_axles, WheelSlips
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.estimator.result.wheel_result import Wheel, wheel_estimates
 from odocal_ros.output.summary import screen as printed
@@ -178,7 +178,7 @@ def test_a_slip_of_one_of_four_wheels_is_named_and_the_factors_hold():
 def test_the_share_of_a_slip_in_the_mean_is_one_over_the_wheels():
     first, second = (WheelSlips(np.array([t]), np.array([t + 2.0]), np.array([size]),
                                 np.array([1])) for t, size in ((50.0, 0.4), (10.0, 0.8)))
-    both = of_axles((first, second), 4)
+    both = join_axles((first, second), 4)
     assert both.begin.tolist() == [10.0, 50.0]
     t, sigma = both.doubts()
     for begin, size in ((10.0, 0.8), (50.0, 0.4)):

@@ -20,10 +20,10 @@ from odocal_ros.settings.levels import FASTEST
 FURTHEST_SLIDE, LONGEST_SLIDE, LEAST_SHARE = 100.0, 20.0, 0.01
 
 
-def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
+def check_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """Return the path length between the marks, m, and the reasons against the drive."""
-    distance, found = check_path(track, t_stop, metres_per_unit, leg)
+    distance, found = check_path_and_speed(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
     if len(t) < 2:
@@ -39,8 +39,8 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     return distance, found
 
 
-def check_path(track: Track, t_stop: float, metres_per_unit: float,
-               leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
+def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
+                         leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
     Return the path length between the marks, m, and reasons if it or the speed is too low.
 
@@ -71,7 +71,7 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
     return out
 
 
-def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
+def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     """Return a reason if the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
     # s, shortest reported; for slow topics 1.5 times the interval of their messages
@@ -84,8 +84,8 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
                    'the time of the odometer data'),)
 
 
-def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
-               t_stop: float, least: float) -> tuple[Reason, ...]:
+def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
+                   t_stop: float, least: float) -> tuple[Reason, ...]:
     """Return the reason if wheels or fixes do not move, () if both do; least : of fixes, m."""
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
@@ -96,14 +96,14 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]
     # 10 sigmas: judgement, a leg is longer. Many receivers state far more than their noise
-    sigma = min(fix_sigma, white_noise(here))
+    sigma = min(fix_sigma, fix_white_noise(here))
     fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        return _stopped(travel, t_here, here, fix_sigma)
+        return _stopped_counter_reasons(travel, t_here, here, fix_sigma)
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
     if wheels_move:
@@ -113,7 +113,8 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     return (Reason(Code.LEG_TOO_SHORT, 'the vehicle did not move'),)
 
 
-def _stopped(travel: Travel, t: Floats, fixes: Floats, fix_sigma: float) -> tuple[Reason, ...]:
+def _stopped_counter_reasons(travel: Travel, t: Floats, fixes: Floats,
+                             fix_sigma: float) -> tuple[Reason, ...]:
     """Return a reason if the fixes, (k, 2) at (k,) s, move far without counts."""
     far, since, until = max(_without_counts(travel, t, fixes, fix_sigma), default=(0.0, 0.0, 0.0))
     if not far or far < LEAST_SHARE * path_and_chord(t, fixes)[0]:
@@ -139,7 +140,7 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
     return found
 
 
-def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
+def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
     """Return (k, 2) s in which fixes move without counts, which go on afterwards: ferries."""
     spans = []
     for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
@@ -177,15 +178,15 @@ def path_and_chord(t_fix: Floats, fixes_n: Floats,
     would accumulate. Fixes out of reach of a vehicle are left out.   least : smallest motion of
     fixes that is significant, m.
     """
-    p = fixes_n[within_reach(t_fix, fixes_n), :2]
+    p = fixes_n[find_reachable(t_fix, fixes_n), :2]
     if len(p) < 2:
         return 0.0, 0.0
-    knots = [*knots_of(p, max(min(2.0, least), 10 * white_noise(p))), len(p) - 1]
+    knots = [*separated_fixes(p, max(min(2.0, least), 10 * fix_white_noise(p))), len(p) - 1]
     path = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
     return path, float(np.hypot(*(p[-1] - p[0])))
 
 
-def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:
+def find_reachable(t_fix: Floats, fixes_n: Floats) -> Bools:
     """Return the fixes that a vehicle can reach from the median one, in sequence: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
@@ -204,7 +205,7 @@ def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:
     return keep
 
 
-def white_noise(fixes_n: Floats) -> float:
+def fix_white_noise(fixes_n: Floats) -> float:
     """Return the white noise of fixes, m, by the median of their second differences."""
     if len(fixes_n) < 5:
         return 2.5
@@ -212,7 +213,7 @@ def white_noise(fixes_n: Floats) -> float:
     return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 
-def knots_of(fixes_n: Floats, least: float) -> list[int]:
+def separated_fixes(fixes_n: Floats, least: float) -> list[int]:
     """Return indices of fixes, (k, 2 or more), at least ``least`` m apart, from the first."""
     knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
     begin, ahead = 1, 64       # fixes searched at a time: the next knot is usually among them

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
-from odocal_ros.calib.sections import NO_WINDOWS, Sections, sections, window_scale
-from odocal_ros.calib.speed_scale import NO_BINS, speed_scale, SpeedScale
+from odocal_ros.calib.scale_variation import (
+    NO_BINS,
+    NO_WINDOWS,
+    Sections,
+    sections,
+    speed_scale,
+    SpeedScale,
+    window_scale,
+)
 from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks

@@ -15,8 +15,8 @@ in mirrored axes have these signs.
 
 import numpy as np
 
-from odocal_ros.calib.check import ONE_MOTION_RATIO
-from odocal_ros.calib.drive import knots_of
+from odocal_ros.calib.drive import separated_fixes
+from odocal_ros.calib.track_check import ONE_MOTION_RATIO
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.integral import integral_at, twice_integral_at
@@ -187,7 +187,7 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     covered = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
     t_fix, fixes_n = t_fix[covered], fixes_n[covered]
     # m: the sigma of a course is then 0.14 rad
-    knots = knots_of(fixes_n, max(min(5.0, least), 10 * sigma))
+    knots = separated_fixes(fixes_n, max(min(5.0, least), 10 * sigma))
     if len(knots) < 5:
         return None
     ends = t_fix[knots]

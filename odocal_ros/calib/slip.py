@@ -9,13 +9,18 @@ the forward axis minus gravity. With the speed set to the odometer's at both end
 constant accelerometer bias and tilt cancel; slip within the window does not. A delayed odometer,
 or one whose speed is low-pass filtered, differs from the IMU at every change of acceleration: the
 delay at which the two agree best is estimated first.
+
+``WheelSlips`` are the slips of single wheels, which wheel_faults.py detects with the gyro.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Source
 from odocal_ros.data.arrays import Bools, Floats, Ints
@@ -38,11 +43,11 @@ SPIN_TURN = 0.1
 # plus 1 at the window's ends; the rest is margin: judgement
 PIN_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
-LEAST_BRAKING = 0.5
+WEAKEST_BRAKING = 0.5
 STOPS = 0.5          # m/s, a speed below is a stop: judgement
 BRAKES_BESIDE = 1.0  # s around a slip searched for braking, a keyframe interval: judgement
 # s, delays of the odometer that are tested: judgement; a bus or a filter has less
-LATE = 0.05 * np.arange(-10, 21)
+TESTED_DELAYS = 0.05 * np.arange(-10, 21)
 
 
 class Slips(NamedTuple):
@@ -51,10 +56,10 @@ class Slips(NamedTuple):
     t: Floats                          # (k,) s, middle of each slip
     size: Floats                       # (k,) m, > 0 if the wheel spun, < 0 if it slid
     late: float = 0.0  # s, of the odometer against the IMU, if it would look like slip, else 0
-    unforced: Ints = np.empty(0, int)  # (k,) 0 or the sign of travel no force explains
+    unforced_sign: Ints = np.empty(0, int)  # (k,) 0 or the sign of travel no force explains
 
 
-def rounding(travel: Travel) -> float:
+def count_size(travel: Travel) -> float:
     """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
     coarse = travel.coarse
     # coarse.most is the largest error of speeds at the ends of a window and within it
@@ -70,8 +75,8 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     scale times forward axis.   latitude : rad.   quantum : size of an odometer count, scale units.
     """
     K = float(np.linalg.norm(f))
-    grid = np.arange(max(track.t[0] - LATE[0], t_imu[0]), min(track.t[-1] - LATE[-1], t_imu[-1]),
-                     SPIN_GRID)
+    grid = np.arange(max(track.t[0] - TESTED_DELAYS[0], t_imu[0]),
+                     min(track.t[-1] - TESTED_DELAYS[-1], t_imu[-1]), SPIN_GRID)
     if len(grid) < 2 * SPAN:
         return Slips(np.empty(0), np.empty(0))
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
@@ -81,11 +86,12 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > SPIN_TURN
     windows = _Windows(grid, a, turns, track, K, quantum)
     # a mean of absolute values: slips hardly affect it
-    late = float(LATE[np.argmin([np.abs(windows.excess(late)).mean() for late in LATE])])
+    late = float(TESTED_DELAYS[np.argmin([np.abs(windows.excess(late)).mean()
+                                          for late in TESTED_DELAYS])])
     t, size = windows.events(late)
     hidden = len(windows.events(0.0)[0]) > len(t)
     speed = K * np.diff(np.interp(grid + late, track.t, track.s)) / SPIN_GRID
-    sign = [unforced(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
+    sign = [unforced_sign(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
         speed, np.full(5, 0.2), 'valid')) for at, metres in zip(t, size, strict=True)]
     return Slips(t, size, late if hidden else 0.0, np.array(sign, int))
 
@@ -153,7 +159,7 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
     return middle[k], excess[k]
 
 
-def unforced(t: float, duration: float, metres: float, t_speed: Floats, speed: Floats) -> int:
+def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, speed: Floats) -> int:
     """
     Return -1 or 1 for travel that no force explains, 0 for slip.
 
@@ -171,14 +177,14 @@ def unforced(t: float, duration: float, metres: float, t_speed: Floats, speed: F
 
     _, change, direction = within(BRAKES_BESIDE)
     if metres * direction < 0:
-        return -int(len(change) and change.min() > -LEAST_BRAKING)
+        return -int(len(change) and change.min() > -WEAKEST_BRAKING)
     size, change, _ = within(0.0)
-    stops = len(change) and ((change < -LEAST_BRAKING) | (size[1:] < STOPS)).all()
+    stops = len(change) and ((change < -WEAKEST_BRAKING) | (size[1:] < STOPS)).all()
     return int(stops and size.min() < STOPS)
 
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
-    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m, sign as by ``unforced``."""
+    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : ``unforced_sign``."""
     found = []
     for code, of, relation, where in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
@@ -201,7 +207,8 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """Return the reasons for delay, slip and unforced travel; time_offset : as configured, s."""
     found: tuple[Reason, ...] = ()
-    t, size, late = slips.t[slips.unforced == 0], slips.size[slips.unforced == 0], slips.late
+    by_force = slips.unforced_sign == 0
+    t, size, late = slips.t[by_force], slips.size[by_force], slips.late
     if late:
         found += (Reason(
             Code.DELAY_SEEN, f'odometer stamps are about {abs(late):.2f} s '
@@ -212,4 +219,78 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+z.2f} m at t = {t[0]:.1f} '
             's: the wheel spun or slid'),)
-    return (*found, *travel_reasons(slips.t, slips.size, slips.unforced))
+    return (*found, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
+
+
+# s, judgement: between rows in the search for slips, which last a second or more
+SLIP_GRID = 0.1
+
+
+def _none(kind: type = float) -> NDArray[Any]:
+    return field(default_factory=lambda: np.empty(0, kind))
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSlips:
+    """Slips of single wheels, in order of time: (k,)."""
+
+    begin: Floats = _none()        # s
+    end: Floats = _none()          # s
+    size: Floats = _none()         # m, > 0: farther; unknown wheel: right minus left
+    wheel: Ints = _none(np.int64)  # -1 left, +1 right, 0 unknown
+    change: float = 0.0            # of the ratio right over left in the drive, as if at half of it
+    count: int = 2                 # number of wheels in the mean
+
+    @property
+    def t(self) -> Floats:
+        """Return the middle of each slip, s."""
+        return (self.begin + self.end) / 2
+
+    def doubts(self) -> tuple[Floats, Floats]:
+        """
+        Return the times at which the mean of the wheels is uncertain, and its sigma: (d,) s, m.
+
+        A slip of one of ``count`` wheels is 1 / ``count`` as large in the mean, distributed over
+        its seconds.
+        """
+        seconds = np.maximum(np.ceil(self.end - self.begin), 1.0).astype(int)
+        t = [begin + (end - begin) * (np.arange(n) + 0.5) / n
+             for begin, end, n in zip(self.begin, self.end, seconds, strict=True)]
+        sigma = np.repeat(np.abs(self.size) / self.count / np.sqrt(seconds), seconds)
+        return np.concatenate([*t, []]), sigma
+
+
+NO_SLIPS = WheelSlips()
+
+
+def join_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:
+    """Return the slips of the wheels of several axles; count: number of wheels in the mean."""
+    columns = {name: np.concatenate([getattr(one, name) for one in axles]) for name in (
+        'begin', 'end', 'size', 'wheel')}
+    order = np.argsort(columns['begin'], kind='stable')
+    return WheelSlips(**{name: column[order] for name, column in columns.items()},
+                      change=math.hypot(*(one.change for one in axles)), count=count)
+
+
+def make_wheel_slips(events: list[tuple[float, float, float]], wheel: list[int]) -> WheelSlips:
+    """Return slips by (begin s, end s, size m, right minus left) and by wheel, -1, 0 or +1."""
+    begin, end, size = np.array(events).T
+    which = np.array(wheel, np.int64)
+    # if the left wheel spins, right minus left is negative
+    return WheelSlips(begin, end, np.where(which < 0, -size, size), which)
+
+
+def wheel_slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason]:
+    """Return the reason that names the wheel with the largest slip, its size and time."""
+    n = len(slips.size)
+    worst = int(np.argmax(np.abs(slips.size)))
+    left, right = (f'the {name} wheel' for name in names)
+    which = ('one of the wheels', right, left)[slips.wheel[worst]]
+    done = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
+    other = ' from the other' * (not slips.wheel[worst])
+    return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
+                   f'{100 * abs(slips.size[worst]):.0f} cm relative to the gyro, from t = '
+                   f'{slips.begin[worst]:.1f} s for '
+                   f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
+                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total'
+                      if n > 1 else '')),)

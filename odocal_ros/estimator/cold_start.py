@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.check import steady
-from odocal_ros.calib.reversal import pieces
+from odocal_ros.calib.track_check import cut_pieces, find_inliers
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
@@ -57,9 +56,9 @@ class FittedTrack:
         for _ in range(2):
             laid = self.K * np.exp(1j * self.chi) * at
             apart = np.stack([(laid - z).real, (laid - z).imag], -1)
-            keep, noise = steady(apart, sigma)
+            keep, noise = find_inliers(apart, sigma)
             flat = np.stack([at.real, at.imag], -1) * self.K
-            found = pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
+            found = cut_pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
             middle, off = found.t, -found.off
             if not len(middle):
                 break

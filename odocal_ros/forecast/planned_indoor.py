@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit_at, LEAST, LEVELS, priors
-from odocal_ros.calib.planar.problem import Run
 from odocal_ros.calib.planar.result import result_of
+from odocal_ros.calib.planar.run import of_sides, rows_of, Run, Wheels
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.prepare import problem_of

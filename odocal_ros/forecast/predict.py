@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.drive import judge_drive
+from odocal_ros.calib.drive import check_drive
 from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_result
@@ -121,7 +121,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     alignment, found = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
     track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
                         Travel(drive.t, drive.travel, sigmas.quantum))
-    distance, said = judge_drive(track, drive.duration, 1.0, config.leg)
+    distance, said = check_drive(track, drive.duration, 1.0, config.leg)
     keep = track.t >= alignment.t - 1e-9
     track = Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
     start, end = (_mark(t, track, drive, sigmas, spans, asked) for t, asked in (

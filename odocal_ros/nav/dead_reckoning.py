@@ -159,3 +159,10 @@ def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | N
             return float(np.median(chord[onward] / run[onward]))
         pieces //= 2
     return None
+
+
+def level_track(travel: Floats, turned: Floats) -> Floats:
+    """Return the level path of travel, (n, 2) in its units; turned : (n,) rad about up."""
+    middle = (turned[1:] + turned[:-1]) / 2
+    step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
-from odocal_ros.calib.drive import not_moving, path_and_chord
+from odocal_ros.calib.drive import motion_reasons, path_and_chord
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.two_point import LEAST_CHORD_SHARE
@@ -68,7 +68,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     placed = place(inputs, config)
-    still = [reason for reason in not_moving(
+    still = [reason for reason in motion_reasons(
         inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.t_stop,
         inputs.least_motion) if reason.code is Code.ODOMETER_STILL]
     if still:       # scale, speeds, standstills and axes are computed from the counts

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.drive import path_and_chord, white_noise, within_reach
+from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_chord
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
@@ -185,14 +185,15 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     t = (t_ns - t_ns[0]) * 1e-9
     geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[use]
     fixes_n = origin_amid(t, geodetic).to_n(geodetic)
-    near = within_reach(t, fixes_n)
+    near = find_reachable(t, fixes_n)
     t, t_ns, fixes_n = t[near], t_ns[near], fixes_n[near, :2]
     path_length = path_and_chord(t, fixes_n)[0]
     if path_length == 0:
         return None
     # of a usual cell: fix noise of both ends is below 15 % of its length, s and m
     shortest, longer_than_noise = 4.0, 10.0
-    cell = max(shortest, longer_than_noise * white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
+    cell = max(shortest, longer_than_noise * fix_white_noise(fixes_n) * (t[-1] - t[0])
+               / path_length)
     knots = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], cell)))
     return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
                    float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))

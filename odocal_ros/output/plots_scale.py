@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.calib.speed_scale import SpeedScale
+from odocal_ros.calib.scale_variation import SpeedScale
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import drawing
 from odocal_ros.output.figures import known, with_sigma

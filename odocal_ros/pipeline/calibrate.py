@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.drive import carried
+from odocal_ros.calib.drive import ferry_intervals
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats, Ints
@@ -181,7 +181,7 @@ def _carried(leg: Leg, config: Config) -> Ints:
     """Return begin and end of motion without counts, ns: (k, 2)."""
     inputs = screened(leg, config).inputs
     placed = place(inputs, settings_by_frame(leg.fix, config))
-    spans = carried(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
+    spans = ferry_intervals(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
     return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
-from odocal_ros.calib.planar.drive import MECANUM_ROWS, of_sides, rows_of, Wheels
-from odocal_ros.calib.planar.problem import Fit, Known, Run
 from odocal_ros.calib.planar.result import refused, result_of
+from odocal_ros.calib.planar.run import Fit, Known, MECANUM_ROWS, of_sides, rows_of, Run, Wheels
 from odocal_ros.calib.result import failed, LegResult, MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
@@ -114,7 +113,7 @@ def _lacking_wheels(kind: str, count: int) -> Reason | None:
     needed, fits, order = {
         settings.MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
         settings.OMNI: (f'{settings.FEWEST_OMNI} or more', count >= settings.FEWEST_OMNI,
-               'counter-clockwise, the first at odometer.wheel_offset.')}.get(
+                        'counter-clockwise, the first at odometer.wheel_offset.')}.get(
         kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
     return None if fits else Reason(
         Code.NO_ODOMETER, f'{kind} drive: {max(count, 1)} wheels with known sides; required: '

@@ -9,10 +9,15 @@ from itertools import chain
 
 import numpy as np
 
-from odocal_ros.calib.drive import check_path, judge_drive, not_moving, uncovered
+from odocal_ros.calib.drive import (
+    check_drive,
+    check_path_and_speed,
+    motion_reasons,
+    odometer_span_reasons,
+)
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import with_axes
-from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, of_axles, WheelSlips
+from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.alignment import Alignment
@@ -50,7 +55,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     accelerations = (facing.accelerations(inputs, placed.rough)
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else facing.facing_of(accelerations)
-    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
+    reasons = (*reasons, *odometer_span_reasons(inputs.travel, inputs.t_stop))
     axis_faults = turned_about(accelerations) or turning(inputs, placed, orientation,
                                                          config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
@@ -81,7 +86,7 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
                                        placed.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
     wheel_reasons, wheel_slips = _compare_wheels(inputs, config, placed, track, reasons)
-    distance, drive_reasons = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
+    distance, drive_reasons = check_drive(track, inputs.t_stop, placed.rough, config.leg)
     # only methods by end points need straight legs
     end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
@@ -97,16 +102,16 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
 
 def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg with distance and speed checked by a more accurate scale."""
-    distance, drive_reasons = check_path(prepared.track, prepared.inputs.t_stop, scale,
-                                         prepared.config.leg)
+    distance, drive_reasons = check_path_and_speed(prepared.track, prepared.inputs.t_stop, scale,
+                                                   prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
         *(r for r in prepared.reasons if r.code not in SCALE_LIMIT_CODES), *drive_reasons))
 
 
 def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    refusal_reasons = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
-                                 inputs.t_stop, inputs.least_motion)
+    refusal_reasons = motion_reasons(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
+                                     inputs.t_stop, inputs.least_motion)
     if refusal_reasons or not placed.rough:
         return refusal_reasons or (Reason(
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale'),)
@@ -123,13 +128,13 @@ def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track
     fixed = [axle for axle in axles_of(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
     if not fixed or not inputs.has_accelerometer or WHEEL_FAULT_CODES & {r.code for r in reasons}:
         return (), NO_SLIPS
-    from odocal_ros.calib.wheels.slips import wheel_faults
+    from odocal_ros.calib.wheel_faults import wheel_faults
     odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
     found, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
         placed.origin.latitude, placed.rough, odometer.track_width, inputs.doubt_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
-    return tuple(chain(*found)), of_axles(wheel_slips, count)
+    return tuple(chain(*found)), join_axles(wheel_slips, count)
 
 
 def _time_of_four_fifths(track: Track, t_stop: float) -> float:

@@ -12,20 +12,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.check import check_worse, per_distance, track_check, track_residuals
 from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.calib.reversal import level_track
-from odocal_ros.calib.sections import counter_change
-from odocal_ros.calib.slip import find_slips, rounding, Slips, SPIN_WINDOW
-from odocal_ros.calib.wheels.wheel_slips import WheelSlips
+from odocal_ros.calib.scale_variation import counter_change_reasons
+from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW, WheelSlips
+from odocal_ros.calib.track_check import (
+    errors_per_distance,
+    track_residuals,
+    track_statistics,
+    worse_check_reasons,
+)
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import (
     forward_b,
+    level_track,
     mounting_from_forward,
     Origin,
     section_ratio,
@@ -228,16 +232,16 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return more, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    more |= {name: track_check(track_residuals(path, pin, fixes), path_length)
+    more |= {name: track_statistics(track_residuals(path, pin, fixes), path_length)
              for name, path in (('before', before), ('after', after))}
     path_at = np.interp(fixes[0], *path_length_over_time(prepared))
     off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
-    more['per_distance'] = per_distance(path_at, off_before, off_after)
+    more['per_distance'] = errors_per_distance(path_at, off_before, off_after)
     kept, far = without_outliers(prepared, after, start, between)
-    found += (*check_worse(path_at, off_before, off_after, bool(prepared.nominal)), *far)
+    found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)), *far)
     seen = evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept, start,
                     paths, prepared.config, prepared.t_fit, prepared.covered)
-    found += counter_change(seen.sections, seen.t_fix, seen.fix_distance)
+    found += counter_change_reasons(seen.sections, seen.t_fix, seen.fix_distance)
     return more | {'evidence': seen}, found
 
 
@@ -250,7 +254,8 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    return {'check': asdict(track_check(track_residuals(path, pin, fixes), path_length))}, found
+    return {'check': asdict(track_statistics(track_residuals(path, pin, fixes),
+                                             path_length))}, found
 
 
 def _start_position(prepared: PreparedLeg, path: Path) -> MarkFix | None:
@@ -287,7 +292,8 @@ def slip_check(prepared: PreparedLeg, track: Track, f: Floats,
     if not prepared.inputs.has_accelerometer:
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
-                       prepared.origin.latitude, rounding(prepared.inputs.travel))
+                       prepared.origin.latitude, count_size(prepared.inputs.travel))
     known = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
     held = (slips.t >= between[0]) & (slips.t <= between[1]) & ~known
-    return slips._replace(t=slips.t[held], size=slips.size[held], unforced=slips.unforced[held])
+    return slips._replace(t=slips.t[held], size=slips.size[held],
+                          unforced_sign=slips.unforced_sign[held])

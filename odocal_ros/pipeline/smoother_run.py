@@ -13,9 +13,9 @@ import numpy as np
 from odocal_ros.calib.marks import Path
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
+from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
 from odocal_ros.calib.wheel_search.search import search, SearchResult
-from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
 from odocal_ros.estimator import smooth, smoother_leg

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib import check
+from odocal_ros.calib import track_check
 from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
-from odocal_ros.calib.drive import white_noise
+from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
-from odocal_ros.calib.reversal import against_travel, pieces
 from odocal_ros.calib.slip import slip_reasons
+from odocal_ros.calib.track_check import cut_pieces, reversal_reasons
 from odocal_ros.calib.two_point import (
     Chord,
     fit,
@@ -132,11 +132,12 @@ class TwoPointRun:
         fixes = self.inputs.t_fix[between], prepared.fixes_n[between]
         drift_n = self._drift(chord, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = check.track_residuals(prepared.path(f), chord.start, fixes)
-        up = check.track_residuals(prepared.path(solve(chord)[0]), chord.start, fixes)
+        residual = track_check.track_residuals(prepared.path(f), chord.start, fixes)
+        up = track_check.track_residuals(prepared.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
-        factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
+        factor = track_check.fix_noise_factor(residual, covariance, drift,
+                                              (chord.start, chord.end))
         if factor.max() > 1.0:
             distance_rms = float(np.sqrt((residual[:, :2]**2).sum(axis=1).mean()))
             self.reasons.append(Reason(
@@ -166,17 +167,21 @@ class TwoPointRun:
     def _check_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:
         prepared, (t, p) = self.prepared, fixes
-        keep, _ = check.steady(residual, prepared.fix_sigma)     # track errors count as noise
-        sigma = max(prepared.fix_sigma, white_noise(p[keep]))
-        found = against_travel(pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma),
-                               self.config.odometer.signed)
+        # track errors count as noise
+        keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
+        sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
+        found = reversal_reasons(cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep],
+                                            sigma),
+                                 self.config.odometer.signed)
         self.found += found
         if not found:
-            off = check.track_residuals(prepared.path(f), chord.start, fixes)
-            wrong = check.mismatch(check.track_check(off, prepared.distance), prepared.fix_sigma,
-                                   drift, prepared.distance)
-            self.reasons += wrong or check.bent(t, off, chord.M @ f, prepared.fix_sigma, drift,
-                                                prepared.distance)
+            off = track_check.track_residuals(prepared.path(f), chord.start, fixes)
+            wrong = track_check.distance_reasons(
+                track_check.track_statistics(off, prepared.distance), prepared.fix_sigma,
+                                                 drift, prepared.distance)
+            self.reasons += wrong or track_check.bend_reasons(t, off, chord.M @ f,
+                                                              prepared.fix_sigma, drift,
+                                                              prepared.distance)
 
     def _check_counting_direction(self, chord: Chord) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""

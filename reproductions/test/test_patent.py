@@ -21,7 +21,7 @@ from odocal_reproductions.patent.embodiment import (
     PRINTED,
     RADIUS,
 )
-from odocal_ros.calib.wheel_search.arrays import bose, full_factorial
+from odocal_ros.calib.wheel_search.parameter_sets import bose, full_factorial
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.core

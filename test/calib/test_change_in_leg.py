@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, said as texts
 
-from odocal_ros.calib.sections import counter_change, Sections
+from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
@@ -183,7 +183,8 @@ def test_a_counter_that_changes_is_found_with_place_and_factor(ratio, sigma, tex
     """Ten sections of 100 m in 10 s each."""
     edges = np.linspace(0.0, 1000.0, len(ratio) + 1)
     parts = Sections(edges[:-1], edges[1:], np.array(ratio), np.full(len(ratio), sigma))
-    found = counter_change(parts, np.linspace(0.0, 100.0, 101), np.linspace(0.0, 1000.0, 101))
+    found = counter_change_reasons(parts, np.linspace(0.0, 100.0, 101),
+                                   np.linspace(0.0, 1000.0, 101))
     assert [r.code for r in found] == [Code.TRACK_MISMATCH] * bool(text)
     assert all(text in r.text for r in found)
 

@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
-from odocal_ros.calib.sections import sections
+from odocal_ros.calib.scale_variation import sections
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import FixSamples
 from odocal_ros.nav.dead_reckoning import dead_reckon

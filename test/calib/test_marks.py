@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from odocal_ros.calib.check import fix_noise_factor
 from odocal_ros.calib.marks import (
     fix_at,
     MarkFix,
@@ -18,6 +17,7 @@ from odocal_ros.calib.marks import (
     standing_at,
     with_slow_errors,
 )
+from odocal_ros.calib.track_check import fix_noise_factor
 from odocal_ros.sim.noise import gauss_markov
 
 pytestmark = pytest.mark.core

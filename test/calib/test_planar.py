@@ -9,10 +9,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.calib.planar import drive
-from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
-from odocal_ros.calib.planar.problem import Known, Run
+from odocal_ros.calib.planar.run import Known, of_sides, rows_of, Run, UNEQUAL, Wheels
 
 LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
 SCALES = np.array([0.0352, 0.0349, 0.0351, 0.0356])     # m/rad, of each wheel
@@ -103,8 +101,8 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
     """A turn and no sideways motion: one difference of four wheels has its prior alone."""
     run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
     sigma = np.sqrt(np.diag(fit(run, Known()).covariance)[:4])
-    assert (sigma < 1.2 * drive.UNEQUAL * SCALES).all()
-    monkeypatch.setattr(drive, 'UNEQUAL', 0.3)
+    assert (sigma < 1.2 * UNEQUAL * SCALES).all()
+    monkeypatch.setattr('odocal_ros.calib.planar.run.UNEQUAL', 0.3)
     assert (np.sqrt(np.diag(fit(run, Known()).covariance)[:4]) > 2 * sigma).all()
 
 

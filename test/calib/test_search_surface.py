@@ -11,7 +11,13 @@ from planar_legs import DRIVES, on_a_plane, plane, simulated, TRUE
 import pytest
 
 from odocal_ros.calib.wheel_search import planar
-from odocal_ros.calib.wheel_search.direct import least_squares
+from odocal_ros.calib.wheel_search.minimisation import (
+    fit_surface,
+    least_squares,
+    minimum_in_box,
+    refine,
+)
+from odocal_ros.calib.wheel_search.parameter_sets import ranges_of, sets_of, Space
 from odocal_ros.calib.wheel_search.planar import (
     course_pieces,
     HUBER,
@@ -20,8 +26,6 @@ from odocal_ros.calib.wheel_search.planar import (
     score,
     weights,
 )
-from odocal_ros.calib.wheel_search.space import ranges_of, sets_of, Space
-from odocal_ros.calib.wheel_search.surface import fit_surface, minimum_in_box, refine
 from odocal_ros.settings.config import WheelsConfig
 
 FREE, HELD = Space(held=False), Space(held=True)

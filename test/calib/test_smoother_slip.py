@@ -12,7 +12,7 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import leg_of, made, said as texts, smoothed
 
-from odocal_ros.calib.slip import find_slips, unforced
+from odocal_ros.calib.slip import find_slips, unforced_sign
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
 from odocal_ros.estimator.result import mismatch
@@ -134,7 +134,7 @@ def test_travel_that_a_counter_loses_without_braking_is_no_slip():
 def test_a_wheel_slips_only_as_a_force_makes_it(begin, metres, acceleration, sign, forward):
     t = np.arange(0.0, 20.0, 1.0)
     speed = begin + acceleration * np.clip(t - 9.0, 0.0, 2.0)
-    assert unforced(9.0, 2.0, forward * metres, t, forward * speed) == sign
+    assert unforced_sign(9.0, 2.0, forward * metres, t, forward * speed) == sign
 
 
 def test_a_speed_that_is_held_before_stops_is_no_slip():

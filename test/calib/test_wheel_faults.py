@@ -10,7 +10,7 @@ from drives import cached, changed, drive, off, seconds, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.wheels.slips import wheel_faults
+from odocal_ros.calib.wheel_faults import wheel_faults
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.prepare import prepare

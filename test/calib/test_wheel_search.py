@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wheels' search: separable wheels, ranges, sigmas, details; its orthogonal arrays."""
+"""The wheels' search: separable wheels, ranges, sigmas, details; its orthogonal parameter_sets."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -12,10 +12,11 @@ from numpy.testing import assert_allclose
 from planar_legs import DRIVES, on_a_plane, simulated, TRUE
 import pytest
 
-from odocal_ros.calib.wheel_search import arrays
-from odocal_ros.calib.wheel_search.direct import least_squares, repeats
+from odocal_ros.calib.wheel_search import parameter_sets
+from odocal_ros.calib.wheel_search.minimisation import least_squares
+from odocal_ros.calib.wheel_search.parameter_sets import Ranges, ranges_of, Space
+from odocal_ros.calib.wheel_search.planar import repeats
 from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
-from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, Space
 from odocal_ros.errors import BadUsage
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import WheelsConfig
@@ -184,12 +185,12 @@ def balanced(array):
 
 
 def test_prime_powers_are_told_from_other_numbers():
-    assert [q for q in range(18) if arrays.prime_power(q)] == [*PRIME_POWERS, 17]
-    assert arrays.prime_power(49) == (7, 2)
-    assert arrays.prime_power(64) == (2, 6)
-    assert arrays.prime_power(6) is None
-    assert [arrays.next_prime_power(n) for n in (1, 6, 10, 14, 18)] == [2, 7, 11, 16, 19]
-    assert [arrays.next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [
+    assert [q for q in range(18) if parameter_sets.prime_power(q)] == [*PRIME_POWERS, 17]
+    assert parameter_sets.prime_power(49) == (7, 2)
+    assert parameter_sets.prime_power(64) == (2, 6)
+    assert parameter_sets.prime_power(6) is None
+    assert [parameter_sets.next_prime_power(n) for n in (1, 6, 10, 14, 18)] == [2, 7, 11, 16, 19]
+    assert [parameter_sets.next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [
         3, 5, 9, 17, 27, 53]
 
 
@@ -197,27 +198,27 @@ def test_prime_powers_are_told_from_other_numbers():
 @pytest.mark.core
 @pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 27, 49])
 def test_every_array_is_balanced(q):
-    array = arrays.bose(q, q + 1)
+    array = parameter_sets.bose(q, q + 1)
     assert array.shape == (q * q, q + 1)
     assert balanced(array)
     array[3, 1] = (array[3, 1] + 1) % q     # and one wrong cell is seen
     assert not balanced(array)
     # three of each level in each column: L9(3^4) of the patent's figure 2, but for the order
-    assert all((np.bincount(column) == q).all() for column in arrays.bose(q, q + 1).T)
+    assert all((np.bincount(column) == q).all() for column in parameter_sets.bose(q, q + 1).T)
 
 
 def test_what_cannot_be_built_is_refused():
     with pytest.raises(BadUsage, match='6 levels'):
-        arrays.bose(6, 3)
+        parameter_sets.bose(6, 3)
     with pytest.raises(BadUsage, match='5 columns'):
-        arrays.bose(3, 5)
+        parameter_sets.bose(3, 5)
     with pytest.raises(BadUsage, match='0 levels'):
-        arrays.design_for(0)
+        parameter_sets.design_for(0)
 
 
 @pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])
 def test_the_design_follows_the_levels(levels, rows):
-    design = arrays.design_for(levels)
+    design = parameter_sets.design_for(levels)
     assert design.rows.shape == (rows, 3)
     assert levels != 9 or design.name == 'L81(9^10)'
     assert levels == 2 or balanced(design.rows)

@@ -18,8 +18,7 @@ import pytest
 
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, MethodResult, Source
-from odocal_ros.calib.sections import Sections
-from odocal_ros.calib.speed_scale import SpeedScale
+from odocal_ros.calib.scale_variation import Sections, SpeedScale
 from odocal_ros.output import plots_scale, report
 from odocal_ros.output.drawing import look
 from odocal_ros.output.files import as_json, write_results

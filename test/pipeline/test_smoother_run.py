@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.drive import not_moving
+from odocal_ros.calib.drive import motion_reasons
 from odocal_ros.calib.gyro_axes import turn_ratio
 from odocal_ros.data.leg import part_of
 from odocal_ros.estimator.fit import CONVERGENCE
@@ -212,7 +212,7 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
     made = simulate(SimOptions(scenario='indoor', duration=120.0, seed=3, imu_rate=50.0,
                                reference=reference, pitch=-0.04, roll=0.01))
     config = with_settings(drives.configured(made), {'odometer.track_width': 0.0,
-                                              'verdict.max_scale_sigma': 0.02})
+                                                     'verdict.max_scale_sigma': 0.02})
     result = calibrate(made.leg(), config)
     assert not {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW} & {r.code for r in result.reasons}
     assert all(r.code.severity is Verdict.ACCEPTED for r in result.reasons), result.reasons
@@ -254,10 +254,10 @@ def test_the_rough_scale_of_a_room_is_that_of_its_straights():
     t, fixes, way, _ = room(np.random.default_rng(1))
     travel = Travel(t, way / 1e-4, 1.0)
     assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
-    assert not not_moving(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
-    assert not_moving(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
+    assert not motion_reasons(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
+    assert motion_reasons(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
     # a reference that states a metre, and shows a centimetre
-    assert not not_moving(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
+    assert not motion_reasons(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
 
 
 def test_turns_on_the_spot_are_no_turns_of_the_course():

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.planar.chain import Equations, Rows, Solved
-from odocal_ros.calib.planar.problem import Fit, Known, Run
-from odocal_ros.calib.planar.start import first_values
+from odocal_ros.calib.planar.first_values import first_values
+from odocal_ros.calib.planar.run import Fit, Known, Run
 from odocal_ros.data.arrays import Floats
 
 # first levels and medians of their hyperpriors, variances. Judgement: wheels slip by millimetres

@@ -10,7 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.choice import PLANAR
-from odocal_ros.calib.planar.problem import Fit
+from odocal_ros.calib.planar.run import Fit
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from odocal_ros.calib.drive import knots_of
+from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 from odocal_ros.nav.rotations import arctan2, wrap
@@ -106,7 +106,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
         return np.empty((0, 2), np.int64)
     course_baseline = 10.0    # m, minimum path between two fixes for a course
     course_clear = 20.0    # fix sigmas, minimum as well: the sigma of a course is then 4 deg
-    ends = knots_of(fixes_n, max(course_baseline, course_clear * float(np.median(sigma))))
+    ends = separated_fixes(fixes_n, max(course_baseline, course_clear * float(np.median(sigma))))
     return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
 
 
@@ -208,3 +208,19 @@ def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
     course = arctan2(path_length[:, 1], path_length[:, 0])
     reckoned = arctan2(mix @ north, mix @ east)
     return wrap(reckoned + np.asarray(sets, dtype=float)[:, 2:] - course)
+
+
+def repeats(rows: Floats) -> float:
+    """
+    Return the number of residuals per independent one: 1 if white, many for a drift.
+
+    rows : (2, k). One plus twice the sum of their autocorrelations before the first negative one.
+    """
+    k = rows.shape[1]
+    spectrum = np.abs(np.fft.rfft(rows, 2 * k, axis=1))**2
+    power = np.fft.irfft(spectrum.sum(axis=0), 2 * k)[:k]
+    if not power[0] > 0:
+        return 1.0
+    correlation = power / power[0]
+    end = np.argmax(correlation < 0) if (correlation < 0).any() else k
+    return float(1 + 2 * correlation[1:end].sum())

@@ -14,11 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.wheel_search.arrays import Design, design_for
-from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
+from odocal_ros.calib.wheel_search.minimisation import least_squares, LeastSquares, refine, Refined
+from odocal_ros.calib.wheel_search.parameter_sets import (
+    Design,
+    design_for,
+    NAMES,
+    Ranges,
+    sets_of,
+    Space,
+)
 from odocal_ros.calib.wheel_search.planar import PlanarLeg, score, Scores
-from odocal_ros.calib.wheel_search.space import NAMES, Ranges, sets_of, Space
-from odocal_ros.calib.wheel_search.surface import refine, Refined
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason

@@ -18,7 +18,7 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
 from odocal_ros.calib.evidence import KEPT_ROWS
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.slip import travel_reasons, unforced
+from odocal_ros.calib.slip import travel_reasons, unforced_sign
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
@@ -188,7 +188,8 @@ def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     slip_path = odometer_minus_ground_path(fit, marginals)
     slips = find_slips(fit, slip_path, count_m)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
-    sign = np.array([unforced(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips], int)
+    sign = np.array([unforced_sign(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips],
+                    int)
     # the shape of a filter is unknown, and a late or held speed errs at changes of speed: no slip
     level = '' if filtered or (sign > 0).any() else describe_slip_level(fit, marginals, count_m)
     wheel_slips = tuple(s for s, unforced_sign in zip(slips, sign, strict=True)

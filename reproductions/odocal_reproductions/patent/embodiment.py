@@ -19,11 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.wheel_search.arrays import bose, full_factorial, next_prime_power
-from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
+from odocal_ros.calib.wheel_search.minimisation import least_squares, LeastSquares, refine, Refined
+from odocal_ros.calib.wheel_search.parameter_sets import (
+    bose,
+    full_factorial,
+    next_prime_power,
+    sets_of,
+    Space,
+)
 from odocal_ros.calib.wheel_search.planar import PlanarLeg, score
-from odocal_ros.calib.wheel_search.space import sets_of, Space
-from odocal_ros.calib.wheel_search.surface import refine, Refined
 from odocal_ros.data.arrays import Floats, Ints
 
 LEVELS = (7, 7, 9)    # definition: of the patent's embodiment

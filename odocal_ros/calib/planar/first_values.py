@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.planar.problem import Run
+from odocal_ros.calib.planar.run import Run
 from odocal_ros.data.arrays import Complexes, Floats, Ints
 
 # track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots

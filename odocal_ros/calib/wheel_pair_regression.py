@@ -30,7 +30,7 @@ MOST_DRIFT = np.deg2rad(2.0)
 MEAN_STEPS = 10     # steps over which speed, turn rate and the ends of a window are averaged: 1 s
 
 
-def without_drift(two: Pair) -> Pair:
+def without_gyro_drift(two: Pair) -> Pair:
     """Return the wheels with the turn rate of standstills, the gyro bias, removed in between."""
     still = two.known & (np.diff(two.left) == 0) & (np.diff(two.right) == 0)
     # half a second after a stop and before a start the body rocks
@@ -45,7 +45,7 @@ def without_drift(two: Pair) -> Pair:
     return replace(two, turn=two.turn - np.append(0.0, np.cumsum(bias * two.step)))
 
 
-def signals_of(two: Pair, metres_per_unit: float) -> Floats:
+def regressors(two: Pair, metres_per_unit: float) -> Floats:
     """
     Return the regressors of the right path, at the edges of the cells: (n, 6).
 
@@ -65,7 +65,7 @@ def _smooth(x: Floats, reach: int) -> Floats:
     return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
 
 
-def fitted(two: Pair, signals: Floats, metres_per_unit: float,
+def fit_signals(two: Pair, signals: Floats, metres_per_unit: float,
            ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return the coefficients of the signals, fitted to cells of a second, and covariance."""
     at = np.arange(0, len(two.t), MEAN_STEPS)
@@ -84,9 +84,9 @@ def fitted(two: Pair, signals: Floats, metres_per_unit: float,
     return x, covariance
 
 
-def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
+def side_reasons(two: Pair, width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
-                                                       track_width / 2):
+                                                     track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
                        f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '
                        'sent twice'),)
@@ -100,8 +100,8 @@ def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[
                    f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)
 
 
-def changed(two: Pair, signals: Floats, metres_per_unit: float,
-            count: int) -> tuple[tuple[Reason, ...], float]:
+def find_ratio_change(two: Pair, signals: Floats, metres_per_unit: float,
+                      count: int) -> tuple[tuple[Reason, ...], float]:
     """
     Return a reason if the wheels' ratio differs before and after a place of the path, and by what.
 
@@ -113,7 +113,7 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
     for share in np.arange(1, 8) / 8:       # of the path
         at = int(np.searchsorted(path, share * path[-1]))
         late = np.where(np.arange(len(path)) > at, two.left - two.left[at], 0.0)
-        x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
+        x, covariance = fit_signals(two, np.column_stack([signals, late]), metres_per_unit)
         if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
@@ -136,7 +136,7 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
                    f'{50 * abs(held):.2f} % to that of each wheel'),), held
 
 
-def unlike(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
+def counter_reasons(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
     """Return a reason if one wheel counts far more: the mean is not at the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()

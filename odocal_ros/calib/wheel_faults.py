@@ -14,23 +14,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.slip import acceleration, excess_path, PIN_STEPS, SPIN_GRID, SPIN_TURN
-from odocal_ros.calib.wheels.wheel_slips import (
+from odocal_ros.calib.slip import (
+    acceleration,
+    excess_path,
+    make_wheel_slips,
     NO_SLIPS,
+    PIN_STEPS,
     SLIP_GRID,
-    slip_reason,
-    slips_of,
+    SPIN_GRID,
+    SPIN_TURN,
+    wheel_slip_reason,
     WheelSlips,
 )
-from odocal_ros.calib.wheels.whole_drive import (
-    changed,
-    fitted,
+from odocal_ros.calib.wheel_pair_regression import (
+    counter_reasons,
+    find_ratio_change,
+    fit_signals,
     MEAN_STEPS,
-    signals_of,
-    swapped,
-    unlike,
+    regressors,
+    side_reasons,
     WHOLE_DRIVE_SIGMAS,
-    without_drift,
+    without_gyro_drift,
 )
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import runs
@@ -68,21 +72,21 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
-    two = without_drift(two)
-    signals = signals_of(two, metres_per_unit)
-    x, covariance = fitted(two, signals, metres_per_unit)
+    two = without_gyro_drift(two)
+    signals = regressors(two, metres_per_unit)
+    x, covariance = fit_signals(two, signals, metres_per_unit)
     if x is None or covariance is None or x[0] <= 0:
         return (), NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
-    reasons = swapped(two, x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
-                       track_width)
-    reasons += unlike(two, ratio, track_width or abs(x[1]) * per_right, max_deviation)
+    reasons = side_reasons(two, x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
+                           track_width)
+    reasons += counter_reasons(two, ratio, track_width or abs(x[1]) * per_right, max_deviation)
     quantum_m = per_right * (1 + ratio) / 2
     apart = (two.right - signals @ x) * per_right         # m, residual of turn and ratio
     width = track_width or abs(x[1]) * per_right
     events, lasting = _events(two, apart, quantum_m, width)
-    found, change = changed(_without(two, events), signals, metres_per_unit, count)
+    found, change = find_ratio_change(_without_slips(two, events), signals, metres_per_unit, count)
     reasons += found
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + lasting)
@@ -92,15 +96,15 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     if not events:
         return reasons, replace(NO_SLIPS, change=change)
     mean = (two.left * ratio + two.right) / 2 * per_right
-    wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
-    slips = replace(slips_of(events, wheel), change=change)
-    return reasons + slip_reason(slips, two.names), slips
+    wheel = [_find_wheel(two, mean, imu, track, latitude, e) for e in events]
+    slips = replace(make_wheel_slips(events, wheel), change=change)
+    return reasons + wheel_slip_reason(slips, two.names), slips
 
 
-def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
+def _without_slope(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     """Return the difference of the paths, m, without its slope on most of the drive."""
     # slopes by rounding at a steady speed, at most two counts over a window, are not removed
-    path, n = _path(two), 200     # steps of a slope, 20 s: longer than most slips
+    path, n = _mean_path(two), 200     # steps of a slope, 20 s: longer than most slips
     run, climb = path[n:] - path[:-n], apart[n:] - apart[:-n]
     if len(run) < n:
         return apart
@@ -111,7 +115,7 @@ def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     return out
 
 
-def _without(two: Pair, events: list[Event]) -> Pair:
+def _without_slips(two: Pair, events: list[Event]) -> Pair:
     """Return the wheels, with the cells of slips marked as unknown."""
     known, around = two.known.copy(), 2.0       # s each side, possibly part of the slip
     for begin, end, _ in events:
@@ -122,7 +126,7 @@ def _without(two: Pair, events: list[Event]) -> Pair:
 def _events(two: Pair, apart: Floats, quantum_m: float,
             width: float) -> tuple[list[Event], list[Event]]:
     """Return the jumps of the difference that end, and those that may change the ratio."""
-    apart = _level(two, apart, quantum_m)
+    apart = _without_slope(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
     unknown = np.append(0, np.cumsum(~two.known))
@@ -132,7 +136,7 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
         jump = mean[span:] - mean[:-span]
         if len(jump) < span:
             continue
-        limit = _limit(two, jump, span, quantum_m * (two.quantum > 0), width)
+        limit = _jump_limits(two, jump, span, quantum_m * (two.quantum > 0), width)
         far = np.abs(jump) > limit
         far &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
         for k in np.flatnonzero(far):
@@ -141,14 +145,14 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
     over: list[Event] = []
     lasting: list[Event] = []
     for a, b in runs(hits):
-        event = _measured(two, apart, windows, a, b)
-        (over if _ends(two, apart, event) else lasting).append(event)
+        event = _measure_jump(two, apart, windows, a, b)
+        (over if _is_finished(two, apart, event) else lasting).append(event)
     return over, lasting
 
 
-def _ends(two: Pair, apart: Floats, event: Event) -> bool:
+def _is_finished(two: Pair, apart: Floats, event: Event) -> bool:
     """Return True if a slip ends: it is short, or its slope is absent before and after it."""
-    path = _path(two)
+    path = _mean_path(two)
     begin, end = np.interp(event[:2], two.t, path)
     if end - begin < path[-1] / 16:      # half a step between the places tested by `changed`
         return True
@@ -162,19 +166,19 @@ def _ends(two: Pair, apart: Floats, event: Event) -> bool:
 
 def _slope(two: Pair, event: Event) -> float:
     """Return the slope of a slip, size by path, between a tenth and nine tenths of its size."""
-    begin, end = np.interp(event[:2], two.t, _path(two))
+    begin, end = np.interp(event[:2], two.t, _mean_path(two))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out
 
 
-def _path(two: Pair) -> Floats:
+def _mean_path(two: Pair) -> Floats:
     return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
 
 
-def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
+def _jump_limits(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
     """Return the limit of jumps between two means that occur by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
-    path = _path(two)
+    path = _mean_path(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
     run = path[ends:][:n] - path[:n]
     spread = np.zeros(n)
@@ -191,8 +195,8 @@ def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -
     return out
 
 
-def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]], a: int,
-              b: int) -> Event:
+def _measure_jump(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]],
+                  a: int, b: int) -> Event:
     """Return (begin, end, size) of the jump within steps a to b, by its best window."""
     found = (0.0, 0.0, 0, 0)
     for span, jump, limit, far in windows:
@@ -214,8 +218,8 @@ def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats,
     return float(two.t[k + min(begin, end)]), float(two.t[k + max(begin, end)]), size
 
 
-def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
-           latitude: float, event: Event) -> int:
+def _find_wheel(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
+                latitude: float, event: Event) -> int:
     """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
     # a slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left
     # by -x by -x / 2; the noise of their odds is the difference of mean and IMU elsewhere

@@ -1,16 +1,22 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What values against limits say, and what an IMU tells of its own units and axes."""
+"""Limits of values, of the track against the fixes, and of the units and axes of an IMU."""
 
 import numpy as np
 import pytest
 
-from odocal_ros.calib.check import bent, fix_noise_factor, mismatch, steady, track_check
-from odocal_ros.calib.drive import knots_of
+from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.gyro_axes import gyro_reasons, turn_ratio
 from odocal_ros.calib.marks import slow_variance
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.track_check import (
+    bend_reasons,
+    distance_reasons,
+    find_inliers,
+    fix_noise_factor,
+    track_statistics,
+)
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.reasons import Code
 from odocal_ros.screening.facing import imu_sanity
@@ -140,15 +146,16 @@ def test_knots_are_the_fixes_that_one_after_the_other_finds_so_far_apart():
         for k in range(len(p)):
             if np.hypot(*(p[k] - p[knots[-1]])) >= least:
                 knots.append(k)
-        assert knots_of(p, least) == knots
-    assert knots_of(p[:0], 3.0) == []
+        assert separated_fixes(p, least) == knots
+    assert separated_fixes(p[:0], 3.0) == []
 
 
 class TestCheck:
     """The corrected track against the fixes."""
 
     def test_criteria(self):
-        check = track_check(np.array([[3.0, 4.0, 9.0], [0.0, 0.0, 9.0], [0.0, -1.0, 9.0]]), 50.0)
+        check = track_statistics(np.array([[3.0, 4.0, 9.0], [0.0, 0.0, 9.0], [0.0, -1.0, 9.0]]),
+                                 50.0)
         assert (check.max, check.end, check.mean) == (5.0, 1.0, 2.0)
         assert check.rms == pytest.approx(np.sqrt(26 / 3))
         assert check.percent_of_distance == 2.0
@@ -180,10 +187,10 @@ class TestCheck:
         assert slow_variance(t[:300], white[:300], t[:300], stated[:300], 0.0)[0] == 0.0
 
     def test_mismatch_is_beyond_noise_drift_and_slip(self):
-        check = track_check(np.full((10, 3), 10.0), 1000.0)
-        assert codes(mismatch(check, 1.5, 0.0, 1000.0)) == [Code.TRACK_MISMATCH]
-        assert mismatch(check, 1.5, 5.0, 1000.0) == ()
-        assert mismatch(check, 1.5, 0.0, 5000.0) == ()
+        check = track_statistics(np.full((10, 3), 10.0), 1000.0)
+        assert codes(distance_reasons(check, 1.5, 0.0, 1000.0)) == [Code.TRACK_MISMATCH]
+        assert distance_reasons(check, 1.5, 5.0, 1000.0) == ()
+        assert distance_reasons(check, 1.5, 0.0, 5000.0) == ()
 
     @pytest.mark.parametrize(('factor', 'code', 'text'), [
         (1.0, None, ''), (-1.0, Code.GYRO_SIGN, 'ratio -1.'),
@@ -212,11 +219,11 @@ class TestCheck:
         rng = np.random.default_rng(4)
         residual = rng.standard_normal((500, 3)) + np.linspace(0, 300, 500)[:, None]
         residual[[100, 101, 300], 0] += 30.0
-        keep, sigma = steady(residual, 0.5)
+        keep, sigma = find_inliers(residual, 0.5)
         assert np.flatnonzero(~keep).tolist() == [100, 101, 300]
         # of 500 white errors of 1 m on a track that goes astray by 0.6 m a fix
         assert sigma == pytest.approx(1.05, abs=0.15)
-        assert steady(residual, 9.0)[1] == 9.0
+        assert find_inliers(residual, 9.0)[1] == 9.0
 
 
 def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():
@@ -255,13 +262,13 @@ def test_a_track_that_bends_where_neither_gyro_nor_fixes_do_is_said():
     across = np.array([-0.8, 0.6, 0.0])
     bow = np.where(np.abs(t - 100.0) < 40.0, 6.0, 0.0)[:, None]     # four windows of 20 s
     # 4 sigma of the mean of 40 fixes, 0.24 m each and as much seen along, and 0.2 % of the way
-    found, = bent(t, white + bow * across, chord, 1.5, 0.0, 500.0)
+    found, = bend_reasons(t, white + bow * across, chord, 1.5, 0.0, 500.0)
     assert found.code is Code.MODEL_MISMATCH
     assert 'deviates up to 6.' in found.text
-    assert not bent(t, white, chord, 1.5, 0.0, 500.0)
+    assert not bend_reasons(t, white, chord, 1.5, 0.0, 500.0)
     # gyros that may, or fixes that are as far off along the way
-    assert not bent(t, white + bow * across, chord, 1.5, 2.0, 500.0)
+    assert not bend_reasons(t, white + bow * across, chord, 1.5, 2.0, 500.0)
     slow = bow * across + np.roll(bow, 60) * chord / 500.0
-    assert not bent(t, white + slow, chord, 1.5, 0.0, 500.0)
+    assert not bend_reasons(t, white + slow, chord, 1.5, 0.0, 500.0)
     # too few windows to tell
-    assert not bent(t[:100], (white + bow * across)[:100], chord, 1.5, 0.0, 500.0)
+    assert not bend_reasons(t[:100], (white + bow * across)[:100], chord, 1.5, 0.0, 500.0)

@@ -1,0 +1,298 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Dead-reckoned track compared with all fixes: residuals, errors by path length, and reversing.
+
+Reversing with an odometer that counts upwards flips the direction of the track by half a turn from
+one piece of the drive to the next. The fixes remain behind the track by twice the piece's length;
+a fix error opposite to the travel disappears again. The track of this test is level, with a
+heading by the gyro about the mean upward axis: an attitude by gyros alone tilts within minutes.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from odocal_ros.calib.drive import separated_fixes
+from odocal_ros.calib.marks import MarkFix, Path, window_means
+from odocal_ros.calib.result import PerDistance, TrackCheck
+from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.nav.rotations import arctan2, wrap
+from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import FAULT_SIGMAS, OUTLIER_SIGMAS, REMARK_SIGMAS
+
+# limits of path length, or turn, by the track relative to the fixes. Physical: errors of scale,
+# skid or lean are smaller; fixes that only jump have any path length
+ONE_MOTION_RATIO = 0.6, 1.6
+# smallest factor applied to stated fix sigmas. Statistical: by the median of 30 fixes, chance
+# alone gives 1.25 instead of 1 once in 30 legs
+NOISIER_WORTH = 1.25
+PIECE_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
+PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
+
+
+def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
+    """
+    Return dead-reckoned minus fixed positions, (n, 3) m.
+
+    path : t (n,) to the antenna's path, (n, 3) m, up to a constant.   pin : mark whose position
+    the path is set to.   fixes : (t, position_n) within the leg.
+    """
+    t, position_n = fixes
+    return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
+
+
+def track_statistics(residual: Floats, distance: float) -> TrackCheck:
+    """Return the statistics of horizontal residuals, m: the patent's (max, mean) and others."""
+    d = np.hypot(*residual.T[:2])
+    return TrackCheck(float(np.sqrt((d**2).mean())), float(d.max()), float(d.mean()),
+                      float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
+
+
+def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
+                     marks: Sequence[MarkFix] = ()) -> Floats:
+    """
+    Return the factors on stated fix sigmas by the residuals, east, north, up: (3,).
+
+    residual : (n, 3) corrected track minus fixes, m; NaN up where no height is known.
+    covariance_n : (n, 3, 3) stated, m^2.   drift : possible track error by gyro drift, m, whose
+    square is subtracted. The rest may include other track errors, so the factors tend to be too
+    large; below NOISIER_WORTH they are 1.   marks : the two that the track is pinned to. Their
+    errors act in proportion to the path, on average a third of each variance; the factor applies
+    to them as well.
+    """
+    stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
+    level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
+    rise = residual[:, 2] - np.median(residual[:, 2])
+    up2 = robust_sigma(rise)**2
+    seen = np.array([level2, level2, up2]) - drift**2
+    level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
+    asked = np.array([level, level, stated[2]])
+    factors = np.sqrt(np.maximum(np.nan_to_num(seen), 0.0) / np.maximum(asked, 1e-12))
+    return np.where(factors > NOISIER_WORTH, factors, 1.0)
+
+
+def _distance_limit(sigma: float, distance: float) -> float:
+    """Return the limit of the distance between track and fixes, m."""
+    # once in 16 000 by chance; slip, suspension and road: judgement
+    return 4.0 * sigma + 0.002 * distance
+
+
+def distance_reasons(check: TrackCheck, fix_sigma: float, drift: float,
+                     distance: float) -> tuple[Reason, ...]:
+    """Return TRACK_MISMATCH where the calibrated track is too far from the fixes."""
+    allowed = _distance_limit(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
+    if check.rms <= allowed:
+        return ()
+    return (Reason(Code.TRACK_MISMATCH, f'the calibrated track is {check.rms:.1f} m rms from the '
+                   f'fixes; the limit is {allowed:.1f} m'),)
+
+
+def bend_reasons(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: float,
+                 distance: float) -> tuple[Reason, ...]:
+    """
+    Return MODEL_MISMATCH if a pinned track bends more than gyro drift and fix errors explain.
+
+    The ends alone do not show a false or missing turn between them. Means of the residuals over
+    windows do, across the chord; the means along it show the size of slow fix errors.
+
+    t, residual : (n,), (n, 3) times, s, and corrected track minus fixes, m.   chord_n : (3,) from
+    mark to mark, m.   fix_sigma, drift : sigma of a fix, and possible track error by gyro drift,
+    m.   distance : path length of the leg, m.
+    """
+    x, y = chord_n[:2] / np.hypot(*chord_n[:2])
+    count, _, (along, across) = window_means(t, *(residual[:, :2] @ axis
+                                                  for axis in ((x, y), (-y, x))))
+    if len(count) < 3:      # two windows show no bend
+        return ()
+    sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
+    allowed, most = _distance_limit(sigma, distance), np.abs(across).max()
+    if most <= allowed:
+        return ()
+    return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {most:.1f} m from the fixes; '
+                   f'the limit is {allowed:.1f} m. Likely cause: gyro errors larger than its '
+                   'grade, or invalid gyro values', 'Use method smoother, which also estimates '
+                   'the gyro errors. Check for lost or invalid IMU messages, or copy the '
+                   'recording again.'),)
+
+
+def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
+    """
+    Return a mask of fixes that are no outliers relative to their neighbours, (n,), and the noise.
+
+    residual : (n, 2 or more) corrected track minus fixes, m; the track may have large errors.
+    The noise is the sigma of a fix by differences of consecutive ones, m, at least fix_sigma.
+    """
+    level = residual[:, :2]
+    jump = np.median((np.diff(level, axis=0)**2).sum(axis=1)) / np.log(2) / 4
+    sigma = max(fix_sigma, float(np.sqrt(jump)))
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(level, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
+    off = np.hypot(*(level - np.median(windows, axis=-1)).T)
+    return off <= OUTLIER_SIGMAS * sigma, sigma
+
+
+def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
+    """
+    Return the rms errors of two tracks over pieces of the path, each set to the fix at its begin.
+
+    path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
+    constant. The noise of the fixes is included.
+    """
+    return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
+                             cut_pieces)
+                 for length, cut_pieces, (was, now) in _squared_errors(path, before, after))
+
+
+def _squared_errors(path: Floats, before: Floats,
+                    after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
+    for length in PIECE_LENGTHS_M:
+        a, b = _piece_ends(path, length)
+        if len(a):
+            squares = [((x[b] - x[a])[:, :2]**2).sum(axis=1) for x in (before, after)]
+            yield length, len(a) / PIECE_STARTS, squares
+
+
+def _piece_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
+    """Return first and last rows of pieces of a length, whose begins are a tenth of it apart."""
+    begin = np.arange(path[0], path[-1] - length,
+                      length / PIECE_STARTS) if len(path) else np.empty(0)
+    a = np.searchsorted(path, begin)
+    b = np.searchsorted(path, path[a] + length)
+    whole = b < len(path)
+    a, b = a[whole], b[whole]
+    near = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
+    return a[near], b[near]
+
+
+def worse_check_reasons(path: Floats, before: Floats, after: Floats,
+                        configured: bool) -> list[Reason]:
+    """
+    Return CHECK_WORSE if the correction significantly increases the distance to the fixes.
+
+    path, before, after : as for ``errors_per_distance``.   configured : a nominal scale is set.
+    """
+    for length, cut_pieces, (was, now) in _squared_errors(path, before, after):
+        more = now - was
+        # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
+        if cut_pieces < 3 or now.mean() < 1.1**2 * was.mean() \
+                or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(cut_pieces):
+            continue
+        return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
+                       f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the '
+                       + ('track as configured' if configured else 'uncalibrated track')
+                       + f' {np.sqrt(was.mean()):.2g} m')]
+    return []
+
+
+# rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
+# and drift
+FLIP = np.deg2rad(135.0)
+# s around a reversal, within which a fix error disappears. Judgement: duration of multipath
+ERROR_LASTS = 60.0
+
+
+class Pieces(NamedTuple):
+    """Pieces of a drive between fixes, one after the other: (k,) each."""
+
+    t: Floats        # s, the middle
+    off: Floats      # rad, direction of the track minus course by the fixes
+    length: Floats   # m, by the fixes
+    stretch: Floats  # length of the track over ``length``, median 1
+    course: Floats   # rad, direction by the fixes
+
+
+def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Pieces:
+    """
+    Cut the drive into pieces long enough for a direction.
+
+    track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
+    noise of a fix, m.
+    """
+    # the sigma of a direction is then sqrt(2) / 20 rad
+    knots = np.array(separated_fixes(fixes_2d, max(10.0, 20 * sigma)), int)
+    if len(knots) < 2:
+        return Pieces(*(np.empty(0),) * 5)
+    a, b = knots[:-1], knots[1:]
+    track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
+    length, middle = np.hypot(*fix.T), (t[a] + t[b]) / 2
+    stretch = np.hypot(*track.T) / length
+    course = arctan2(*fix.T[::-1])
+    off = wrap(arctan2(*track.T[::-1]) - course)
+    return Pieces(middle, off, length, stretch / (np.median(stretch) or 1.0), course)
+
+
+def find_reversed(found: Pieces) -> Bools:
+    """
+    Return True for pieces that are driven backwards: (k,) bool.
+
+    The heading offset is a random walk: its variance grows with the time between pieces, and its
+    size is by the median of its changes. A piece beyond FLIP from the mean of those before is
+    opposite to them. Where FAULT_SIGMAS of the walk exceed FLIP, the drive is divided; each part
+    has its own forward direction, that of most of its pieces.
+
+    A piece whose path length by track and by fixes differs too much, as on the spot or with a
+    jump of the fixes, has no direction.
+    """
+    back = np.zeros(len(found.t), bool)
+    if len(found.t) > 1:        # without the remaining gyro bias, a constant rate of the offset
+        rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
+        found = found._replace(off=wrap(found.off - rate * found.t))
+    moves = np.flatnonzero((found.stretch > ONE_MOTION_RATIO[0])
+                           & (found.stretch < ONE_MOTION_RATIO[1]))
+    if len(moves) < 3:
+        return back
+    dt, step = np.maximum(np.diff(found.t[moves]), 1e-9), wrap(np.diff(found.off[moves]))
+    usual = robust_sigma(step)
+    sigma = usual * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
+    unknown = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
+    state = _is_opposite(found.off[moves])
+    for part in np.split(np.arange(len(moves)), unknown):
+        flipped = state[part] != (np.mean(state[part]) > 0.5)
+        for run in np.split(np.arange(len(part)), np.flatnonzero(np.diff(flipped)) + 1):
+            if len(run) and flipped[run[0]] and _stays_back(
+                    found, moves[part[run]], moves[part[~flipped]]):
+                back[moves[part[run]]] = True
+    return back
+
+
+def _is_opposite(off: Floats) -> Bools:
+    """Return True for offsets, rad, opposite to the mean of those before, which follows: (k,)."""
+    mean, out = float(off[0]), np.zeros(len(off), bool)
+    for k, angle in enumerate(off.tolist()):
+        out[k] = abs(wrap(angle - mean)) > FLIP
+        mean += float(wrap(angle - mean - np.pi * out[k])) / 2
+    return out
+
+
+def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
+    """
+    Return True if the fixes stay behind after a run of pieces, as after a reversal.
+
+    Over ERROR_LASTS to each side, the displacement of the fixes is then nearer to that of the
+    track with the run reversed; after a fix error, which disappears, to that of the track.
+    """
+    t = found.t
+    about = np.flatnonzero((t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS))
+    # the heading by most forward pieces: that of single ones contains the error
+    near = found.off[forward[np.isin(forward, about)]]
+    base = float(found.off[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
+    usual = base + (float(np.median(wrap(near - base))) if len(near) else 0.0)
+    track = found.stretch[about] * found.length[about] * np.exp(
+        1j * (found.course[about] + found.off[about] - usual))
+    off = np.sum(found.length[about] * np.exp(1j * found.course[about])) - track.sum()
+    return bool(abs(off + 2 * track[np.isin(about, run)].sum()) < abs(off))
+
+
+def reversal_reasons(found: Pieces, signed: bool) -> tuple[Reason, ...]:
+    """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
+    back = find_reversed(found)
+    if not back.any():
+        return ()
+    how = 'odometer.signed is false' if not signed else 'the counter does not count down'
+    return (Reason(Code.TRACK_MISMATCH, f'in {int(back.sum())} of {len(back)} sections the track '
+                   f'runs opposite to the fixes. Likely cause: the vehicle reversed and {how}',
+                   Code.REVERSING_UNSIGNED.remedy),)
