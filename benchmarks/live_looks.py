@@ -22,7 +22,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
-from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE
+from odocal_ros.live.running_estimate import UPDATE_PERIOD_NS, UPDATE_CPU_SHARE
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -51,12 +51,13 @@ def show(leg, config, seconds):
     """Print all looks at a leg; return the last forecast."""
     print('   leg s   look s CPU   of that once   next after s   scale sigma ppm   yaw sigma deg')
     state = ThinnedLeg(leg.form), SmootherSoFar()
-    before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + LOOK_PERIOD_NS, [], 0.0, -1.0
+    before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + UPDATE_PERIOD_NS, [], 0.0, -1.0
     early = 0.0
     while before_ns < leg.stop_ns:
         seen, cost, unique_paths = look(leg, config, state, before_ns, now_ns)
         total += cost
-        pauses.append(max(LOOK_PERIOD_NS * 1e-9, cost + (cost - unique_paths) / LOOK_SHARE))
+        pauses.append(max(UPDATE_PERIOD_NS * 1e-9,
+                          cost + (cost - unique_paths) / UPDATE_CPU_SHARE))
         t = (now_ns - leg.start_ns) * 1e-9
         early = total if t <= EARLY_S else early
         if seen is not None and (t > shown + seconds / LINES or now_ns >= leg.stop_ns):

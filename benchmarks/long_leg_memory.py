@@ -73,10 +73,10 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.forecast.leg_so_far import SmootherSoFar
     from odocal_ros.forecast.thinned_leg import ThinnedLeg
     import odocal_ros.live.node  # noqa: F401 all that a node holds
-    from odocal_ros.live.worker import compute, give_back, hold_little
+    from odocal_ros.live.worker import compute, release_memory, limit_kept_memory
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
-    hold_little()
+    limit_kept_memory()
     print(f'node, modules loaded: {peak_mib():.0f} MiB', flush=True)
     config, recorder, thinned, smoother = Config(), LegRecorder(), ThinnedLeg(), SmootherSoFar()
     last, begin, done = {}, [], []
@@ -109,7 +109,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
         if looks and gone > (len(done) + 1) * hours * 3600 / looks * 0.999:
             done.append(gone)
             forecast_of(thinned.leg(begin[0]), thinned.fix_rate(), config, lambda: True, smoother)
-            give_back()
+            release_memory()
             print(f'node, {gone / 3600:.1f} h recorded, estimate running: {peak_mib():.0f} MiB '
                   f'(goal {NODE_GOAL})', flush=True)
         if gone > hours * 3600:
@@ -122,11 +122,11 @@ def node(bag_path, hours, imu_hz, looks) -> None:
             bag.read(readers, take_in)
         recorder.form = readers['/odometer'].form
     print(f'node, recorded: {peak_mib():.0f} MiB (goal {NODE_GOAL})', flush=True)
-    give_back()     # as the worker does after each look
+    release_memory()     # as the worker does after each look
     stop = recorder.newest_ns('imu')
     began = time.perf_counter()
     result, = compute(recorder.snapshot(), begin[0], stop, [], config,
-                      progress=lambda *_: give_back()).results
+                      progress=lambda *_: release_memory()).results
     scale = result.methods['smoother'].estimates['scale_factor']
     print(f'node, computed ({result.imu_samples} IMU rows, {time.perf_counter() - began:.0f} s, '
           f'scale {scale.value} +- {scale.sigma}): {peak_mib():.0f} MiB (goal {NODE_GOAL})',

@@ -29,8 +29,8 @@ SPOT_TURNS = ('for the track width: turn on the spot in both directions, and dri
               'metre after each turn')
 
 
-def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
-            good: str = '', advice: str = '') -> tuple[bool, str]:
+def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
+                  good: str = '', advice: str = '') -> tuple[bool, str]:
     """
     Return (success, text) of a result: values, verdict, legs, cautions and the next action.
 
@@ -43,15 +43,15 @@ def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: i
         cut = f' in {len(parts)} sections' if len(parts) > 1 else ''
         text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
-    said = [text, good]
+    parts_of_answer = [text, good]
     for reason in cautions(calibration.reasons)[:MOST_REASONS]:
-        said += [f'{reason.code.name}: {reason.text}', reason.remedy]
-    if advice and advice not in said:
-        said.append(f'Next: {advice}')
-    return calibration.verdict is not Verdict.REJECTED, _sentences(said)
+        parts_of_answer += [f'{reason.code.name}: {reason.text}', reason.remedy]
+    if advice and advice not in parts_of_answer:
+        parts_of_answer.append(f'Next: {advice}')
+    return calibration.verdict is not Verdict.REJECTED, _sentences(parts_of_answer)
 
 
-def provisional(at_stop: SessionView) -> str:
+def provisional_answer(at_stop: SessionView) -> str:
     """
     Return the answer that a leg is being computed, with its running estimate.
 
@@ -73,7 +73,7 @@ def provisional(at_stop: SessionView) -> str:
         'result.*; call ~/stop_leg again to wait for it'])
 
 
-def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:
+def restored_answer(result: Restored, unit: str, good: str) -> tuple[bool, str]:
     """Return the answer that carries a restored result; ``unit`` is that of its scale."""
     return result.valid, _sentences([f'no leg is running; {result.words(unit)}', good,
                                      'Next: drive a leg to update it'])
@@ -85,7 +85,7 @@ def _sentences(parts: Iterable[str]) -> str:
     return ' '.join([*(f'{part.rstrip(".")}.' for part in before), last])
 
 
-def one_line(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """Return an error as one line; an unexpected one is reported as an internal error."""
     text = error_text(error)
     if isinstance(error, OdocalError):
@@ -102,13 +102,13 @@ def hint(now: SessionView) -> str:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')
     if now.lost_cause:
-        return '; '.join([_fault(now), *now.missing[:1]])
+        return '; '.join([_fault_text(now), *now.missing[:1]])
     if now.missing:
         return now.missing[0]
     if now.clocks:
         return clocks_differ(now.clocks)
     if state is State.RECORDING:
-        actions, facts = _while_recording(now)
+        actions, facts = _recording_hint(now)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
         if now.config.leg.automatic and now.imu:
@@ -117,14 +117,14 @@ def hint(now: SessionView) -> str:
             return (f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg '
                     f'({now.still_s:.0f} s so far)')
         return 'call ~/start_leg'
-    return after_result(now)
+    return advice_after_result(now)
 
 
-def action_first(now: SessionView) -> str:
+def hint_action_first(now: SessionView) -> str:
     """Return the hint for a single line: in a leg the action comes before the estimate."""
     fine = not (now.lost_cause or now.missing or now.clocks)
     if now.session.state is State.RECORDING and fine:
-        actions, facts = _while_recording(now)
+        actions, facts = _recording_hint(now)
         return '; '.join([*(actions or ['drive on']), *facts])
     return hint(now)
 
@@ -137,8 +137,8 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
     if session.state is not State.COMPUTING and session.calibration is not None:
         return quantities.of_calibration(session.calibration, now.config, now.two_wheels)
     if session.state is not State.COMPUTING and session.restored is not None:
-        return quantities.of_estimates(session.restored.estimates, now.config, now.two_wheels,
-                                       session.restored.valid)
+        return quantities.of_estimates(session.restored.estimates, now.config,
+                                       now.two_wheels, session.restored.valid)
     return quantities.nothing_known()
 
 
@@ -160,68 +160,70 @@ def manoeuvres(now: SessionView) -> list[str]:
     """Return the missing manoeuvres of the leg, besides metres and standstill."""
     if now.session.state is not State.RECORDING:
         return []
-    wants, least = [], now.leg.min_speed
+    required, least = [], now.leg.min_speed
     if now.max_speed < least:
-        wants.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
-                     f'({KMH * least:.0f} km/h)')
+        required.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
+                        f'({KMH * least:.0f} km/h)')
     if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
-        wants.append('call ~/mark at rest on each point')
+        required.append('call ~/mark at rest on each point')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):
-        wants += _of_two_wheels(now)
-    return wants + (now.forecast.lacks if now.forecast else [])
+        required += _wheel_manoeuvres(now)
+    return required + (now.forecast.lacks if now.forecast else [])
 
 
-def _of_two_wheels(now: SessionView) -> list[str]:
+def _wheel_manoeuvres(now: SessionView) -> list[str]:
     """Return the manoeuvres for the wheels; before the first update only for the track width."""
     config = now.session.config
     wheels = None if now.forecast is None else now.forecast.wheels
-    asked = quantities.QUANTITIES['left_right'].limit(config)
-    wants = []
-    if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= asked):
-        wants.append(STRAIGHT)
+    limit = quantities.QUANTITIES['left_right'].limit(config)
+    required = []
+    if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= limit):
+        required.append(STRAIGHT)
     if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
-        wants.append(TURNS if now.imu else SPOT_TURNS)
-    return wants
+        required.append(TURNS if now.imu else SPOT_TURNS)
+    return required
 
 
-def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
+def _recording_hint(now: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint as two lists: actions, then facts."""
-    metres, wants = metres_to_go(now), manoeuvres(now)
+    metres, required = metres_to_go(now), manoeuvres(now)
     facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
     slow = now.max_speed < now.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
-            wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
-        end = _end(now) if now.session.by_itself else DRIVE_ON
-        return [', '.join(wants), end], facts
+            required = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in required)]
+        end = _end_text(now) if now.session.is_automatic else DRIVE_ON
+        return [', '.join(required), end], facts
     if now.forecast is None:
-        return [*wants, _end(now)], facts
+        return [*required, _end_text(now)], facts
     facts.append(now.forecast.words(now.distance_m))
     if now.forecast_age_s > FORECAST_OLD_S:
         facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
-    ends = now.forecast.complete or now.session.by_itself
-    return wants + ([_end(now)] if ends else []), facts
+    is_last_step = now.forecast.complete or now.session.is_automatic
+    return required + ([_end_text(now)] if is_last_step else []), facts
 
 
-def _fault(now: SessionView) -> str:
+def _fault_text(now: SessionView) -> str:
     worst = now.faults[0]
     text = f'{worst.code.name}: {worst.text}. {worst.remedy.rstrip(".")}'
-    if now.session.by_itself:
+    if now.session.is_automatic:
         return f'the leg will not be used: {text}; the next leg starts automatically'
     return f'call ~/cancel_leg and start again: the leg would be rejected: {text}'
 
 
-def _end(now: SessionView) -> str:
-    if now.session.by_itself:
-        left = now.session.config.leg.automatic_minutes - now.duration_s / 60
-        return (f'the leg ends automatically at a standstill, or within {max(1, round(left))} min')
+def _end_text(now: SessionView) -> str:
+    if now.session.is_automatic:
+        remaining = now.session.config.leg.automatic_minutes - now.duration_s / 60
+        return ('the leg ends automatically at a standstill, or within '
+                f'{max(1, round(remaining))} min')
     if now.still_s < now.session.config.leg.standstill:
         return f'stand still {REST_FORESEEN_S:.0f} s at the end point, then call ~/stop_leg'
-    left = seconds_to_stand(now)
-    return (f'stand still {left:.0f} s more, then ' if left >= 1 else '') + 'call ~/stop_leg'
+    remaining = seconds_to_stand(now)
+    return (f'stand still {remaining:.0f} s more, then ' if remaining >= 1
+            else '') + 'call ~/stop_leg'
 
 
-def after_result(now: SessionView) -> str:
+def advice_after_result(now: SessionView) -> str:
     """Return the advice after a result: the largest improvement, then the other quantities."""
     reasons = now.session.calibration.reasons if now.session.calibration else ()
     config = now.config
@@ -233,13 +235,13 @@ def after_result(now: SessionView) -> str:
     save = '' if config.output.autosave or now.saved else 'call ~/save, or '
     text = ('drive on: legs start and end automatically' if config.leg.automatic else
             f'{save}drive another leg for a smaller sigma')
-    return '; '.join([text, *_notes(reasons, quantities_ok(now))])
+    return '; '.join([text, *_remedies(reasons, quantities_ok(now))])
 
 
-def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
+def _remedies(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
     """Return the remedies of the reasons about quantities that exceed their limits."""
-    wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
+    labels = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
     return list(dict.fromkeys(
-        f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
-        for r in reasons if ABOUT.get(r.code) in wanted))
+        f'for the {labels[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
+        for r in reasons if ABOUT.get(r.code) in labels))

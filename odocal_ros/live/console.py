@@ -44,29 +44,30 @@ class TopicReport:
     """Reports mixed and lost messages; a loss again at LOSS_FACTOR times the reported count."""
 
     def __init__(self) -> None:
-        self._said: dict[str, int] = {}
-        self._doubled: set[str] = set()      # reported
+        self._reported_counts: dict[str, int] = {}
+        self._reported_duplicates: set[str] = set()      # reported
 
-    def news(self, lost: dict[str, int], doubled: list[str]) -> list[str]:
+    def new_texts(self, lost: dict[str, int], duplicate_publishers: list[str]) -> list[str]:
         """
-        Return the sentences on new losses, and those of ``doubled`` that are new and not empty.
+        Return the sentences on new losses, and new sentences of ``duplicate_publishers``.
 
         lost : topic -> messages lost so far; a smaller number than before starts a new count.
         """
-        found = [text for text in dict.fromkeys(doubled) if text and text not in self._doubled]
-        self._doubled.update(found)
+        found = [text for text in dict.fromkeys(duplicate_publishers) if text
+                 and text not in self._reported_duplicates]
+        self._reported_duplicates.update(found)
         for topic, count in lost.items():
-            said = self._said.get(topic, 0)
-            if count < said:
-                said = self._said[topic] = 0
-            if count >= max(1, LOSS_FACTOR * said):
-                self._said[topic] = count
-                found.append(f'{losses_in_words({topic: count})}. Likely cause: CPU load or '
+            reported = self._reported_counts.get(topic, 0)
+            if count < reported:
+                reported = self._reported_counts[topic] = 0
+            if count >= max(1, LOSS_FACTOR * reported):
+                self._reported_counts[topic] = count
+                found.append(f'{losses_text({topic: count})}. Likely cause: CPU load or '
                              'network. Reduce the load, or set the QoS of the topic to reliable')
         return found
 
 
-def losses_in_words(lost: dict[str, int]) -> str:
+def losses_text(lost: dict[str, int]) -> str:
     """Return the counts as text, empty if nothing was lost in a queue or on the network."""
     return ', '.join(f'{count} message{"s" * (count != 1)} of {topic} lost'
                      for topic, count in lost.items() if count)
@@ -83,7 +84,7 @@ class Console:
         self._log = log
         self._ready = False          # has been logged
         self._topics = TopicReport()
-        self._silence = False        # has been logged
+        self._missing_logged = False        # has been logged
         self._due_ns = 0             # time of the next log of missing inputs
         self._pause_ns = SILENCE_FIRST_NS
         self._missing_text = ''      # missing inputs of the last view, numbers removed
@@ -92,17 +93,17 @@ class Console:
         self._withdrawn: set[Code] = set()     # logged as no longer valid
 
     def report(self, now: SessionView, steady_ns: int) -> None:
-        self._faults(now)
-        for text in self._topics.news(now.lost_messages, now.doubled):
+        self._log_faults(now)
+        for text in self._topics.new_texts(now.lost_messages, now.duplicate_publishers):
             self._log.warning(text)
         if now.missing:
-            self._missing(now, steady_ns)
+            self._log_missing(now, steady_ns)
         else:
-            self._complete(now)
+            self._log_complete(now)
 
-    def _missing(self, now: SessionView, steady_ns: int) -> None:
+    def _log_missing(self, now: SessionView, steady_ns: int) -> None:
         text = NUMBER.sub('', '; '.join(now.missing))
-        if self._silence and text != self._missing_text:    # other publishers, other inputs
+        if self._missing_logged and text != self._missing_text:    # other publishers, other inputs
             self._pause_ns = SILENCE_FIRST_NS
             self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
         self._missing_text = text
@@ -110,22 +111,22 @@ class Console:
             self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:
             self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(now.missing))
-            self._silence = True
+            self._missing_logged = True
             self._pause_ns = min(2 * self._pause_ns, SILENCE_SELDOM_NS)
             self._due_ns = steady_ns + self._pause_ns
 
-    def _complete(self, now: SessionView) -> None:
+    def _log_complete(self, now: SessionView) -> None:
         self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
             what = ('legs start and end automatically' if now.config.leg.automatic else
                     'stand still for 10 s, then call ~/start_leg')
             self._log.info(f'ready ({rates}): {what}' if rates else f'ready: {what}')
-        elif self._silence:
+        elif self._missing_logged:
             self._log.info('all inputs are available again')
-        self._ready, self._silence = True, False
+        self._ready, self._missing_logged = True, False
 
-    def _faults(self, now: SessionView) -> None:
+    def _log_faults(self, now: SessionView) -> None:
         """Log the problems of the current leg, each once."""
         leg_id = now.session.leg_id
         if self._leg_id != leg_id:
@@ -137,8 +138,8 @@ class Console:
                                   f'{fault.remedy}')
         if now.session.state is not State.RECORDING:
             return
-        gone = self._reported - self._withdrawn - {fault.code for fault in now.faults}
-        for code in sorted(gone, key=lambda code: code.name):
+        withdrawn = self._reported - self._withdrawn - {fault.code for fault in now.faults}
+        for code in sorted(withdrawn, key=lambda code: code.name):
             self._withdrawn.add(code)
             self._log.info(f'leg {leg_id}: {code.name} no longer applies: later messages '
                            'contradict it')

@@ -23,9 +23,9 @@ from odocal_ros.live.process import run, SettledNode
 from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
-ZEROS = 20            # judgement: zero commands at a stop, since one may be lost
+STOP_COMMANDS = 20            # judgement: zero commands at a stop, since one may be lost
 STUCK_S = 2.0         # judgement: twice the time of the slowest robot for a visible motion
-LAST_ZEROS, LAST_PERIOD_S = 5, 0.02       # judgement: zero commands of an ending node
+FINAL_STOP_COMMANDS, LAST_PERIOD_S = 5, 0.02       # judgement: zero commands of an ending node
 HELP = """\
 usage: drive_pattern --ros-args -p speed:=M_PER_S -p 'rectangle:=[X, Y, X, Y]' [-p NAME:=VALUE]
 
@@ -53,13 +53,13 @@ class DrivePattern(SettledNode):
         self._pose_at = -math.inf       # all times: s, of the steady clock
         self._bumped = self._ending = False
         self._route: tuple[pattern.Piece, ...] = ()     # empty: the robot is not driven
-        self._progress, self._begun, self._zeros = pattern.Progress(), 0.0, 0
+        self._progress, self._started_s, self._stop_commands_left = pattern.Progress(), 0.0, 0
         # where and when the robot last moved
-        self._moved: tuple[pattern.Pose, float] | None = None
+        self._last_motion: tuple[pattern.Pose, float] | None = None
         sensor = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(message_class(self.config.pose_type), 'pose', self._take_pose,
+        self.create_subscription(message_class(self.config.pose_type), 'pose', self._receive_pose,
                                  sensor)
-        self.create_subscription(Bool, 'bumper', self._take_bumper, sensor)
+        self.create_subscription(Bool, 'bumper', self._receive_bumper, sensor)
         self._publisher = self.create_publisher(TwistStamped if self.config.stamped else Twist,
                                                 'cmd_vel', 1)
         self.create_service(Trigger, '~/start', self._start)
@@ -79,7 +79,7 @@ class DrivePattern(SettledNode):
     def destroy_node(self) -> None:
         if getattr(self, '_route', ()) or getattr(self, '_zeros', 0):
             self._halt('the node ends')
-            for _ in range(LAST_ZEROS if self.context.ok() else 0):
+            for _ in range(FINAL_STOP_COMMANDS if self.context.ok() else 0):
                 self._send(0.0, 0.0)
                 time.sleep(LAST_PERIOD_S)
         super().destroy_node()  # type: ignore[no-untyped-call]
@@ -87,38 +87,39 @@ class DrivePattern(SettledNode):
     def _end(self, *_: object) -> None:
         self._ending = True
 
-    def _take_pose(self, message: Any) -> None:
-        here = message.pose if hasattr(message.pose, 'position') else message.pose.pose
-        q = here.orientation
+    def _receive_pose(self, message: Any) -> None:
+        pose = message.pose if hasattr(message.pose, 'position') else message.pose.pose
+        q = pose.orientation
         heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-        self._pose = here.position.x, here.position.y, heading
+        self._pose = pose.position.x, pose.position.y, heading
         self._pose_at = time.monotonic()
 
-    def _take_bumper(self, message: Bool) -> None:
+    def _receive_bumper(self, message: Bool) -> None:
         self._bumped = message.data
         if self._route:
             self._tick()        # at once
 
-    def _why_stop(self) -> str:
+    def _stop_reason(self) -> str:
         now = time.monotonic()
-        driven_s = now - self._begun if self._route else 0.0
+        driven_s = now - self._started_s if self._route else 0.0
         return pattern.why_stop(self._pose, now - self._pose_at, self._rectangle, self._bumped,
                                 driven_s, self.config.timeout)
 
     def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        why = 'a pattern is already running' if self._route else self._why_stop()
+        reason = 'a pattern is already running' if self._route else self._stop_reason()
         others = self.count_publishers(self._publisher.topic_name) - 1
-        if not why and others:
-            why = (f'{self._publisher.topic_name} has {others} other publisher'
-                   f'{"s" * (others != 1)}: end the other node, or remap one of them')
-        response.success, response.message = not why, why
-        if why:
-            self.get_logger().warning(f'~/start refused: {why}')
+        if not reason and others:
+            reason = (f'{self._publisher.topic_name} has {others} other publisher'
+                      f'{"s" * (others != 1)}: end the other node, or remap one of them')
+        response.success, response.message = not reason, reason
+        if reason:
+            self.get_logger().warning(f'~/start refused: {reason}')
             return response
         assert self._pose is not None
         self._route = pattern.route_of(self.config, self._pose[:2])
-        self._progress, self._begun, self._zeros = pattern.Progress(), time.monotonic(), 0
-        self._moved = None
+        self._progress, self._started_s = pattern.Progress(), time.monotonic()
+        self._stop_commands_left = 0
+        self._last_motion = None
         response.message = (f'driving: {self.config.pattern}, '
                             f'{sum(piece.length for piece in self._route):.1f} m')
         self.get_logger().info(response.message)
@@ -130,41 +131,41 @@ class DrivePattern(SettledNode):
         self._halt('~/stop')
         return response
 
-    def _halt(self, why: str) -> None:
+    def _halt(self, reason: str) -> None:
         """Stop the robot: a zero command now, and more at the next ticks."""
         if self._route:
-            self.get_logger().info(f'stopped: {why}')
-        self._route, self._zeros = (), ZEROS
+            self.get_logger().info(f'stopped: {reason}')
+        self._route, self._stop_commands_left = (), STOP_COMMANDS
         if self.context.ok():
             self._send(0.0, 0.0)
 
     def _tick(self) -> None:
         """Send a command while a pattern is running; then zeros, then nothing."""
         if not self._route:
-            if self._zeros:
-                self._zeros -= 1
+            if self._stop_commands_left:
+                self._stop_commands_left -= 1
                 self._send(0.0, 0.0)
             return
-        if why := self._why_stop():
-            self._halt(why)
+        if reason := self._stop_reason():
+            self._halt(reason)
             return
         assert self._pose is not None
         speed, rate, self._progress = pattern.command(self._route, self._progress, self._pose,
                                                       time.monotonic(), self.config)
         if self._progress.piece == len(self._route):
             self._halt('the pattern is complete')
-        elif self._stuck(speed or rate):
+        elif self._is_stuck(speed or rate):
             self._halt(f'the pose has not changed for {STUCK_S:g} s: the wheels are blocked, or '
                        'the position is frozen')
         else:
             self._send(speed, rate)
 
-    def _stuck(self, asked: float) -> bool:
+    def _is_stuck(self, commanded: float) -> bool:
         pose, now = self._pose, time.monotonic()
         assert pose is not None
-        if not asked or self._moved is None or pattern.moved(self._moved[0], pose):
-            self._moved = pose, now
-        return now - self._moved[1] > STUCK_S
+        if not commanded or self._last_motion is None or pattern.moved(self._last_motion[0], pose):
+            self._last_motion = pose, now
+        return now - self._last_motion[1] > STUCK_S
 
     def _send(self, speed: float, rate: float) -> None:
         twist = Twist()

@@ -28,12 +28,12 @@ from odocal_ros.safe_io.atomic_files import locked, new_folder
 from odocal_ros.settings.config import Config
 
 LATEST = 'latest'
-LEFT_S = 60.0      # judgement: age from which an empty folder or unfinished link is unused
+REMAINS_AGE_S = 60.0      # judgement: age from which an empty folder or unfinished link is unused
 RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # time, count
 
 
 @dataclass(frozen=True)
-class Filed:
+class WrittenResult:
     """A written folder, the start of its last leg, ns, and the earlier target of ``latest``."""
 
     folder: Path
@@ -50,9 +50,9 @@ class ResultFolders:
     """
 
     def __init__(self) -> None:
-        self._filed: list[Filed] = []
+        self._written: list[WrittenResult] = []
 
-    def file(self, folder: Path, last_ns: int, force: bool) -> str:
+    def point_latest(self, folder: Path, last_ns: int, force: bool) -> str:
         """
         Point ``latest`` at a new folder; return the reason if it stays unchanged, else empty.
 
@@ -60,13 +60,13 @@ class ResultFolders:
         """
         link = folder.parent / LATEST
         with locked(folder.parent):         # another node may write there, too
-            _clear(folder.parent)
-            before = _target(link)
-            worse = '' if force else replacing(stored_in(link), folder)
-            if worse:
-                return worse
-            _point(link, folder.name)
-        self._filed.append(Filed(folder, last_ns, before))
+            _remove_remains(folder.parent)
+            before = _link_target(link)
+            reason = '' if force else replacing(stored_in(link), folder)
+            if reason:
+                return reason
+            _set_link(link, folder.name)
+        self._written.append(WrittenResult(folder, last_ns, before))
         return ''
 
     def prune(self, newest: Path, kept: int) -> None:
@@ -82,14 +82,15 @@ class ResultFolders:
             # by the time, and the count within that second
             names = [m[0] for m in sorted(made, key=lambda m: (m[1], int(m[2] or 1)))]
             old = names[:-kept] if kept else []
-            shown = _target(root / LATEST)
-            stay = {newest.name, shown, *(f.before for f in self._filed if f.folder.name == shown)}
+            linked = _link_target(root / LATEST)
+            kept_names = {newest.name, linked,
+                          *(f.before for f in self._written if f.folder.name == linked)}
             for name in reversed(names if old else []):
                 found = stored_in(root / name)
                 if found and found.usable:
-                    stay.add(name)
+                    kept_names.add(name)
                     break
-            for name in (n for n in old if n not in stay):
+            for name in (n for n in old if n not in kept_names):
                 found = stored_in(root / name)
                 if found and found.config.get('leg.automatic'):
                     shutil.rmtree(root / name, ignore_errors=True)
@@ -100,38 +101,38 @@ class ResultFolders:
 
         Returns the newest folder of this session that is not withdrawn, None without one.
         """
-        dropped = [f for f in self._filed if f.last_ns >= since_ns]
-        self._filed = [f for f in self._filed if f.last_ns < since_ns]
-        for one in reversed(dropped):
-            root = one.folder.parent
+        dropped = [f for f in self._written if f.last_ns >= since_ns]
+        self._written = [f for f in self._written if f.last_ns < since_ns]
+        for entry in reversed(dropped):
+            root = entry.folder.parent
             link = root / LATEST
-            if _target(link) != one.folder.name:
+            if _link_target(link) != entry.folder.name:
                 continue       # another process has moved it
-            if one.before and (root / one.before).is_dir():
-                _point(link, one.before)
+            if entry.before and (root / entry.before).is_dir():
+                _set_link(link, entry.before)
             else:
                 link.unlink(missing_ok=True)
-        return self._filed[-1].folder if self._filed else None
+        return self._written[-1].folder if self._written else None
 
 
-def _clear(root: Path) -> None:
+def _remove_remains(root: Path) -> None:
     """Remove the remains of killed nodes: empty result folders and temporary links."""
-    until = time.time() - LEFT_S
-    for one in root.iterdir():
+    until = time.time() - REMAINS_AGE_S
+    for entry in root.iterdir():
         with suppress(OSError):
-            if one.lstat().st_mtime > until:
+            if entry.lstat().st_mtime > until:
                 continue
-            if RESULT_NAME.fullmatch(one.name):
-                one.rmdir()      # fails unless it is empty
-            elif one.name.startswith(f'.{LATEST}-') and one.is_symlink():
-                one.unlink()
+            if RESULT_NAME.fullmatch(entry.name):
+                entry.rmdir()      # fails unless it is empty
+            elif entry.name.startswith(f'.{LATEST}-') and entry.is_symlink():
+                entry.unlink()
 
 
-def _target(link: Path) -> str:
+def _link_target(link: Path) -> str:
     return link.readlink().name if link.is_symlink() else ''
 
 
-def _point(link: Path, name: str) -> None:
+def _set_link(link: Path, name: str) -> None:
     """Move the link in one step: readers find the old or the new folder."""
     other = link.with_name(f'.{LATEST}-{uuid.uuid4().hex}')
     other.symlink_to(name)
@@ -140,8 +141,8 @@ def _point(link: Path, name: str) -> None:
 
 def output_root(config: Config, node: str) -> Path:
     """Return the folder of results: the setting, else the node's own folder in the ROS home."""
-    own = Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal' / node.lstrip('/')
-    return Path(config.output.directory or own).expanduser()
+    default = Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal' / node.lstrip('/')
+    return Path(config.output.directory or default).expanduser()
 
 
 class Filing:
@@ -157,31 +158,33 @@ class Filing:
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
         self._warned: Calibration | None = None    # a requested save left latest unchanged
-        self._under_way = 0
-        self._artist = Worker()        # separate: no leg waits for a report
+        self._saves_running = 0
+        self._report_worker = Worker()        # separate: no leg waits for a report
 
     def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
-             imu_frame: str, now_ns: int, asked: bool) -> Future:
+             imu_frame: str, now_ns: int, by_operator: bool) -> Future:
         """
         Write the result files in the worker; the future has (success, text).
 
         asked : by the operator; ``latest`` moves to a worse result only at the second request.
         """
         future = Future()
-        self._under_way += 1
+        self._saves_running += 1
 
-        def then(outcome: Any, error: Exception | None) -> None:
-            self._under_way -= 1
+        def on_done(outcome: Any, error: Exception | None) -> None:
+            self._saves_running -= 1
             if error is None:
-                folder, stays = outcome
+                folder, unchanged_reason = outcome
                 self.saved, self.trouble = str(folder), ''
-                if stays and asked:
+                if unchanged_reason and by_operator:
                     self._warned = calibration
-                future.set_result((True, f'saved to {folder}' + (
-                    f'; latest is unchanged: {stays}; call ~/save{" again" * asked} to point it '
-                    'to this result anyway' if stays else '')))
+                text = f'saved to {folder}'
+                if unchanged_reason:
+                    text += (f'; latest is unchanged: {unchanged_reason}; call ~/save'
+                             f'{" again" * by_operator} to point it to this result anyway')
+                future.set_result((True, text))
             else:
-                self.trouble = answers.one_line(error)
+                self.trouble = answers.error_line(error)
                 future.set_result((False, f'not saved: {self.trouble}'))
             log = self._log.info if error is None else self._log.warning
             log(future.result()[1])
@@ -190,12 +193,12 @@ class Filing:
         self._worker.submit(partial(
             self._write, calibration, config, [{'bag': '', 'sha256': None, 'node': self._node,
                                                'topics': topics}],
-            imu_frame, now_ns, asked and calibration is self._warned), then)
+            imu_frame, now_ns, by_operator and calibration is self._warned), on_done)
         return future
 
     @property
     def busy(self) -> bool:
-        return self._under_way > 0 or self._artist.busy
+        return self._saves_running > 0 or self._report_worker.busy
 
     def _write(self, calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
@@ -214,38 +217,38 @@ class Filing:
                     folder.rmdir()      # empty: its name was only reserved
                 raise
             last_ns = max((leg.start_ns for leg in calibration.legs), default=0)
-            stays = self._folders.file(folder, last_ns, force)
+            unchanged_reason = self._folders.point_latest(folder, last_ns, force)
             if config.leg.automatic:
                 self._folders.prune(folder, config.output.automatic_kept)
         except OSError as error:
             raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                               'output.directory to a writable folder') from None
         if results.has_report:      # drawing it takes long
-            self._artist.submit(results.draw, self._drawn)
-        return folder, stays
+            self._report_worker.submit(results.draw, self._drawn)
+        return folder, unchanged_reason
 
     def _drawn(self, why: str, error: Exception | None) -> None:
         if error is not None or why:
             self._log.warning('the report could not be drawn: '
-                              f'{answers.one_line(error) if error else why}')
+                              f'{answers.error_line(error) if error else why}')
 
     def poll(self) -> None:
         """Log reports that could not be drawn."""
-        self._artist.poll()
+        self._report_worker.poll()
 
     def close(self, grace_s: float) -> bool:
         """Wait up to ``grace_s`` for the report; return True if it is drawn."""
-        return self._artist.close(grace_s)
+        return self._report_worker.close(grace_s)
 
     def withdraw(self, since_ns: int) -> None:
         """Move ``latest`` and ``saved`` back to the newest result of legs before ``since_ns``."""
         self.trouble = ''
 
-        def then(folder: Path | None, error: Exception | None) -> None:
+        def on_done(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)
             if error is not None:
                 self._log.warning('latest still points to a result with a dropped leg: '
-                                  f'{answers.one_line(error)}')
+                                  f'{answers.error_line(error)}')
             self._show()
 
-        self._worker.submit(partial(self._folders.withdraw, since_ns), then)
+        self._worker.submit(partial(self._folders.withdraw, since_ns), on_done)

@@ -14,7 +14,7 @@ from odocal_ros.settings.levels import TIME_RESTART_NS, TIME_RESTART_ROWS
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
 # judgement: a stamp further ahead is accepted if TIME_ANEW_ROWS of them follow
-WILD_STAMP_NS = 30 * 10**9
+STAMP_JUMP_NS = 30 * 10**9
 
 
 class Health:
@@ -37,18 +37,18 @@ class Health:
         self.fix_status: int | None = None
         self._last_sequence: int | None = None
         self._interval_s = 0.0
-        self.forget()
+        self.reset_times()
 
-    def forget(self) -> None:
+    def reset_times(self) -> None:
         """Restart after a jump of time; counts of losses stay."""
         self.newest_ns = 0
         self.jumped_back = False
         self._ahead: list[int] = []      # unconfirmed stamps far ahead
         self._behind = 0                 # stale rows at the end of the last block
         # count and stamp after each block
-        self._ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
+        self._block_ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
 
-    def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
+    def register_arrival(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count lost messages; sequences: publisher's numbers in order of arrival, or None."""
         self.received_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
@@ -59,8 +59,8 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def decoded(self, stamps: list[int], received_ns: Sequence[int] | Ints,
-                max_gap_s: float | None = None) -> list[bool]:
+    def check_stamps(self, stamps: list[int], received_ns: Sequence[int] | Ints,
+                     max_gap_s: float | None = None) -> list[bool]:
         """
         Process the stamps of some rows, ns; a gap is a step beyond the limit (or 5 intervals).
 
@@ -68,36 +68,36 @@ class Health:
         """
         self.count += len(stamps)
         self.stampless = bool(stamps) and max(stamps) <= 0
-        sound = self._not_ahead(stamps)
-        rows = [row for row, plausible in enumerate(sound) if plausible]
+        plausible = self._not_ahead(stamps)
+        rows = [row for row, is_plausible in enumerate(plausible) if is_plausible]
         if rows:
             newest = self.newest_ns
-            self._take([stamps[row] for row in rows], max_gap_s)
+            self._update_times([stamps[row] for row in rows], max_gap_s)
             self.delay_s = (int(received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
             for row in rows:
                 newest = max(newest, stamps[row])
-                sound[row] = stamps[row] >= newest - TIME_RESTART_NS
-        return sound
+                plausible[row] = stamps[row] >= newest - TIME_RESTART_NS
+        return plausible
 
     def _not_ahead(self, stamps: list[int]) -> list[bool]:
         """Return a mask of stamps that exist and are not far ahead of the last one."""
-        sound, last = [stamp > 0 for stamp in stamps], self.newest_ns
+        plausible, last = [stamp > 0 for stamp in stamps], self.newest_ns
         first = next((stamp for stamp in stamps if stamp > 0), 0)
-        if not self._ahead and max(stamps, default=0) - (last or first) < WILD_STAMP_NS:
-            return sound
+        if not self._ahead and max(stamps, default=0) - (last or first) < STAMP_JUMP_NS:
+            return plausible
         for row, stamp in enumerate(stamps):
-            if sound[row] and last and stamp - last >= WILD_STAMP_NS:
-                near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_STAMP_NS
-                self._ahead = [*self._ahead, stamp] if near else [stamp]
-                sound[row] = len(self._ahead) >= TIME_RESTART_ROWS
-            if sound[row]:
+            if plausible[row] and last and stamp - last >= STAMP_JUMP_NS:
+                is_near = self._ahead and abs(stamp - self._ahead[-1]) < STAMP_JUMP_NS
+                self._ahead = [*self._ahead, stamp] if is_near else [stamp]
+                plausible[row] = len(self._ahead) >= TIME_RESTART_ROWS
+            if plausible[row]:
                 last, self._ahead = stamp, []
-        return sound
+        return plausible
 
-    def _take(self, stamps: list[int], max_gap_s: float | None) -> None:
-        known = [self.newest_ns, *stamps] if self.newest_ns else stamps
-        steps = [after - before for before, after in pairwise(known)]
-        newest = self._newest(known, steps)
+    def _update_times(self, stamps: list[int], max_gap_s: float | None) -> None:
+        stamps_with_last = [self.newest_ns, *stamps] if self.newest_ns else stamps
+        steps = [after - before for before, after in pairwise(stamps_with_last)]
+        newest = self._newest_after(stamps_with_last, steps)
         rising = sorted(step * 1e-9 for step in steps if step > 0)
         if rising:
             limit = max_gap_s or 5 * self._interval_s
@@ -106,45 +106,46 @@ class Health:
             self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
                 else typical
         self.newest_ns = newest
-        self._ends.append((self.count, newest))
+        self._block_ends.append((self.count, newest))
 
-    def _newest(self, known: list[int], steps: list[int]) -> int:
+    def _newest_after(self, stamps_with_last: list[int], steps: list[int]) -> int:
         """Return the newest stamp after a block, and note whether time has restarted."""
         # one or two stale stamps are a driver error, more a restart of time; if a block ends with
         # few of them, or has one row only, the next block decides
-        behind, self._behind = self._behind, 0
+        stale_before, self._behind = self._behind, 0
         if not steps or min(steps) >= -TIME_RESTART_NS:
-            return known[-1]
-        at = steps.index(min(steps))
-        after = max(known[at + 1:])
-        fell = after < known[at] - TIME_RESTART_NS
+            return stamps_with_last[-1]
+        step_row = steps.index(min(steps))
+        after = max(stamps_with_last[step_row + 1:])
+        has_restarted = after < stamps_with_last[step_row] - TIME_RESTART_NS
         # back to the stamps before a wild one
-        after_wild = (steps[at - 1] > TIME_RESTART_NS and after >= known[at - 1] - TIME_RESTART_NS
-                      if at else not self.newest_ns)
-        if not fell or after_wild:
-            return known[-1]
-        rows = len(known) - 1 - at
-        if rows < TIME_RESTART_ROWS if at else rows + behind < 2:
+        after_wild = (steps[step_row - 1] > TIME_RESTART_NS
+                      and after >= stamps_with_last[step_row - 1] - TIME_RESTART_NS
+                      if step_row else not self.newest_ns)
+        if not has_restarted or after_wild:
+            return stamps_with_last[-1]
+        rows = len(stamps_with_last) - 1 - step_row
+        if rows < TIME_RESTART_ROWS if step_row else rows + stale_before < 2:
             self._behind = rows
-            return known[at]
+            return stamps_with_last[step_row]
         self.jumped_back = True
-        return known[-1]
+        return stamps_with_last[-1]
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""
         return (now_ns - self.received_ns) * 1e-9 if self.received_ns else float('inf')
 
-    def flowing(self, now_ns: int) -> bool:
-        allowed_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)
-        return bool(self.newest_ns) and self.silent_s(now_ns) < allowed_s
+    def is_flowing(self, now_ns: int) -> bool:
+        limit_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)
+        return bool(self.newest_ns) and self.silent_s(now_ns) < limit_s
 
     def rate_hz(self, now_ns: int) -> float:
         """Return rows per second by their stamps over the last seconds, 0 when silent."""
-        if not self.flowing(now_ns):
+        if not self.is_flowing(now_ns):
             return 0.0
-        recent = [e for e in self._ends if e[1] >= self.newest_ns - RATE_SPAN_NS]
+        recent = [e for e in self._block_ends if e[1] >= self.newest_ns - RATE_SPAN_NS]
         if len(recent) < 2:
-            recent = list(self._ends)[-2:]
+            recent = list(self._block_ends)[-2:]
         if len(recent) < 2 or recent[-1][1] <= recent[0][1]:
             return 0.0
         return (recent[-1][0] - recent[0][0]) / ((recent[-1][1] - recent[0][1]) * 1e-9)

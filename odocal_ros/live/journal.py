@@ -67,8 +67,8 @@ class Journal:
     def folder(self) -> str:
         return self._writer.folder if self._limit else ''
 
-    def remember(self, source: Input | StaticTransforms, raws: list[bytes],
-                 sent_ns: list[int]) -> None:
+    def store(self, source: Input | StaticTransforms, raws: list[bytes],
+              sent_ns: list[int]) -> None:
         """Store messages of a topic in the order of the recorder."""
         if not self._limit:
             return

@@ -49,21 +49,22 @@ class LegCompletion:
         self._journal = journal
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._worker = worker.Worker()
-        self._watch = RunningEstimate(self._worker, self._log)
+        self._running_estimate = RunningEstimate(self._worker, self._log)
         self._node_name = node.get_fully_qualified_name()
         self._computing = worker.Computing(self._worker, self._fail, self.show_status,
                                     node.context.ok)
         self._ability: Ability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for a retry
-        self._at_stop: SessionView | None = None   # of the open leg: its last running estimate
+        # of the open leg: its last running estimate
+        self._view_at_stop: SessionView | None = None
         self._distance_m = 0.0                # of the leg last touched
         self._silent = False                  # the IMU is silent in the leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
 
     @property
-    def awaited(self) -> bool:
+    def is_awaited(self) -> bool:
         """Return True while a leg is computed or files are written."""
         return self.session.state is State.COMPUTING or self._filing.busy
 
@@ -76,10 +77,11 @@ class LegCompletion:
             self._restart_after_jump()
         self._stop_when_too_long()
         self._close_when_complete()
-        if self._at_stop is not None and self.session.state is State.COMPUTING:
-            self._computing.answer_late(partial(answers.provisional, self._at_stop))
+        if self._view_at_stop is not None and self.session.state is State.COMPUTING:
+            self._computing.answer_late(partial(answers.provisional_answer, self._view_at_stop))
         if self.session.state is State.RECORDING:
-            self._watch.look(self._recording.newest_ns, self._recording.progress.distance_m())
+            self._running_estimate.update(self._recording.newest_ns,
+                                          self._recording.progress.distance_m())
             self._report_silence()
         self._journal.tick(self._config(), self.session.busy)
 
@@ -90,24 +92,25 @@ class LegCompletion:
             self.show_status()
 
     def pump(self) -> None:
-        running = self._watch.forecast and self._watch.forecast.estimates.get('scale_factor')
-        found = running.value if running else None
-        self._recording.pump(self._config(), found or self._publishing.scale_factor())
+        forecast = self._running_estimate.forecast
+        estimate = forecast.estimates.get('scale_factor') if forecast else None
+        scale = estimate.value if estimate else None
+        self._recording.pump(self._config(), scale or self._publishing.scale_factor())
 
     def close(self) -> bool:
-        self._watch.end()
+        self._running_estimate.end()
         grace_s = worker.FILES_GRACE_S if self._filing.busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
 
-    def left_behind(self) -> str:
+    def unstopped_leg_text(self) -> str:
         """Return the folder and replay command of a leg that was not stopped, else empty."""
         if self.session.state is not State.RECORDING:
             return ''
-        return f'leg {self.session.leg_id} was not stopped: {self._kept()}'
+        return f'leg {self.session.leg_id} was not stopped: {self._data_location()}'
 
-    def _kept(self, start_ns: int = 0) -> str:
+    def _data_location(self, start_ns: int = 0) -> str:
         """Return the place of the newest leg's data and how to compute it from a mark."""
         folder = self._journal.folder
         return (f'the data is in {folder}; compute it with {replay_command(folder, start_ns)}'
@@ -118,7 +121,7 @@ class LegCompletion:
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
             self._drop_leg(lost='time jumped back')
-            self._log.warning(self._lost_leg())
+            self._log.warning(self._lost_leg_text())
         else:
             self._log.warning(f'{jump}: all samples so far are dropped')
         self._recording.restart()
@@ -132,12 +135,13 @@ class LegCompletion:
         if in_leg:
             self._distance_m = progress.distance_m()
         end_ns = session.stop_ns or recording.newest_ns
-        forecast = self._watch.forecast
-        if self._at_stop is not None and session.state is State.COMPUTING:
-            forecast = self._at_stop.forecast
+        forecast = self._running_estimate.forecast
+        if self._view_at_stop is not None and session.state is State.COMPUTING:
+            forecast = self._view_at_stop.forecast
         config = session.config if session.busy else self._config()
         return SessionView(
-            session, config, missing=inputs.missing(config), doubled=inputs.doubled(),
+            session, config, missing=inputs.missing(config),
+            duplicate_publishers=inputs.duplicate_publishers(),
             lost_messages=inputs.lost(), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self._publishing.results(),
             restored=session.restored_since(), distance_m=self._distance_m,
@@ -145,8 +149,8 @@ class LegCompletion:
             max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(), ability=self._ability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
-            faults=self._watch.faults(recording.imu_silent_s()) if in_leg else (),
-            computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg(),
+            faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
+            computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg_text(),
             save_trouble=self._filing.trouble, journal=self._journal.folder,
             journal_trouble=self._journal.trouble, received=recording.received(),
             local=recording.local, imu=not inputs.without_imu)
@@ -172,23 +176,23 @@ class LegCompletion:
                 f'leg {session.leg_id} is stopped: it reached leg.max_duration, {limit:g} s')
             self.end_leg_now()
 
-    def _why_not(self) -> str:
+    def _start_refusal(self) -> str:
         """Return the explanation why no leg can start, empty if one can."""
         missing = self._recording.inputs.missing(self._config())
         clocks = self._recording.progress.clocks.differing(self._config())
         return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
 
-    def _begin_leg(self, mark_ns: int, by_itself: bool = False) -> str:
+    def _begin_leg(self, mark_ns: int, is_automatic: bool = False) -> str:
         """Open a leg at a mark and return the text for log and answer."""
         session = self.session
         config = self._config()
         session.start(mark_ns, with_marks(config) if config.reference.points else config,
-                      by_itself)
+                      is_automatic)
         self._recording.inputs.begin_leg()
         self._journal.begin(session, self._recording.inputs.topics)
-        if not by_itself:
+        if not is_automatic:
             self._recording.progress.begin_leg()
-        self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
+        self._running_estimate.begin(self._recording.snapshot(), mark_ns, session.config)
         self._ability = ability(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
@@ -202,9 +206,9 @@ class LegCompletion:
 
     def _end_leg(self, mark_ns: int) -> None:
         now = self.view()
-        self._at_stop = replace(now, forecast=now.forecast and now.forecast.ended())
+        self._view_at_stop = replace(now, forecast=now.forecast and now.forecast.ended())
         self.session.stop(mark_ns)
-        self._watch.end()
+        self._running_estimate.end()
         self._close_by_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)
         self.show_status()
         self._close_when_complete()
@@ -214,7 +218,7 @@ class LegCompletion:
         if self._close_by_ns is None:
             return
         late = time.monotonic_ns() > self._close_by_ns
-        if late or self._recording.passed(self.session.stop_ns):
+        if late or self._recording.has_passed(self.session.stop_ns):
             self._close_by_ns = None
             self._journal.end()
             self._snapshot = self._recording.snapshot()
@@ -225,7 +229,8 @@ class LegCompletion:
         kept = [leg.results for leg in session.legs]
         self._computing.submit(partial(
             worker.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
-            session.carried, session.by_itself, self._computing.report), self._take_leg)
+            session.carried, session.is_automatic, self._computing.report),
+            self._handle_leg_result)
 
     def _fail(self, trouble: str) -> None:
         if self.session.state is State.COMPUTING:      # else the result is available
@@ -235,53 +240,53 @@ class LegCompletion:
                   'it') if self.session.open_leg else 'call ~/reset'
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
-    def _take_leg(self, done: worker.Computed | worker.LeftOut) -> None:
-        leg_id, self._snapshot, self._at_stop = self.session.leg_id, None, None
+    def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
+        leg_id, self._snapshot, self._view_at_stop = self.session.leg_id, None, None
         self._distance_m = sum(one.distance for one in done.results)
-        if isinstance(done, worker.LeftOut):
-            self.session.leave_out(done.why)
+        if isinstance(done, worker.UnusedLeg):
+            self.session.drop_unusable(done.why)
             text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
                     f'{done.why.code.name}: {done.why.text}')
             self._log.info(text)
             self._computing.answer(False, text)
             return
         self.session.finish(done.results, done.calibration)
-        self.session.carry_on(done.carried, done.folded)
-        success, text = self._take_result(done.calibration, done.paths, done.results)
+        self.session.set_carried(done.carried, done.folded)
+        success, text = self._publish_result(done.calibration, done.paths, done.results)
         if success and self._config().output.autosave:
             self._save(done.calibration)
 
-    def _take_result(self, calibration: Calibration, paths: worker.Paths,
-                     parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
+    def _publish_result(self, calibration: Calibration, paths: worker.Paths,
+                        parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)
         now = self.view()
-        success, text = answers.outcome(calibration, parts, self.session.leg_id,
-                                        words(answers.quantities_ok(now)),
-                                        answers.after_result(now))
+        success, text = answers.result_answer(calibration, parts, self.session.leg_id,
+                                              words(answers.quantities_ok(now)),
+                                              answers.advice_after_result(now))
         self._log.info(text)
         self._computing.answer(success, text)
         return success, text
 
-    def _lost_leg(self) -> str:
+    def _lost_leg_text(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
         return session.lost and (
-            f'leg {session.leg_id} was cancelled: {session.lost}; {self._kept(session.start_ns)}; '
-            'call ~/start_leg for a new leg')
+            f'leg {session.leg_id} was cancelled: {session.lost}; '
+            f'{self._data_location(session.start_ns)}; call ~/start_leg for a new leg')
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         self.session.cancel(lost)
-        self._watch.end()
-        self._close_by_ns = self._snapshot = self._at_stop = None
+        self._running_estimate.end()
+        self._close_by_ns = self._snapshot = self._view_at_stop = None
         self._computing.drop()
         self.show_status()
         self._journal.end()
-        self._computing.answer(False, text or self._lost_leg())
+        self._computing.answer(False, text or self._lost_leg_text())
 
-    def _save(self, calibration: Calibration, asked: bool = False) -> Future:
+    def _save(self, calibration: Calibration, by_operator: bool = False) -> Future:
         inputs = self._recording.inputs
         config = replace(self.session.config, output=self._config().output)   # may be new
         return self._filing.save(calibration, config, inputs.topics,
                                  inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
-                                 asked)
+                                 by_operator)

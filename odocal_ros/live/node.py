@@ -19,10 +19,10 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
-from odocal_ros.live.process import complain, run, SettledNode
+from odocal_ros.live.process import print_error, run, SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.topic_input import LOOK_AROUND_S
+from odocal_ros.live.topic_input import SEARCH_PERIOD_S
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.floor_marks import check_points
 
@@ -70,11 +70,11 @@ class Calibrator(SettledNode):
         params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
         self.publishing = Publishing(self)
         self.journal = Journal(self, self.publishing.status_topic)
-        self.recording = Recording(self, self.config, self.journal.remember)
+        self.recording = Recording(self, self.config, self.journal.store)
         self.operation = Operation(self, self.recording, self.publishing, self.journal,
                                    lambda: self.config)
         self._lock = threading.RLock()  # for executors with several threads
-        self._due_ns = dict.fromkeys(('look', 'diagnostics', 'status'), 0)
+        self._due_ns = dict.fromkeys(('search', 'diagnostics', 'status'), 0)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         group = ReentrantCallbackGroup()  # a delayed answer must not block callbacks
@@ -88,8 +88,8 @@ class Calibrator(SettledNode):
         for part in ('operation', 'journal', 'recording'):
             if hasattr(self, part) and getattr(self, part).close() is False:
                 self.at_work = True
-        if hasattr(self, 'operation') and (left := self.operation.left_behind()):
-            complain('calibrator', left)      # a context that is shut down cannot log
+        if hasattr(self, 'operation') and (left := self.operation.unstopped_leg_text()):
+            print_error('calibrator', left)      # a context that is shut down cannot log
         super().destroy_node()  # type: ignore[no-untyped-call]
 
     # parameters
@@ -117,7 +117,7 @@ class Calibrator(SettledNode):
     def _tick(self) -> None:
         with self._lock:
             self.operation.tick()
-            if self._due('look', LOOK_AROUND_S):
+            if self._due('search', SEARCH_PERIOD_S):
                 self.recording.inputs.update(self.config)
                 session = self.operation.session
                 self.recording.forget(self.config.leg.preroll,
@@ -130,8 +130,8 @@ class Calibrator(SettledNode):
 
     def _pace(self) -> None:
         """Set the period of ``_tick``: shorter while a caller waits."""
-        awaited = self.operation.awaited
-        period_s = AWAITED_TURN_S if awaited else min(TURN_S, 1 / self.config.publish.rate)
+        is_awaited = self.operation.is_awaited
+        period_s = AWAITED_TURN_S if is_awaited else min(TURN_S, 1 / self.config.publish.rate)
         period_ns = round(period_s * 1e9)
         if period_ns != self._timer.timer_period_ns:
             self._timer.timer_period_ns = period_ns

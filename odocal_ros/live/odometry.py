@@ -27,7 +27,7 @@ from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS, TopicReport
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
-from odocal_ros.live.topic_input import Input, LOOK_AROUND_S
+from odocal_ros.live.topic_input import Input, SEARCH_PERIOD_S
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.message_fields import types_of
 from odocal_ros.safe_io.text_formats import error_text
@@ -35,8 +35,8 @@ from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
 # judgement, all in s: period of checks for a due pose (its largest delay), of the executor (which
 # costs most CPU), and of computations while odometer data are missing
-LOOK_S, SERVE_S, SILENT_S = 0.02, 0.2, 0.2
-SAID_AGAIN_NS = 10 * 10**9      # judgement: between two log lines of one kind
+CHECK_PERIOD_S, EXECUTOR_PERIOD_S, RECKONING_PERIOD_S = 0.02, 0.2, 0.2
+LOG_INTERVAL_NS = 10 * 10**9      # judgement: between two log lines of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
 
@@ -81,63 +81,63 @@ class OdometryNode(SettledNode):
 
     def _build(self) -> None:
         self.config = params.declare(self, ApplyConfig)
-        kept = params.declare_results(self, params.APPLIED)
-        if kept is None or not kept.valid:
-            why = 'no calibration is given' if kept is None else (
-                f'the calibration of {kept.stamp} was rejected')
+        calibration = params.declare_results(self, params.APPLIED)
+        if calibration is None or not calibration.valid:
+            why = 'no calibration is given' if calibration is None else (
+                f'the calibration of {calibration.stamp} was rejected')
             raise BadConfig(f'{why}: start with --ros-args --params-file FILE, a calibration.yaml '
                             'that odocal replay or the calibrator wrote')
-        vehicle = vehicle_of(kept.estimates, self.config)
+        vehicle = vehicle_of(calibration.estimates, self.config)
         for text in vehicle.assumptions:
             self.get_logger().warning(text)
         self._odometry = Odometry(vehicle, self.config)
         wheels = WHEELS[:2] if self.config.odometer.own_topics else WHEELS[:1]
         self._inputs = {slot: Input(self, slot, types_of(slot, self.config.odometer))
                         for slot in ('imu', *wheels)}
-        params.check_qos(self, (one.topic for one in self._inputs.values()))
-        for one in self._inputs.values():
-            one.check(self.config)
+        params.check_qos(self, (source.topic for source in self._inputs.values()))
+        for source in self._inputs.values():
+            source.check(self.config)
         frames = self.config.frames
         self._pose = NumbersPublisher(self, 'odometry', OdometryMessage(
             header=Header(frame_id=frames.odom), child_frame_id=frames.base))
         self._twist = NumbersPublisher(self, 'odometry/twist', TwistWithCovarianceStamped(
             header=Header(frame_id=frames.base)))
-        self._look_ns = self._silent_ns = 0
+        self._searched_ns = self._silent_ns = 0
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
-        self._said_ns: dict[str, int] = {}      # last log by kind of text
+        self._logged_ns: dict[str, int] = {}      # last log by kind of text
         self._topics = TopicReport()
         self.add_on_set_parameters_callback(params.fixed(ApplyConfig))
         self._tf = self._transforms() if self.config.publish_tf else None
         self._due_ns = self._reckoned_ns = 0
-        self._timer = self.steady_timer(LOOK_S, self._turn)
-        self.get_logger().info(f'applies the {kept.words("")}')
+        self._timer = self.steady_timer(CHECK_PERIOD_S, self._run_cycle)
+        self.get_logger().info(f'applies the {calibration.words("")}')
 
     def spin(self, executor: Executor) -> None:
         """Take messages when a pose may be due; the executor handles the rest at a low rate."""
         self.destroy_timer(self._timer)      # only for other executors
-        serve_at = 0.0
+        next_executor_s = 0.0
         while self.context.ok():
-            look_at = time.monotonic() + LOOK_S
-            self._turn()
-            until = max(look_at, min(self._due_ns * 1e-9, serve_at))
-            if any(one.waiting.gate.is_open for one in self._inputs.values()):
+            next_check_s = time.monotonic() + CHECK_PERIOD_S
+            self._run_cycle()
+            until = max(next_check_s, min(self._due_ns * 1e-9, next_executor_s))
+            if any(source.waiting.gate.is_open for source in self._inputs.values()):
                 while (left := until - time.monotonic()) > 0:      # it takes the messages
                     executor.spin_once(timeout_sec=left)
                 continue
-            if until > serve_at:
-                serve_at = until + SERVE_S
+            if until > next_executor_s:
+                next_executor_s = until + EXECUTOR_PERIOD_S
                 executor.spin_once(timeout_sec=0.0)
             time.sleep(max(0.0, until - time.monotonic()))
 
-    def _turn(self) -> None:
+    def _run_cycle(self) -> None:
         now_ns = time.monotonic_ns()
-        if now_ns - self._look_ns > LOOK_AROUND_S * 1e9:
-            self._look_ns = now_ns
-            self._look_around(now_ns)
+        if now_ns - self._searched_ns > SEARCH_PERIOD_S * 1e9:
+            self._searched_ns = now_ns
+            self._search_publishers(now_ns)
         if now_ns < self._due_ns:
             return
         try:
-            poses = self._reckon(now_ns)
+            poses = self._due_poses(now_ns)
         except Exception as error:      # no message may stop the node
             poses = []
             self._odometry.restart(f'internal error, please report it: {type(error).__name__}: '
@@ -151,24 +151,25 @@ class OdometryNode(SettledNode):
                 self._begun = True
                 self.get_logger().info('odometry starts')
         for text in self._odometry.take_notes():
-            self._say(text, now_ns)
+            self._log_text(text, now_ns)
 
-    def _reckon(self, now_ns: int) -> list[Pose]:
+    def _due_poses(self, now_ns: int) -> list[Pose]:
         """Return the poses that are due; IMU messages wait for those of the odometer."""
         for slot, source in self._inputs.items():
             if slot != 'imu':
                 self._pump(source)
-        if self._odometry.missing_odometer_s() > 0 and now_ns - self._reckoned_ns < SILENT_S * 1e9:
+        is_recent = now_ns - self._reckoned_ns < RECKONING_PERIOD_S * 1e9
+        if self._odometry.missing_odometer_s() > 0 and is_recent:
             return []
         self._reckoned_ns = now_ns
         self._pump(self._inputs['imu'])
         return self._odometry.poses()
 
-    def _say(self, text: str, now_ns: int) -> None:
+    def _log_text(self, text: str, now_ns: int) -> None:
         """Log the findings: every restart, other kinds of text at a limited rate."""
         kind = re.sub(r'[-+.\de]*\d', '#', text)
-        if text.startswith(RESTARTS) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
-            self._said_ns[kind] = now_ns
+        if text.startswith(RESTARTS) or now_ns - self._logged_ns.get(kind, 0) > LOG_INTERVAL_NS:
+            self._logged_ns[kind] = now_ns
             self.get_logger().warning(text)
 
     def _pump(self, source: Input) -> None:
@@ -177,19 +178,19 @@ class OdometryNode(SettledNode):
             if slot != 'imu_other':
                 self._odometry.feed(slot, rows, source.reader.form if source.reader else None)
         if source.health.jumped_back:
-            source.health.forget()
+            source.health.reset_times()
 
-    def _look_around(self, now_ns: int) -> None:
+    def _search_publishers(self, now_ns: int) -> None:
         """Search for publishers, and log missing inputs at a low rate."""
         inputs = self._inputs.values()
-        for one in inputs:
-            one.look()
-            if not one.flowing():
-                one.find(self.config)
-        for text in self._topics.news({one.topic: one.health.lost for one in inputs},
-                                      [one.doubled() for one in inputs]):
+        for source in inputs:
+            source.update_publishers()
+            if not source.is_flowing():
+                source.find_type(self.config)
+        for text in self._topics.new_texts({source.topic: source.health.lost for source in inputs},
+                                           [source.duplicate_publishers() for source in inputs]):
             self.get_logger().warning(text)
-        missing = list(filter(None, (one.why() for one in inputs)))
+        missing = list(filter(None, (source.missing_reason() for source in inputs)))
         clock_difference_s = self._odometry.clock_difference_s()
         if not missing and clock_difference_s:
             missing = [clock_difference_text(clock_difference_s)]
@@ -215,7 +216,7 @@ class OdometryNode(SettledNode):
             raise BadConfig('publish_tf needs the package tf2_msgs, which is not installed: '
                             'install ros-jazzy-tf2-msgs, or set publish_tf to false') from None
         publisher = self.create_publisher(kind, '/tf', 100)
-        return lambda one: publisher.publish(kind(transforms=[one]))
+        return lambda transform: publisher.publish(kind(transforms=[transform]))
 
 
 def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:

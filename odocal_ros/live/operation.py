@@ -37,31 +37,31 @@ class AutomaticLegs(LegCompletion):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._search: LegSearch | None = None
-        self._searched: LegConfig | None = None      # the settings of the search
+        self._search_settings: LegConfig | None = None      # the settings of the search
         self._counted_ns = 0                  # start of the leg whose metres are counted
         self._warned: set[str] = set()        # changes of the scale that were logged
         self._recording.tap = self._receive
 
     def tick(self) -> None:
         super().tick()
-        self._keep_search()
+        self._update_search()
         if self._search is not None and self._search.spans:
-            self._by_itself(self._search)
+            self._control_automatic_leg(self._search)
 
     def _receive(self, slot: str, block: Samples) -> None:
-        self._watch.feed(slot, block)
+        self._running_estimate.feed(slot, block)
         if self._search is not None:
             self._search.feed(slot, block, self._recording.inputs.form)
 
-    def _keep_search(self) -> None:
+    def _update_search(self) -> None:
         """Create the search for the settings in force; none without leg.automatic."""
         leg = self._config().leg
-        wanted = leg if leg.automatic else None
-        if wanted == self._searched:
+        settings = leg if leg.automatic else None
+        if settings == self._search_settings:
             return
-        before, self._searched = self._searched, wanted
-        self._search = LegSearch(self._config()) if wanted else None
-        if wanted and before is None:
+        before, self._search_settings = self._search_settings, settings
+        self._search = LegSearch(self._config()) if settings else None
+        if settings and before is None:
             self._load_carried()
 
     def _load_carried(self) -> None:
@@ -69,58 +69,58 @@ class AutomaticLegs(LegCompletion):
         found = stored_in(output_root(self._config(), self._node_name) / LATEST)
         if not found or not found.carried:
             return
-        why = _not_ours(found, self._config())
-        if why:
-            self._log.warning(f'{found.name} is not continued: {why}')
+        reason = _foreign_result_reason(found, self._config())
+        if reason:
+            self._log.warning(f'{found.name} is not continued: {reason}')
         else:
             self.session.carried = found.carried
             self._log.info(f'continues {found.name}: {found.carried.legs} legs, the last of '
                            f'{iso(found.carried.last_ns)}')
 
-    def _by_itself(self, search: LegSearch) -> None:
+    def _control_automatic_leg(self, search: LegSearch) -> None:
         session, span, newest = self.session, search.spans[0], search.spans[-1]
         if session.state is not State.RECORDING and newest.start_ns != self._counted_ns:
             self._counted_ns = newest.start_ns      # the leg before may still be computed
             self._recording.progress.begin_leg()
-        if session.state is State.FAILED and session.open_leg and session.by_itself:
+        if session.state is State.FAILED and session.open_leg and session.is_automatic:
             self._drop_leg(lost=session.trouble)
         elif session.state is State.RECORDING:
-            if session.by_itself and span.stop_ns:
+            if session.is_automatic and span.stop_ns:
                 search.spans.popleft()
                 self._end_leg(span.stop_ns)
-        elif not session.open_leg and not session.busy and not self._why_not():
+        elif not session.open_leg and not session.busy and not self._start_refusal():
             if span.start_ns < self._recording.newest_ns - self._config().leg.preroll * 1e9:
                 search.spans.popleft()      # its samples were dropped
             else:
-                self._begin_leg(span.start_ns, by_itself=True)
+                self._begin_leg(span.start_ns, is_automatic=True)
 
     def end_leg_now(self) -> None:
         """End the leg, by service or at its longest duration, as a leg of the operator."""
-        self.session.by_itself = False
+        self.session.is_automatic = False
         super().end_leg_now()
-        self._look_after(self.session.stop_ns, at_rest=False)
+        self._restart_search(self.session.stop_ns, at_rest=False)
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         super()._drop_leg(text, lost)
-        self._look_after(self._recording.newest_ns, at_rest=True)
+        self._restart_search(self._recording.newest_ns, at_rest=True)
 
     def _restart_after_jump(self) -> None:
         super()._restart_after_jump()
-        self._search = LegSearch(self._config()) if self._searched else None
+        self._search = LegSearch(self._config()) if self._search_settings else None
 
-    def _look_after(self, stamp_ns: int, at_rest: bool) -> None:
+    def _restart_search(self, stamp_ns: int, at_rest: bool) -> None:
         if self._search is not None:
             self._search.restart(stamp_ns, at_rest)
 
-    def _take_leg(self, done: worker.Computed | worker.LeftOut) -> None:
-        super()._take_leg(done)
+    def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
+        super()._handle_leg_result(done)
         for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
                 self._warned.add(reason.text)
                 self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')
 
 
-def _not_ours(found: Stored, config: Config) -> str:
+def _foreign_result_reason(found: Stored, config: Config) -> str:
     """Return the explanation why a result belongs to another vehicle or mounting, else empty."""
     if found.vehicle != config.vehicle:
         return f'it belongs to vehicle {found.vehicle!r}'
@@ -138,11 +138,11 @@ class Operation(AutomaticLegs):
 
     def start_leg(self) -> tuple[bool, str]:
         session, mark_ns = self.session, self._mark_ns()
-        if session.state is State.RECORDING and not session.by_itself:
+        if session.state is State.RECORDING and not session.is_automatic:
             return True, (f'recording since {iso(session.start_ns)}, leg '
                           f'{session.leg_id}; {answers.hint(self.view())}')
-        if why := self._why_not():
-            raise Refused(f'no leg can be started: {why}')
+        if reason := self._start_refusal():
+            raise Refused(f'no leg can be started: {reason}')
         if session.state is State.RECORDING:      # an automatic leg
             self._drop_leg(f'leg {session.leg_id} is replaced by a leg of the operator')
         return True, self._begin_leg(mark_ns)
@@ -177,7 +177,7 @@ class Operation(AutomaticLegs):
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             return self._last_result()
-        return self._computing.promise(worker.PATIENCE_S)
+        return self._computing.create_future(worker.PATIENCE_S)
 
     def _last_result(self) -> tuple[bool, str]:
         session, now = self.session, self.view()
@@ -185,12 +185,12 @@ class Operation(AutomaticLegs):
             raise Refused(now.lost)
         good = words(answers.quantities_ok(now))
         if session.calibration is not None:
-            success, text = answers.outcome(session.calibration, good=good,
-                                            advice=answers.after_result(now))
+            success, text = answers.result_answer(session.calibration, good=good,
+                                                  advice=answers.advice_after_result(now))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
             form = self._recording.inputs.form
-            return answers.restored(session.restored, form.scale_unit if form else '', good)
+            return answers.restored_answer(session.restored, form.scale_unit if form else '', good)
         raise Refused('no leg is running and there is no result yet: call ~/start_leg first')
 
     def cancel_leg(self) -> tuple[bool, str]:
@@ -215,11 +215,11 @@ class Operation(AutomaticLegs):
 
         def take(outcome: tuple[Calibration, worker.Paths]) -> None:
             self.session.settle(outcome[0])
-            self._take_result(*outcome)
+            self._publish_result(*outcome)
 
         self._computing.submit(
             partial(worker.recombine, left, self._config(), self.session.carried), take)
-        return self._computing.promise()
+        return self._computing.create_future()
 
     def reset(self) -> tuple[bool, str]:
         if self.session.state is State.FAILED and self.session.open_leg:
@@ -227,7 +227,7 @@ class Operation(AutomaticLegs):
         dropped = self.session.begin_reset()
         self._publishing.forget_restored()
         for leg in dropped:  # each is published as undone: a replay of the bag omits it too
-            self.session.dropped(leg)
+            self.session.note_undone(leg)
             self.show_status()
         self._publishing.set_results(None)
         self._publishing.show_paths(worker.leg_paths(None, self._config()))
@@ -239,4 +239,4 @@ class Operation(AutomaticLegs):
         if self.session.calibration is None:
             raise Refused('nothing to save: no leg has been computed yet; call ~/start_leg, '
                           'drive, ~/stop_leg')
-        return self._save(self.session.calibration, asked=True)
+        return self._save(self.session.calibration, by_operator=True)

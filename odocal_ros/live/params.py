@@ -122,14 +122,15 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
     """
     overrides = getattr(node, '_parameter_overrides', {})
     for topic in topics:
-        for policy, wanted in QOS.items():
+        for policy, allowed in QOS.items():
             name = f'qos_overrides.{topic}.subscription.{policy}'
             value = overrides[name].value if name in overrides else None
             number = policy == 'depth' and type(value) is int and 0 < value < 2**31
-            if value is not None and not number and value not in wanted:
-                want = f'one of {", ".join(wanted)}' if wanted else 'a whole number above 0'
-                raise BadConfig(f'{name}: {value!r} is not {want}; correct the parameter and '
-                                'restart')
+            if value is not None and not number and value not in allowed:
+                requirement = (f'one of {", ".join(allowed)}' if allowed else
+                               'a whole number above 0')
+                raise BadConfig(f'{name}: {value!r} is not {requirement}; correct the parameter '
+                                'and restart')
 
 
 def changed(config: Config, parameters: list[Parameter]) -> Config:
@@ -155,10 +156,11 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
 def fixed(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
     """Return the on-set callback of a node that reads settings of a kind only at start-up."""
     def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
-        ours = [p.name for p in parameters
-                if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
-        return msg.SetParametersResult(successful=not ours, reason=(
-            f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
+        own_parameters = [p.name for p in parameters
+                          if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
+        return msg.SetParametersResult(successful=not own_parameters, reason=(
+            f'{own_parameters[0]} is only read at start-up: restart the node with it')
+            if own_parameters else '')
     return refuse
 
 
@@ -170,18 +172,18 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
             'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
         value = node.declare_parameter(name, default, about).value
         kind = type(default)
-        whole = kind is float and type(value) is int
-        if type(value) is not kind and not whole:
+        is_whole = kind is float and type(value) is int
+        if type(value) is not kind and not is_whole:
             raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {TAKE}')
-        if whole:
+        if is_whole:
             node.set_parameters([Parameter(name, value=float(value))])
     kept = restored_from({name: node.get_parameter(name).value
                           for name in _result_defaults(estimates)}, estimates)
-    here = node.get_parameter('vehicle').value
-    if kept is not None and kept.vehicle and here and kept.vehicle != here:
+    vehicle = node.get_parameter('vehicle').value
+    if kept is not None and kept.vehicle and vehicle and kept.vehicle != vehicle:
         raise BadConfig(f"the result belongs to vehicle '{one_line(kept.vehicle)}', but this "
-                        f"node to '{one_line(here)}': give the calibration.yaml of this vehicle, "
-                        'or none')
+                        f"node to '{one_line(vehicle)}': give the calibration.yaml of this "
+                        'vehicle, or none')
     return kept
 
 

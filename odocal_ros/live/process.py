@@ -23,10 +23,10 @@ from rclpy.utilities import remove_ros_args
 from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live.console import PlainLog
-from odocal_ros.live.worker import hold_little
+from odocal_ros.live.worker import limit_kept_memory
 from odocal_ros.safe_io.text_formats import brief_line, error_text
 
-LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between searches for another node of the same name
+NAMESAKE_PERIOD_S = 5.0      # judgement: s between searches for another node of the same name
 
 
 class SettledNode(Node):
@@ -39,7 +39,7 @@ class SettledNode(Node):
             super().__init__(node_name or self.default_name, **kwargs)
             try:
                 self._build()
-                self._alone = self.steady_timer(LOOK_FOR_NAMESAKE_S, self._look_for_namesake)
+                self._namesake_timer = self.steady_timer(NAMESAKE_PERIOD_S, self._check_namesakes)
             except Exception:
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
@@ -56,11 +56,11 @@ class SettledNode(Node):
     def spin(self, executor: Executor) -> None:
         executor.spin()
 
-    def _look_for_namesake(self) -> None:
+    def _check_namesakes(self) -> None:
         """Log once if another node has the same name."""
         own = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own) > 1:
-            self._alone.cancel()
+            self._namesake_timer.cancel()
             self.get_logger().warning(
                 f'another node is called {self.get_fully_qualified_name()}: services, parameters '
                 'and topics conflict; stop one, or rename it with -r __node:=NAME')
@@ -78,26 +78,26 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
     Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and after printing help or
     version; 1 if it cannot start, with the cause in one line.
     """
-    hold_little()
+    limit_kept_memory()
     name = kind.default_name
     # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
     signal.signal(signal.SIGINT, lambda *_: None)
     try:
-        asked = remove_ros_args(args)[1:]
-        if {'-h', '--help'} & set(asked):
+        arguments = remove_ros_args(args)[1:]
+        if {'-h', '--help'} & set(arguments):
             print(about)
             return 0
-        if '--version' in asked:
+        if '--version' in arguments:
             print(f'odocal_ros {__version__}')
             return 0
-        if asked:
-            return complain(name, f'{asked[0]} is unknown: settings are ROS parameters after '
-                            f'--ros-args (see {name} --help)')
+        if arguments:
+            return print_error(name, f'{arguments[0]} is unknown: settings are ROS parameters '
+                               f'after --ros-args (see {name} --help)')
         _init(args)
     except Exception as error:
         text = error_text(error).split(', at /')[0]
-        return complain(name, f'{text}; write parameters as --ros-args -p name:=value, remaps as '
-                        '-r from:=to')
+        return print_error(name, f'{text}; write parameters as --ros-args -p name:=value, remaps '
+                           'as -r from:=to')
     executor, node, code = SingleThreadedExecutor(), None, 0
     try:
         node = kind()
@@ -106,10 +106,10 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
     except ExternalShutdownException:
         pass
     except OdocalError as error:
-        code = complain(name, str(error))
+        code = print_error(name, str(error))
     except Exception as error:
         # during a shutdown, the publisher of a callback may be destroyed already
-        code = complain(name, error_text(error)) if rclpy.ok() else 0
+        code = print_error(name, error_text(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
         if node is not None:
@@ -138,7 +138,7 @@ def _init(args: list[str] | None) -> None:
             os.close(stderr)
 
 
-def complain(name: str, text: str) -> int:
+def print_error(name: str, text: str) -> int:
     """Print the cause of a command's failure on stderr; return its exit code."""
     print(brief_line(f'{name}: {text}'), file=sys.stderr)
     return 1

@@ -21,8 +21,8 @@ from odocal_ros.calib.result import Calibration, wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
 from odocal_ros.live import answers, params
-from odocal_ros.live.answers import action_first
-from odocal_ros.live.console import losses_in_words
+from odocal_ros.live.answers import hint_action_first
+from odocal_ros.live.console import losses_text
 from odocal_ros.live.health import Health
 from odocal_ros.live.messages import LATCHED
 from odocal_ros.live.recording import Recording
@@ -38,10 +38,10 @@ SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fau
 # judgement: significant decimals
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
-    'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
+    'distance_to_minimum_m', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
     'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
-        'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
+        'required_scale_sigma_ppm': 1, 'required_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
 # results of the status, and the unit in their keys
 UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
          'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
@@ -61,18 +61,18 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'imu_rate_hz': now.rates_hz.get('imu', 0.0),
         'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': now.rates_hz.get('fix', 0.0),
-    } | {key: results[name] for key, name in VALUES.items()} | _of_wheels(now) | {
+    } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(now) | {
         'verdict': session.verdict(), 'hint': text, 'legs': legs,
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': now.restored,
         'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
-        'metres_to_least': answers.metres_to_go(now),
+        'distance_to_minimum_m': answers.metres_to_go(now),
         'seconds_to_stand': answers.seconds_to_stand(now),
-        'asked_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
-        'asked_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
+        'required_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
+        'required_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
         'manoeuvres': '; '.join(answers.manoeuvres(now)),
-        'can_tell': ', '.join(now.ability.can) if now.ability else '',
-        'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
+        'observable': ', '.join(now.ability.can) if now.ability else '',
+        'not_observable': '; '.join(now.ability.cannot) if now.ability else '',
         'messages_lost': sum(now.lost_messages.values()),
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'save_trouble': now.save_trouble, 'lost': now.lost,
@@ -82,10 +82,10 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
     } | _computing(now) | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
     return DiagnosticStatus(
         level=level(now), name=STATUS_NAME, message=sentence(now, text, ok), hardware_id='odocal',
-        values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
+        values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
 
 
-def _of_wheels(now: SessionView) -> dict[str, object]:
+def _wheel_factors(now: SessionView) -> dict[str, object]:
     """Return the keys of more than two wheels: factor and sigma of each by its name."""
     calibration = now.session.calibration
     estimates = calibration.estimates if calibration else {}
@@ -94,7 +94,7 @@ def _of_wheels(now: SessionView) -> dict[str, object]:
             for end, value in (('', estimates[name].value), ('_sigma', estimates[name].sigma))}
 
 
-def in_force(now: SessionView, name: str) -> float:
+def current_value(now: SessionView, name: str) -> float:
     """Return a value or sigma of the result, or of the running estimate until the leg has one."""
     if now.session.state is not State.RECORDING and now.forecast is None:
         return float(now.results[f'result.{name}'])
@@ -112,12 +112,13 @@ def level(now: SessionView) -> Any:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not now.received:
         return DiagnosticStatus.STALE
-    doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
-    doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
-                                or now.save_trouble or now.lost or now.faults
-                                or now.doubled or _changes(now.session)
-                                or now.session.unused and now.session.unused.code not in SHORT)
-    return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
+    has_warning = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
+    has_warning = has_warning or bool(now.missing or now.clocks or now.journal_trouble
+                                      or now.save_trouble or now.lost or now.faults
+                                      or now.duplicate_publishers or _changes(now.session)
+                                      or now.session.unused
+                                      and now.session.unused.code not in SHORT)
+    return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
 def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
@@ -126,7 +127,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
     legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
     if session.carried:
         legs += f' and {session.carried.legs} before'
-    seen = {
+    state_text = {
         'waiting': 'Waiting',
         'idle': 'Ready',
         'recording': f'Recording leg {session.leg_id}: {now.distance_m:.0f} m in '
@@ -137,14 +138,14 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
         'failed': f'Failed: {session.trouble}',
     }[now.state]
     if now.restored and session.state is State.IDLE:
-        seen += f', including the result restored from {now.restored}'
+        state_text += f', including the result restored from {now.restored}'
     good = '' if session.state is State.RECORDING else quantities.words(ok)
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
-                                   _unused(session), *now.doubled,
-                                   losses_in_words(now.lost_messages), *troubles)))
+    return '; '.join(filter(None, (state_text, *_changes(session), good, now.lost, text,
+                                   _unused(session), *now.duplicate_publishers,
+                                   losses_text(now.lost_messages), *troubles)))
 
 
 def _computing(now: SessionView) -> dict[str, object]:
@@ -159,8 +160,8 @@ def _changes(session: Session) -> list[str]:
 
 
 def _unused(session: Session) -> str:
-    why = session.unused
-    return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
+    reason = session.unused
+    return f'a leg was not used: {reason.code.name}: {reason.text}' if reason else ''
 
 
 def _automatic(now: SessionView) -> str:
@@ -168,7 +169,7 @@ def _automatic(now: SessionView) -> str:
         return ''
     if now.session.state is not State.RECORDING:
         return 'waiting'
-    return 'leg' if now.session.by_itself else 'started by the operator'
+    return 'leg' if now.session.is_automatic else 'started by the operator'
 
 
 def _reason_codes(now: SessionView) -> str:
@@ -178,7 +179,7 @@ def _reason_codes(now: SessionView) -> str:
     return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
 
-def _bare(value: object, places: int | None = None) -> str:
+def _value_text(value: object, places: int | None = None) -> str:
     """Return a value as text for PlotJuggler: a number without unit, in full or rounded."""
     if not isinstance(value, float):
         return str(value)
@@ -186,7 +187,7 @@ def _bare(value: object, places: int | None = None) -> str:
                 else round(float(value), places))
 
 
-def input_status(name: str, health: Health, why: str, needed: bool,
+def input_status(name: str, health: Health, missing_reason: str, needed: bool,
                  now_ns: int) -> DiagnosticStatus:
     """
     Return the health of one input for ``/diagnostics``.
@@ -195,8 +196,9 @@ def input_status(name: str, health: Health, why: str, needed: bool,
     needs the input. STALE is left to the aggregator, for nodes that no longer report.
     """
     rate, silent = health.rate_hz(now_ns), health.silent_s(now_ns)
-    if why:
-        status, message = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN, why
+    if missing_reason:
+        status = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN
+        message = missing_reason
     elif health.fix_status is not None and health.fix_status < 0:
         status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
     elif health.unusable:
@@ -213,7 +215,7 @@ def input_status(name: str, health: Health, why: str, needed: bool,
         values['fix_status'] = health.fix_status
     return DiagnosticStatus(
         level=status, name=name, message=message, hardware_id='odocal',
-        values=[KeyValue(key=k, value=_bare(v)) for k, v in values.items()])
+        values=[KeyValue(key=k, value=_value_text(v)) for k, v in values.items()])
 
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
@@ -232,11 +234,12 @@ class Publishing:
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
         self._hint = publish(String, '~/hint', LATCHED)
         self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
-        self._shown: dict[Publisher, str] = {}        # last message of each
+        self._last_messages: dict[Publisher, str] = {}        # last message of each
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
-        self._before = self.results()    # without kept legs: the restored result, or none
+        # published without kept legs: the restored result, or none
+        self._restored_results = self.results()
 
     def results(self) -> dict[str, Any]:
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}
@@ -247,7 +250,7 @@ class Publishing:
 
     def set_results(self, calibration: Calibration | None) -> None:
         """Set all ``result.*`` at once; None: to the restored result, if there is one."""
-        results = self._before
+        results = self._restored_results
         if calibration:
             stamp = date_text(iso(self._node.get_clock().now().nanoseconds))
             results = params.as_results(calibration, stamp,
@@ -260,7 +263,7 @@ class Publishing:
             self.setting_results = False
 
     def forget_restored(self) -> None:
-        self._before = dict(params.RESULTS)
+        self._restored_results = dict(params.RESULTS)
 
     def show_paths(self, messages: Paths) -> None:
         for publisher, message in zip(self._paths, messages, strict=True):
@@ -269,16 +272,16 @@ class Publishing:
     def show_status(self, now: SessionView) -> DiagnosticArray:
         array = self._array([calibration_status(now)])
         # the hint first: receivers of the status then have it
-        self._show(self._hint, String(data=action_first(now)))
+        self._show(self._hint, String(data=hint_action_first(now)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():
-            self._show(publisher, Float64(data=in_force(now, name)))
+            self._show(publisher, Float64(data=current_value(now, name)))
         return array
 
     def _show(self, publisher: Publisher, message: Float64 | String) -> None:
         """Publish a message if it differs from the last one; NaN equals NaN."""
-        if repr(message) != self._shown.get(publisher):
-            self._shown[publisher] = repr(message)
+        if repr(message) != self._last_messages.get(publisher):
+            self._last_messages[publisher] = repr(message)
             publisher.publish(message)
 
     def show_diagnostics(self, recording: Recording, config: Config) -> None:
@@ -288,7 +291,7 @@ class Publishing:
             node = node.lstrip('/')      # with its namespace, to separate vehicles
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
-            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
+            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.missing_reason(),
                          one in needed, time.monotonic_ns())
             for slot, one in recording.inputs.by_slot.items()
             if one in needed or slot in recording.inputs.topics]))

@@ -31,13 +31,13 @@ class Inputs:
     def __init__(self, node: Node, config: Config) -> None:
         self._node, self._needs_imu = node, config.odometer.needs_imu
         self.by_slot: dict[str, Input] = {}
-        for slot, allowed in _wanted(config).items():
-            one = self.by_slot[slot] = Input(node, slot, allowed)
-            one.check(config)
+        for slot, allowed in _used_inputs(config).items():
+            source = self.by_slot[slot] = Input(node, slot, allowed)
+            source.check(config)
         self._check_reference()
-        for one in self.by_slot.values():
-            if len(one.allowed) == 1:  # one fixed type: errors are raised at the start
-                one.subscribe(one.allowed[0], config)
+        for source in self.by_slot.values():
+            if len(source.allowed) == 1:  # one fixed type: errors are raised at the start
+                source.subscribe(source.allowed[0], config)
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
@@ -49,13 +49,13 @@ class Inputs:
 
     def update(self, config: Config) -> None:
         """Add the topics that the configuration uses, and search for publishers."""
-        for slot, allowed in _wanted(config).items():
+        for slot, allowed in _used_inputs(config).items():
             if slot not in self.by_slot:
                 self.by_slot[slot] = Input(self._node, slot, allowed)
-        for one in self.by_slot.values():
-            one.look()
-            if not one.flowing():
-                one.find(config)
+        for source in self.by_slot.values():
+            source.update_publishers()
+            if not source.is_flowing():
+                source.find_type(config)
 
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""
@@ -81,26 +81,28 @@ class Inputs:
 
     def missing(self, config: Config) -> list[str]:
         """Return the causes that prevent a leg, one line per missing topic."""
-        return [one.why() for one in self.required(config) if not one.flowing()]
+        return [source.missing_reason() for source in self.required(config)
+                if not source.is_flowing()]
 
     def begin_leg(self) -> None:
         """Start a new count of lost messages."""
-        for one in self.by_slot.values():
-            one.health.lost_before = one.health.lost
+        for source in self.by_slot.values():
+            source.health.lost_before = source.health.lost
 
     def lost(self) -> dict[str, int]:
         """Return topic -> messages lost since the last leg began, or since the start."""
-        return {one.topic: one.health.lost - one.health.lost_before
-                for one in self.by_slot.values()}
+        return {source.topic: source.health.lost - source.health.lost_before
+                for source in self.by_slot.values()}
 
-    def doubled(self) -> list[str]:
-        return list(filter(None, (one.doubled() for one in self.by_slot.values())))
+    def duplicate_publishers(self) -> list[str]:
+        return list(filter(None,
+                           (source.duplicate_publishers() for source in self.by_slot.values())))
 
     @property
     def topics(self) -> dict[str, str]:
         """Return slot -> topic of the subscribed inputs; the IMU only if needed or published."""
-        return {slot: one.topic for slot, one in self.by_slot.items()
-                if one.reader is not None and not (slot == 'imu' and self.without_imu)}
+        return {slot: source.topic for slot, source in self.by_slot.items()
+                if source.reader is not None and not (slot == 'imu' and self.without_imu)}
 
     @property
     def form(self) -> OdometerForm | None:
@@ -115,7 +117,7 @@ class Inputs:
         return right.reader.form if right and right.reader else None
 
 
-def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
+def _used_inputs(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
     by_marks = bool(config.reference.points)    # the positions are those of marks
     return {slot: types_of(slot, config.odometer) for slot in config.inputs
@@ -131,11 +133,11 @@ class Recording:
     """
 
     def __init__(self, node: Node, config: Config,
-                 remember: Callable[[Input | StaticTransforms, list[bytes], list[int]], None]
+                 store_messages: Callable[[Input | StaticTransforms, list[bytes], list[int]], None]
                  ) -> None:
         self.inputs = Inputs(node, config)
         self.recorder = LegRecorder()
-        self._remember = remember
+        self._store_messages = store_messages
         self.tap: Callable[[str, Samples], None] | None = None  # also receives every block
         self._clock = node.get_clock()
         self.progress = self._no_progress()
@@ -156,7 +158,7 @@ class Recording:
             if raws:
                 for slot, block in static.decode(raws, sent_ns):
                     self.recorder.feed(slot, block)
-                self._remember(static, raws, sent_ns)
+                self._store_messages(static, raws, sent_ns)
         for source in self.inputs.by_slot.values():
             raws, sent_ns = source.take()
             if not raws:
@@ -166,18 +168,18 @@ class Recording:
                 self.recorder.feed(slot, block)
                 if slot == 'imu_other':
                     continue
-                if not source.sound.all():     # the recorder has all: the pipeline screens
-                    block = take(block, source.sound)
-                self._show(slot, block, config, found_scale)
+                if not source.plausible.all():     # the recorder has all: the pipeline screens
+                    block = take(block, source.plausible)
+                self._distribute(slot, block, config, found_scale)
             if not self.time_jumped:     # after a jump: no sample of an earlier leg
-                self._remember(source, raws, sent_ns)
+                self._store_messages(source, raws, sent_ns)
 
     def add_marks(self, block: FixSamples, config: Config) -> None:
         """Add the positions of a mark like those of a topic."""
         self.recorder.feed('fix', block)
-        self._show('fix', block, config, 0.0)
+        self._distribute('fix', block, config, 0.0)
 
-    def _show(self, slot: str, block: Samples, config: Config, found_scale: float) -> None:
+    def _distribute(self, slot: str, block: Samples, config: Config, found_scale: float) -> None:
         self.progress.feed(slot, block, config, self.inputs.form, found_scale)
         if self.tap is not None:
             self.tap(slot, block)
@@ -191,13 +193,13 @@ class Recording:
         """Drop samples older than the pre-roll of a leg from ``start_ns``, 0: from now."""
         # by the topic's own stamps: a topic on another clock must not grow without limit
         for source in self.inputs.by_slot.values():
-            slots = (source.slot, *self._beside(source))
+            slots = (source.slot, *self._additional_slots(source))
             if source.health.newest_ns:
                 since_ns = min(source.health.newest_ns, start_ns or source.health.newest_ns)
                 self.recorder.forget_before(
                     since_ns - round((preroll_s + PREROLL_MARGIN_S) * 1e9), slots)
 
-    def _beside(self, source: Input) -> tuple[str, ...]:
+    def _additional_slots(self, source: Input) -> tuple[str, ...]:
         """Return the other slots that the messages of a topic fill: more wheels, other IMUs."""
         if source.slot == 'imu':
             return ('imu_other',)
@@ -209,9 +211,9 @@ class Recording:
         """Return the newest stamp of the leading topic, by which marks are set; 0 without one."""
         return self.inputs.leading.newest_ns
 
-    def passed(self, mark_ns: int) -> bool:
+    def has_passed(self, mark_ns: int) -> bool:
         """Return True if every topic with messages has passed a mark."""
-        newest = [one.health.newest_ns for one in self.inputs.by_slot.values()]
+        newest = [source.health.newest_ns for source in self.inputs.by_slot.values()]
         return not any(0 < stamp_ns <= mark_ns for stamp_ns in newest)
 
     def snapshot(self) -> LegRecorder:
@@ -233,7 +235,7 @@ class Recording:
         self.progress = self._no_progress()
         for source in self.inputs.by_slot.values():
             source.take()
-            source.health.forget()
+            source.health.reset_times()
 
     def two_wheels(self) -> bool:
         """Return True if there are two wheels, known as left and right."""
@@ -248,14 +250,16 @@ class Recording:
 
     def rates_hz(self) -> dict[str, float]:
         now_ns = time.monotonic_ns()
-        return {slot: one.health.rate_hz(now_ns) for slot, one in self.inputs.by_slot.items()}
+        return {slot: source.health.rate_hz(now_ns) for slot,
+                source in self.inputs.by_slot.items()}
 
     def received(self) -> bool:
-        return any(one.health.received_ns for one in self.inputs.by_slot.values())
+        return any(source.health.received_ns for source in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
         """Return the time from the last IMU message to the newest of all, s; 0 without an IMU."""
-        received_ns = {slot: one.health.received_ns for slot, one in self.inputs.by_slot.items()}
+        received_ns = {slot: source.health.received_ns for slot,
+                       source in self.inputs.by_slot.items()}
         silent_ns = max(received_ns.values()) - received_ns['imu']
         return 0.0 if self.inputs.without_imu else max(0, silent_ns) * 1e-9
 

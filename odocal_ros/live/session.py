@@ -89,7 +89,7 @@ class Session:
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
         self.trouble = ''
         self.lost = ''      # why the last leg was dropped automatically
-        self.by_itself = False      # leg.automatic started the last leg
+        self.is_automatic = False      # leg.automatic started the last leg
         self.unused: Reason | None = None      # why the last automatic leg is not used
         self.carried: Carried | None = None    # information of released and earlier legs
         self.marks: list[FloorMark] = []       # since the pre-roll of the last leg
@@ -106,7 +106,7 @@ class Session:
         closed = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
         return self.state is State.RECORDING or closed
 
-    def start(self, mark_ns: int, config: Config, by_itself: bool = False) -> None:
+    def start(self, mark_ns: int, config: Config, is_automatic: bool = False) -> None:
         """Open a leg at a mark, under the configuration in force."""
         if self.state is State.COMPUTING:
             raise Refused(f'leg {self.leg_id} is being computed: call again when its result is on '
@@ -116,7 +116,7 @@ class Session:
                           'again, or drop it with ~/cancel_leg')
         self._last_id += 1
         self.leg_id, self.start_ns, self.stop_ns = self._last_id, mark_ns, 0
-        self.config, self.by_itself = config, by_itself
+        self.config, self.is_automatic = config, is_automatic
         self.state, self.event, self.trouble = State.RECORDING, 'started', ''
         self.lost = ''
         first_ns = mark_ns - round(config.leg.preroll * 1e9)
@@ -155,12 +155,12 @@ class Session:
         self.unused = None
         self.settle(calibration)
 
-    def leave_out(self, why: Reason) -> None:
+    def drop_unusable(self, why: Reason) -> None:
         """Drop the computed automatic leg, which is not usable."""
         self.event, self.unused = 'cancelled', why
         self.settle(self.calibration)
 
-    def carry_on(self, carried: Carried | None, legs: int) -> None:
+    def set_carried(self, carried: Carried | None, legs: int) -> None:
         """Release the first kept legs: their information is carried over."""
         self.carried, self.legs = carried, self.legs[legs:]
 
@@ -183,7 +183,7 @@ class Session:
                           'before ~/undo_leg')
         if not self.legs:
             raise Refused('no leg to undo')
-        self.dropped(self.legs.pop())
+        self.note_undone(self.legs.pop())
         self.lost = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None
@@ -194,13 +194,13 @@ class Session:
         if self.busy:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
                           'before ~/reset')
-        dropped, self.legs = self.legs, []
+        note_undone, self.legs = self.legs, []
         self.calibration, self.state, self.trouble = None, State.IDLE, ''
         self.restored, self.lost = None, ''
         self.carried = self.unused = None
-        return dropped
+        return note_undone
 
-    def dropped(self, leg: KeptLeg) -> None:
+    def note_undone(self, leg: KeptLeg) -> None:
         self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
         self.event = 'undone'
 
@@ -232,7 +232,7 @@ class SessionView:
     session: Session
     config: Config
     missing: list[str] = field(default_factory=list)
-    doubled: list[str] = field(default_factory=list)     # topics with several publishers
+    duplicate_publishers: list[str] = field(default_factory=list)     # texts, one per topic
     lost_messages: dict[str, int] = field(default_factory=dict)      # topic -> since the leg began
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)

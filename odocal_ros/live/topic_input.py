@@ -30,8 +30,8 @@ from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
 from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config
 
-MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
-LOOK_AROUND_S = 1.0     # judgement: between two searches for publishers
+MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
+SEARCH_PERIOD_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: publishers of static transforms
 Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
@@ -81,12 +81,12 @@ class Input:
         self.reader: Reader | None = None
         self.health = Health()
         self.trouble = ''
-        self.sound = np.empty(0, bool)    # rows of the last block with a plausible stamp
+        self.plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
         self.frame = ''        # of the IMU's header, once a message has come
         self.publishers: list[TopicEndpointInfo] = []
-        self.meant: list[str] = []     # suggested topics if this one has no publisher
+        self.suggestions: list[str] = []     # suggested topics if this one has no publisher
         self._failed = 0
-        self._unseen: list[Reading] = []     # stamps and arrivals not yet in ``health``
+        self._unreported: list[Reading] = []     # stamps and arrivals not yet in ``health``
         self._frame_id = ''
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
@@ -99,42 +99,43 @@ class Input:
             message_class(self.allowed[0])
             make_reader(self.slot, self.allowed[0], config)
 
-    def look(self) -> None:
+    def update_publishers(self) -> None:
         """Update clock and publishers, and without any the suggested topics."""
         self.waiting.follow_clock()
-        self._see()
+        self._update_health()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
-        self.meant = [] if self.publishers else self._same()
+        self.suggestions = [] if self.publishers else self._suggested_topics()
 
-    def _same(self) -> list[str]:
+    def _suggested_topics(self) -> list[str]:
         """Return published topics of a suitable type, the most similar name first."""
-        wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
+        usable = set(self.allowed or TYPES)
+        own_topics = {p.topic_name for p in self._node.publishers}
         if self.slot == 'fix':      # most contain the wheel odometry
-            wanted -= {'nav_msgs/msg/Odometry', TRANSFORMS}
+            usable -= {'nav_msgs/msg/Odometry', TRANSFORMS}
         names = [name for name, types in self._node.get_topic_names_and_types()
-                 if wanted & set(types) and name not in own
+                 if usable & set(types) and name not in own_topics
                  and self._node.count_publishers(name)]
         # many types may be an odometer: only similar names
-        return difflib.get_close_matches(self.topic, names, MOST_TOPICS_MEANT,
+        return difflib.get_close_matches(self.topic, names, MOST_SUGGESTIONS,
                                          0.0 if self.allowed else NAME_SIMILARITY)
 
-    def doubled(self) -> str:
+    def duplicate_publishers(self) -> str:
         """Return a warning of several publishers or IMUs on the topic, empty without."""
         frames = self.reader.frames if self.reader is not None else None
         if frames is not None and frames.other and not self._frame_id:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
                     f'{one_line(frames.other)!r}): set imu.frame_id to the one to use')
-        mixed = [p for p in self.publishers if p.topic_type == self.msgtype]
-        if len(mixed) < 2:
+        same_type = [p for p in self.publishers if p.topic_type == self.msgtype]
+        if len(same_type) < 2:
             return ''
         # a node's name is discovered after its topics
-        who = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
-                               else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
-                               for p in mixed))
-        return (f'{self.topic} has {len(mixed)} publishers ({who}): their messages are mixed; '
-                'stop all but one')
+        names_text = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
+                                      else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+                                      for p in same_type))
+        return (f'{self.topic} has {len(same_type)} publishers ({names_text}): their messages are '
+                'mixed; stop all but one')
 
-    def find(self, config: Config) -> None:
+    def find_type(self, config: Config) -> None:
         """Subscribe once the type is known."""
         if self.reader is not None:
             return
@@ -182,7 +183,7 @@ class Input:
         """Return the messages since the last call, and their send times, ns."""
         raws, sent_ns, numbers = self.waiting.take()
         if raws:
-            self.health.arrived(numbers, time.monotonic_ns())
+            self.health.register_arrival(numbers, time.monotonic_ns())
         return raws, sent_ns
 
     def decode(self, raws: list[bytes], received_ns: list[int],
@@ -191,7 +192,7 @@ class Input:
         pairs = self._read(self.reader.rows if self.reader else None, raws, received_ns)
         for slot, block in pairs:
             if slot == self.slot:
-                self.sound = np.array(self.health.decoded(
+                self.plausible = np.array(self.health.check_stamps(
                     block.stamp_ns.tolist(), block.received_ns, max_gap_s), bool)
                 if isinstance(block, FixSamples) and len(block.status):
                     self.health.fix_status = int(block.status[-1])
@@ -202,17 +203,17 @@ class Input:
         """Return (slot, rows in plain numbers) pairs of a few messages, as ``decode``."""
         pairs = self._read(self.reader.readings if self.reader else None, raws, received_ns)
         for slot, rows in pairs:
-            self._unseen += [row[:2] for row in rows] if slot == self.slot else []
-        if len(self._unseen) > HEALTH_ROWS:
-            self._see()
+            self._unreported += [row[:2] for row in rows] if slot == self.slot else []
+        if len(self._unreported) > HEALTH_ROWS:
+            self._update_health()
         return pairs
 
-    def _see(self) -> None:
+    def _update_health(self) -> None:
         """Update the health by the readings since the last time."""
-        if self._unseen:
-            stamps, received = zip(*self._unseen, strict=True)
-            self.health.decoded(list(stamps), received)
-            self._unseen = []
+        if self._unreported:
+            stamps, received = zip(*self._unreported, strict=True)
+            self.health.check_stamps(list(stamps), received)
+            self._unreported = []
 
     def _read(self, read: Read | None, raws: list[bytes],
               received_ns: list[int]) -> list[tuple[str, Any]]:
@@ -237,23 +238,24 @@ class Input:
     def newest_ns(self) -> int:
         return self.health.newest_ns
 
-    def flowing(self) -> bool:
-        return self.health.flowing(time.monotonic_ns())
+    def is_flowing(self) -> bool:
+        return self.health.is_flowing(time.monotonic_ns())
 
-    def why(self) -> str:
+    def missing_reason(self) -> str:
         """Return the reason why no usable message arrives, as text; empty if one does."""
         silent = self.health.silent_s(time.monotonic_ns())
-        if self.flowing():
+        if self.is_flowing():
             return ''
         if self.trouble:
             return self.trouble
         if self.health.stampless:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
-            meant = f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''
+            names = ' or '.join(self.suggestions)
+            suggestions = f' (did you mean {names}?)' if names else ''
             return f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found' + (
                 f', silent for {silent:.0f} s; restart the driver' if self.health.received_ns else
-                f'; start the driver or remap {self.name}{meant}')
+                f'; start the driver or remap {self.name}{suggestions}')
         types = {p.topic_type for p in self.publishers}
         if self.msgtype and self.msgtype not in types:
             return (f'{self.topic} is published as {", ".join(sorted(types))}; required: '
@@ -261,8 +263,9 @@ class Input:
                     + ', or restart the node' * (len(self.allowed) != 1))
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
-        many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
+        publishers_text = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
         if not self.health.received_ns:
-            return f'{self.topic}: {many} found ({offers}) but no message yet; check the driver'
-        return (f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: {many} found; '
-                'check the driver')
+            return (f'{self.topic}: {publishers_text} found ({offers}) but no message yet; check '
+                    'the driver')
+        return (f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: '
+                f'{publishers_text} found; check the driver')

@@ -43,24 +43,24 @@ def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
                        Text(rates, style='dim')), title=name, border_style=colour)
 
 
-def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
+def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     """Return the progress towards each limit: label -> (0 to 1, text)."""
     if status.get('state') == 'computing':
         return {}      # passes are in the hint, since their total is unknown
-    driven, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
-    stand = number(status, 'seconds_to_stand')
-    found = {}
-    if driven + lacks > 0:      # a leg
-        found['path'] = driven / (driven + lacks), f'{lacks:.0f} m to go'
-    found['standstill'] = 1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go'
+    driven, missing_m = number(status, 'distance_m'), number(status, 'distance_to_minimum_m')
+    standstill_s = number(status, 'seconds_to_stand')
+    bars = {}
+    if driven + missing_m > 0:      # a leg
+        bars['path'] = driven / (driven + missing_m), f'{missing_m:.0f} m to go'
+    bars['standstill'] = 1 - standstill_s / REST_FORESEEN_S, f'{standstill_s:.0f} s to go'
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
-        asked = number(status, f'asked_{name}_sigma_{unit}')
+        required = number(status, f'required_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
         # a sigma falls with the path length or its root: the ratio to the limit is a rough measure
-        share = min(asked / sigma, 1.0) if sigma > 0 else 0.0
-        known = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
-        found[name] = share, f'{known}, limit {three_digits(asked)} {unit}'
-    return found
+        share = min(required / sigma, 1.0) if sigma > 0 else 0.0
+        sigma_text = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
+        bars[name] = share, f'{sigma_text}, limit {three_digits(required)} {unit}'
+    return bars
 
 
 def _of_result(status: dict[str, str]) -> dict[str, float]:
@@ -82,10 +82,11 @@ def number(status: dict[str, str], key: str) -> float:
 
 def _bars(status: dict[str, str]) -> Table:
     grid = Table.grid(padding=(0, 1))
-    for label, (share, words) in shares(status).items():
-        full = share >= 1.0
+    for label, (share, text) in progress_shares(status).items():
+        is_reached = share >= 1.0
         grid.add_row(label, ProgressBar(1.0, max(share, 0.0), width=40, complete_style=(
-            'green' if full else 'yellow'), finished_style='green'), 'OK' if full else words)
+            'green' if is_reached else 'yellow'), finished_style='green'), 'OK' if is_reached
+            else text)
     return grid
 
 
@@ -94,11 +95,11 @@ def _values(status: dict[str, str]) -> str:
     prefix = 'estimate_' if state in ('recording', 'computing') else ''
     keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),
             ('yaw', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad', degrees(1), ' deg'))
-    said = [f'{label} {with_sigma(found, number(status, prefix + sigma) or None, factor)}{unit}'
-            for label, value, sigma, factor, unit in keys
-            if (found := number(status, prefix + value))]
-    provisional = 'provisional: ' if state == 'computing' and said else ''
-    return provisional + ('   '.join(said) or 'no value yet')
+    texts = [f'{label} {with_sigma(bars, number(status, prefix + sigma) or None, factor)}{unit}'
+             for label, value, sigma, factor, unit in keys
+             if (bars := number(status, prefix + value))]
+    provisional = 'provisional: ' if state == 'computing' and texts else ''
+    return provisional + ('   '.join(texts) or 'no value yet')
 
 
 MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100

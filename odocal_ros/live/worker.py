@@ -65,7 +65,7 @@ class Computed:
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class UnusedLeg:
     """Result of an unused automatic leg, and the cause."""
 
     results: tuple[LegResult, ...]
@@ -74,20 +74,22 @@ class LeftOut:
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
             kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
-            by_itself: bool = False, progress: Callable[[Stage], None] | None = None,
-            ) -> Computed | LeftOut:
+            is_automatic: bool = False, progress: Callable[[Stage], None] | None = None,
+            ) -> Computed | UnusedLeg:
     """Return a leg's result, its combination with the kept legs, and the paths to publish."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
-    if by_itself and (why := refusal(results[0])):
-        return LeftOut(results, why)
-    paths = leg_paths(max(results, key=lambda one: one.distance), config)
-    folded = max(0, len(kept) + 1 - (LEGS_HELD if by_itself else MARKED_LEGS_HELD))
-    before, carried = carried, fold([one for leg in kept[:folded] for one in leg], config, carried)
-    if carried is before and not by_itself:      # two-point results carry nothing: all are kept
+    if is_automatic and (why := refusal(results[0])):
+        return UnusedLeg(results, why)
+    paths = leg_paths(max(results, key=lambda result: result.distance), config)
+    folded = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
+    carried_before, carried = carried, fold([result for leg in kept[:folded] for result in leg],
+                                            config, carried)
+    # two-point results carry nothing: all are kept
+    if carried is carried_before and not is_automatic:
         folded = 0
-    left = [one for leg in kept[folded:] for one in leg]
-    calibration = combine([*left, *results], config, carried, known_imu(config))
+    current = [result for leg in kept[folded:] for result in leg]
+    calibration = combine([*current, *results], config, carried, known_imu(config))
     return Computed(results, paths, calibration, carried, folded)
 
 
@@ -156,18 +158,18 @@ class Worker:
             except Exception as error:
                 self._done.put((then, None, error))
             del entry, job, then      # release the job's leg now, not at the next job
-            give_back()
+            release_memory()
             self._jobs.task_done()
 
 
-def hold_little() -> None:
+def limit_kept_memory() -> None:
     """Limit the freed memory that is kept; no effect if the C library has no such options."""
     if hasattr(_libc, 'mallopt'):
         for option, value in OPTIONS.items():
             _libc.mallopt(option, value)
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Return free pages to the system; no effect if the C library cannot."""
     if hasattr(_libc, 'malloc_trim'):
         _libc.malloc_trim(0)
@@ -192,7 +194,7 @@ class Computing:
     def report(self, stage: Stage) -> None:
         """Store the progress of the job; called by the worker's thread."""
         self.at = stage
-        give_back()      # memory of the pass before
+        release_memory()      # memory of the pass before
 
     def submit(self, job: Job, take: Callable[[Any], object]) -> None:
         """Run a job in the worker and hand its result to ``take``."""
@@ -206,12 +208,12 @@ class Computing:
             try:
                 if error is None:
                     take(result)
-            except Exception as wrong:      # so that waiting callers are answered
+            except Exception as failure:      # so that waiting callers are answered
                 if not self._alive():
                     raise
-                error = wrong
+                error = failure
             if error is not None:
-                self._failed(answers.one_line(error))
+                self._failed(answers.error_line(error))
             self._done()
 
         self._worker.submit(job, then)
@@ -219,7 +221,7 @@ class Computing:
     def drop(self) -> None:
         self._job = None
 
-    def promise(self, patience_s: float = math.inf) -> Future:
+    def create_future(self, patience_s: float = math.inf) -> Future:
         """Return a future that the next ``answer`` or ``answer_late`` completes."""
         future = Future()
         self._waiting.append((future, time.monotonic() + patience_s))
@@ -233,7 +235,7 @@ class Computing:
     def answer_late(self, text: Callable[[], str]) -> None:
         """Answer callers whose waiting time is over; the job continues."""
         now = time.monotonic()
-        late = [future for future, until in self._waiting if until <= now]
-        self._waiting = [one for one in self._waiting if one[1] > now]
-        for future in late:
+        expired = [future for future, until in self._waiting if until <= now]
+        self._waiting = [result for result in self._waiting if result[1] > now]
+        for future in expired:
             future.set_result((True, text()))

@@ -238,8 +238,8 @@ def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
 # answers
 
 def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
-    success, text = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), (), 0,
-                                    'OK: scale; not OK: yaw', 'drive another leg')
+    success, text = answers.result_answer(result(None, Code.YAW_FAR_FROM_NOMINAL), (), 0,
+                                          'OK: scale; not OK: yaw', 'drive another leg')
     assert success
     assert text == (
         'caution: scale factor 1.00000 ± 0.00010, left 1.00000 ± 0.00020, right 1.00000 ± '
@@ -248,7 +248,7 @@ def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
         'seen. Check imu.mounting_rpy, imu.nominal_yaw and the heading source. Next: drive '
         'another leg')
     remedy = Code.YAW_FAR_FROM_NOMINAL.remedy
-    again = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), advice=remedy)[1]
+    again = answers.result_answer(result(None, Code.YAW_FAR_FROM_NOMINAL), advice=remedy)[1]
     assert again.count(remedy) == 1
 
 

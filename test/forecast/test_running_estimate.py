@@ -14,7 +14,7 @@ from odocal_ros.data.samples import take
 from odocal_ros.forecast.forecast import Forecast, Prospect
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.live import running_estimate as watch
-from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
+from odocal_ros.live.running_estimate import UPDATE_PERIOD_NS, RunningEstimate
 from odocal_ros.live.worker import Worker
 
 pytestmark = pytest.mark.slow
@@ -31,19 +31,19 @@ class Log:
 
 def watched(drive, config, worker, log):
     leg = drive.leg()
-    recorder, look = LegRecorder(), RunningEstimate(worker, log)
+    recorder, estimate = LegRecorder(), RunningEstimate(worker, log)
     recorder.form = leg.form
     half = leg.start_ns + 150 * SECOND
     for slot in ('imu', 'odometer', 'fix'):
         rows = leg.rows(slot)
         recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
-    look.begin(recorder, leg.start_ns, config)
+    estimate.begin(recorder, leg.start_ns, config)
     for slot in ('imu', 'odometer', 'fix'):
         rows = leg.rows(slot)
         for first_ns in range(leg.start_ns, half, 10 * SECOND):
-            look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
-                                 & (rows.stamp_ns <= first_ns + 10 * SECOND)))
-    return look, half
+            estimate.feed(slot, take(rows, (rows.stamp_ns > first_ns)
+                                     & (rows.stamp_ns <= first_ns + 10 * SECOND)))
+    return estimate, half
 
 
 def finished(worker):
@@ -65,16 +65,16 @@ def worker():
 
 def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
     log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(drive.leg().start_ns + LOOK_PERIOD_NS - 1)
+    estimate, now_ns = watched(drive, config, worker, log)
+    estimate.update(drive.leg().start_ns + UPDATE_PERIOD_NS - 1)
     finished(worker)
-    assert look.forecast is None                      # too early
-    look.look(now_ns)
+    assert estimate.forecast is None                      # too early
+    estimate.update(now_ns)
     finished(worker)
     expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
     assert log.lines == []
-    assert look.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
-    assert look.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
+    assert estimate.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
+    assert estimate.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
 
 
 def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypatch):
@@ -83,28 +83,28 @@ def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypa
 
     monkeypatch.setattr(watch, 'forecast_of', fail)
     log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(now_ns)
+    estimate, now_ns = watched(drive, config, worker, log)
+    estimate.update(now_ns)
     finished(worker)
-    assert look.forecast is None
+    assert estimate.forecast is None
     line, = log.lines
     assert 'a bug' in line
     monkeypatch.undo()
-    look.look(now_ns + LOOK_PERIOD_NS)
+    estimate.update(now_ns + UPDATE_PERIOD_NS)
     finished(worker)
-    assert look.forecast is not None
+    assert estimate.forecast is not None
 
 
 def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
     log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(now_ns)
-    look.end()
+    estimate, now_ns = watched(drive, config, worker, log)
+    estimate.update(now_ns)
+    estimate.end()
     finished(worker)
-    assert (look.forecast, log.lines) == (None, [])
-    look.look(now_ns + LOOK_PERIOD_NS)
+    assert (estimate.forecast, log.lines) == (None, [])
+    estimate.update(now_ns + UPDATE_PERIOD_NS)
     finished(worker)
-    assert look.forecast is None
+    assert estimate.forecast is None
 
 
 def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
@@ -117,11 +117,11 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
     monkeypatch.setattr(watch, '_look', dear)
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
     monkeypatch.setattr(watch, 'time', clock)
-    look, now_ns = watched(drive, config, worker, Log())
+    estimate, now_ns = watched(drive, config, worker, Log())
     for _ in range(320):
         clock.now += 1.0
-        now_ns += LOOK_PERIOD_NS
-        look.look(now_ns)
+        now_ns += UPDATE_PERIOD_NS
+        estimate.update(now_ns)
         finished(worker)
     # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
     assert len(looks) == 7

@@ -100,10 +100,10 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
     """
     with playing_to(driven, {'output.directory': folder} | settings, 3 * SPEED) as leg:
         leg.record(BEFORE_S, START_S, LAST_S)
-        asked, begin = leg.client.ask('stop_leg'), time.monotonic()
+        call, begin = leg.client.ask('stop_leg'), time.monotonic()
         leg.play(LAST_S, LAST_S + 2)
         if stage == 'save':
-            leg.client.result(asked)
+            leg.client.result(call)
             leg.client.ask('save')
             begin = time.monotonic()
         time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))

@@ -184,10 +184,10 @@ class Drive:
 
     def ended(self, stop_s: float, after_s: float = 2.0):
         """Stop a leg and play on for a while; return the answer with the result."""
-        asked = self.client.ask('stop_leg')
+        call = self.client.ask('stop_leg')
         self.client.until(state='computing')
         self.play(stop_s, stop_s + after_s)
-        return self.client.result(asked)
+        return self.client.result(call)
 
     def stopped(self, stop_s: float, after_s: float = 2.0) -> SimpleNamespace:
         """Stop a leg; return the answer, and what ``written`` does."""

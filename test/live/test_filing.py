@@ -33,9 +33,9 @@ def filing():
     filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
                     lambda: None, '/calibrator')
 
-    def run(calibration, folder, asked=True):
+    def run(calibration, folder, by_operator=True):
         config = with_settings(Config(), {'output.directory': str(folder)})
-        future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, asked)
+        future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, by_operator)
         wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
         return future.result()
     yield SimpleNamespace(worker=worker, filing=filing, said=said, save=run)
@@ -45,8 +45,8 @@ def filing():
 @pytest.fixture
 def save(filing, tmp_path):
     """Return a function that saves a calibration and returns the answer and where latest is."""
-    def run(calibration, asked=True):
-        success, text = filing.save(calibration, tmp_path, asked)
+    def run(calibration, by_operator=True):
+        success, text = filing.save(calibration, tmp_path, by_operator)
         assert success
         saved = filing.filing.saved
         assert saved in text
@@ -66,9 +66,9 @@ def test_what_cannot_be_saved_is_a_warning_until_it_is(filing, tmp_path):
 
 
 def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
-    assert save(GOOD, asked=False)[1]
+    assert save(GOOD, by_operator=False)[1]
     for _ in range(2):
-        assert not save(BAD, asked=False)[1]
+        assert not save(BAD, by_operator=False)[1]
     assert not save(BAD)[1]
     assert not save(Calibration(BAD.reasons, {}, {}, ()))[1]        # another result
     text, latest = save(BAD)
@@ -164,7 +164,7 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
         folder = tmp_path / f'2026-05-{day:02}T09-12-00Z'
         folder.mkdir()
         of[folder.name] = made
-        folders.file(folder, day, False)
+        folders.point_latest(folder, day, False)
         folders.prune(folder, 0)
     (tmp_path / 'journal').mkdir()
     assert len(list(tmp_path.glob('2026*'))) == 8        # 0: all
@@ -176,19 +176,19 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
 
 
 def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
-    ResultFolders().file(make('old'), 1, False)
+    ResultFolders().point_latest(make('old'), 1, False)
     folders = ResultFolders()
-    assert folders.file(make('bad'), 2, False) == 'it is rejected'
+    assert folders.point_latest(make('bad'), 2, False) == 'it is rejected'
     assert latest(tmp_path) == Path('old')
 
 
 def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
-    ResultFolders().file(make('old'), 0, False)
+    ResultFolders().point_latest(make('old'), 0, False)
     folders = ResultFolders()
     a = make('a')
-    folders.file(a, 1, False)
-    folders.file(make('b'), 2, False)
-    folders.file(make('c'), 2, False)
+    folders.point_latest(a, 1, False)
+    folders.point_latest(make('b'), 2, False)
+    folders.point_latest(make('c'), 2, False)
     assert folders.withdraw(2) == a
     assert latest(tmp_path) == Path('a')
     assert folders.withdraw(0) is None
@@ -198,13 +198,13 @@ def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
 
 def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
     old, folders = make('old'), ResultFolders()
-    folders.file(old, 1, False)
+    folders.point_latest(old, 1, False)
     folders.withdraw(0)       # the first of all
     assert latest(tmp_path) is None
     assert old.is_dir()
-    ResultFolders().file(old, 0, False)
+    ResultFolders().point_latest(old, 0, False)
     folders = ResultFolders()
-    folders.file(make('a'), 1, False)
+    folders.point_latest(make('a'), 1, False)
     old.rmdir()
     folders.withdraw(0)
     assert latest(tmp_path) is None
@@ -212,8 +212,8 @@ def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
 
 def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
     folders = ResultFolders()
-    folders.file(make('a'), 1, False)
-    ResultFolders().file(make('other'), 5, False)
+    folders.point_latest(make('a'), 1, False)
+    ResultFolders().point_latest(make('other'), 5, False)
     folders.withdraw(0)
     assert latest(tmp_path) == Path('other')
 
@@ -221,7 +221,7 @@ def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
 def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
     """Whoever looks at what is there points at its own before the next looks."""
     good, bad = make('good'), make('bad')
-    late = threading.Thread(target=lambda: ResultFolders().file(good, 1, False))
+    late = threading.Thread(target=lambda: ResultFolders().point_latest(good, 1, False))
     stored_in = module.stored_in
 
     def slowly(path):
@@ -231,6 +231,6 @@ def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
             late.join(0.3)
         return found
     monkeypatch.setattr(module, 'stored_in', slowly)
-    ResultFolders().file(bad, 2, False)
+    ResultFolders().point_latest(bad, 2, False)
     late.join()
     assert latest(tmp_path) == Path('good')

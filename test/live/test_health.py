@@ -27,14 +27,15 @@ def rows(stamps_s, values=None, received_s=None):
 
 def decoded(health, block, **limits):
     """Process a block as an input does; return its mask."""
-    return np.array(health.decoded(block.stamp_ns.tolist(), block.received_ns, **limits), bool)
+    return np.array(health.check_stamps(block.stamp_ns.tolist(), block.received_ns, **limits),
+                    bool)
 
 
 def health_of(*blocks, arrived=(), **limits):
     """Return the health after blocks of stamps, s, and numbers that arrived after 1 s, 2 s."""
     health = Health()
     for second, numbers in enumerate(arrived, 1):
-        health.arrived(numbers, now_ns=second * SECOND)
+        health.register_arrival(numbers, now_ns=second * SECOND)
     for stamps in blocks:
         decoded(health, rows(stamps), **limits)
     return health
@@ -46,9 +47,9 @@ def test_rate_is_by_stamps_and_silence_is_by_the_rate():
     assert health.rate_hz(SECOND) == pytest.approx(50.0)
     assert health.rate_hz(3 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz is the end
     health = health_of([0.5, 1.5, 2.5], arrived=[[None] * 3])
-    assert health.flowing(SECOND + 4 * SECOND)       # 5 intervals of 1 s
-    assert not health.flowing(SECOND + 6 * SECOND)
-    assert not health_of([0.0], arrived=[[1]]).flowing(SECOND)
+    assert health.is_flowing(SECOND + 4 * SECOND)       # 5 intervals of 1 s
+    assert not health.is_flowing(SECOND + 6 * SECOND)
+    assert not health_of([0.0], arrived=[[1]]).is_flowing(SECOND)
 
 
 def test_losses_are_counted_across_batches_and_two_publishers_are_none():

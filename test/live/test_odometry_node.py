@@ -207,13 +207,13 @@ def test_it_goes_on_after_an_error_of_its_own(simulated):
         leg.client.node.create_subscription(Odometry, 'odometry', found.append,
                                             QoSProfile(depth=5000))
         play = with_clock(leg) if simulated else leg.play
-        asked = leg.client.send(GetParameters, 'get_parameters',
-                                GetParameters.Request(names=['publish.rate']))
+        call = leg.client.send(GetParameters, 'get_parameters',
+                               GetParameters.Request(names=['publish.rate']))
         play(0, 40)
         last_s = leg.part(0, 40)[-1].stamp_ns // 10**9
         wait_for(lambda: found and found[-1].header.stamp.sec > last_s - 2,
                  f'the last pose; the node says {leg.node.text}')
-        assert asked.result().values[0].double_value == 20.0
+        assert call.result().values[0].double_value == 20.0
         assert leg.node.end() == 0
     assert 'restarts from the origin: internal error, please report it: ZeroDivisionError' in (
         leg.node.text)

@@ -101,9 +101,9 @@ def test_the_result_is_that_of_a_replay(leg):
 
 def flood(client):
     """Ask to set all parameters to odd values, again and again; return the futures."""
-    asked = client.send(ListParameters, 'list_parameters', ListParameters.Request())
-    wait_for(asked.done, 'the names of the parameters')
-    names, futures = asked.result().result.names, []
+    call = client.send(ListParameters, 'list_parameters', ListParameters.Request())
+    wait_for(call.done, 'the names of the parameters')
+    names, futures = call.result().result.names, []
     for k in range(REQUESTS):
         wanted = [Parameter(name, value=value).to_parameter_msg()
                   for name in names for value in (k, 'x' * 50, float('nan'), [True] * 100)]

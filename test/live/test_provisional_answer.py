@@ -90,10 +90,10 @@ def _without_estimate(found, leg, client, gate):
 
 
 def _answered(leg, stop_s=0.0):
-    begin, asked = time.monotonic(), leg.client.ask('stop_leg')
+    begin, call = time.monotonic(), leg.client.ask('stop_leg')
     if stop_s:
         leg.play(stop_s, stop_s + 2)
-    return SimpleNamespace(answer=answer_of(asked), seconds=time.monotonic() - begin)
+    return SimpleNamespace(answer=answer_of(call), seconds=time.monotonic() - begin)
 
 
 def test_the_answer_does_not_wait_for_a_fit_that_takes_long(seen):
@@ -159,4 +159,5 @@ def test_a_leg_that_would_be_rejected_is_no_good_news():
     session.start(1, Config())
     now = SessionView(session, Config(), faults=(
         Reason(Code.IMU_GAP, 'no IMU data for 9 s'),), forecast_age_s=math.nan)
-    assert 'The leg would be rejected: IMU_GAP: no IMU data for 9 s. ' in answers.provisional(now)
+    assert 'The leg would be rejected: IMU_GAP: no IMU data for 9 s. ' in (
+        answers.provisional_answer(now))

@@ -33,8 +33,8 @@ def calibration(*codes):
     return Calibration(tuple(Reason(c, 'seen') for c in codes), {}, {}, ())
 
 
-def drive_leg(session, start_ns, *codes, by_itself=False):
-    session.start(start_ns, CONFIG, by_itself)
+def drive_leg(session, start_ns, *codes, is_automatic=False):
+    session.start(start_ns, CONFIG, is_automatic)
     session.stop(start_ns + 4)
     session.finish(result(), calibration(*codes))
 
@@ -101,7 +101,7 @@ def test_undo_takes_the_last_leg_and_shows_its_marks():
 
 def test_a_reset_drops_all_legs_and_what_is_carried_on():
     session = with_legs(3)
-    session.carry_on('two legs', 2)
+    session.set_carried('two legs', 2)
     assert [leg.leg_id for leg in session.legs] == [3]
     assert [leg.leg_id for leg in session.begin_reset()] == [3]
     assert (session.legs, session.calibration, session.state) == ([], None, State.IDLE)
@@ -128,14 +128,14 @@ def test_an_open_leg_must_be_ended_first(command):
 def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
     session = with_legs(1)
     before = session.calibration
-    session.start(50, CONFIG, by_itself=True)
+    session.start(50, CONFIG, is_automatic=True)
     session.stop(60)
-    session.leave_out(Reason(Code.LEG_TOO_SHORT, '30 m'))
+    session.drop_unusable(Reason(Code.LEG_TOO_SHORT, '30 m'))
     assert (session.state, session.event, session.open_leg) == (
         State.CALIBRATED, 'cancelled', False)
     assert session.calibration is before
     assert session.unused.text == '30 m'
-    drive_leg(session, 70, by_itself=True)
+    drive_leg(session, 70, is_automatic=True)
     assert session.unused is None
 
 

@@ -22,7 +22,7 @@ from odocal_ros.live.console import Console
 from odocal_ros.live.messages import LATCHED
 from odocal_ros.live.node_commands import NEEDS
 from odocal_ros.live.session import Session, SessionView
-from odocal_ros.live.topic_input import LOOK_AROUND_S
+from odocal_ros.live.topic_input import SEARCH_PERIOD_S
 from odocal_ros.live.watch import StatusListener
 from odocal_ros.offline.cli import main
 from odocal_ros.reasons import Code, Reason
@@ -97,22 +97,25 @@ def test_once_without_a_node_ends(monkeypatch, capsys):
 
 def test_the_bars_are_shares_of_what_is_asked():
     pytest.importorskip('rich')
-    from odocal_ros.live.watch import shares
-    found = shares({'distance_m': '75.0', 'metres_to_least': '25.0', 'seconds_to_stand': '4.0',
-                    'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
-                    'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
+    from odocal_ros.live.watch import progress_shares
+    found = progress_shares({'distance_m': '75.0', 'distance_to_minimum_m': '25.0',
+                             'seconds_to_stand': '4.0',
+                             'required_scale_sigma_ppm': '1000.0',
+                             'predicted_scale_sigma_ppm': '4000.0',
+                             'required_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
         'path': 0.75, 'standstill': 0.6, 'scale': 0.25, 'yaw': 0.0}
     # after a leg it is the result that is held against what is asked
-    done = {'state': 'calibrated', 'asked_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
-            'scale_factor_sigma': '0.00004', 'asked_yaw_sigma_deg': '0.5',
+    done = {'state': 'calibrated', 'required_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
+            'scale_factor_sigma': '0.00004', 'required_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
-    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, limit 1000 ppm')
-    assert shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
-    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, limit 1000 ppm')
-    assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
+    assert progress_shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, limit 1000 ppm')
+    assert progress_shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
+    assert progress_shares(done | {'state': 'recording'})['scale'] == (0.0,
+                                                                       'not known, limit 1000 ppm')
+    assert progress_shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
     # without a leg no metres are missing, and '0 m to go' would be wrong
-    assert 'path' not in shares({'state': 'waiting', 'metres_to_least': '0.0'})
+    assert 'path' not in progress_shares({'state': 'waiting', 'distance_to_minimum_m': '0.0'})
 
 
 def test_what_anybody_publishes_does_not_reach_the_terminal():
@@ -253,7 +256,7 @@ def test_a_sender_that_returns_with_another_type_is_named(start, connect):
     speed.publish(sent)
     other.node.create_publisher(Int64, '/odometer', 10)
     wait_for(lambda: client.node.count_publishers('/odometer') == 2, 'the second publisher')
-    time.sleep(2 * LOOK_AROUND_S)
+    time.sleep(2 * SEARCH_PERIOD_S)
     assert 'their messages are mixed' not in node.text
     client.node.destroy_publisher(speed)
     wait_for(lambda: any('/odometer is published as std_msgs/msg/Int64; required: '

@@ -169,8 +169,8 @@ def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
         'With these settings, observable: the scale, the yaw (from stops, starts and turns), '
         'the pitch, left and right wheel and the track width (in turns)')
     assert session.first['hint'].split(', ', 1)[1] in text        # the same text in the status
-    assert session.first['can_tell'].startswith('the scale, the yaw (from')
-    assert (session.first['cannot_tell'], session.first['track_width_ok']) == ('', 'unknown')
+    assert session.first['observable'].startswith('the scale, the yaw (from')
+    assert (session.first['not_observable'], session.first['track_width_ok']) == ('', 'unknown')
     assert TURNS in session.first['manoeuvres']
 
 

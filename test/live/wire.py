@@ -22,7 +22,7 @@ SIGMAS = 5.0
 BAD_WORDS = ('Traceback', 'RuntimeWarning', 'nternal error', ' broke: ')
 SET = {'leg__min_distance': 100.0, 'verdict__min_legs': 1, 'imu__nominal_yaw': float('nan')}
 # of the status: what no clock may make negative
-SPANS = ('duration_s', 'standstill_s', 'distance_m', 'max_speed_mps', 'metres_to_least',
+SPANS = ('duration_s', 'standstill_s', 'distance_m', 'max_speed_mps', 'distance_to_minimum_m',
          'seconds_to_stand', 'estimate_age_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz')
 
 
@@ -102,11 +102,11 @@ class Wire:
 
     def _ask(self, seen, name, then=None) -> None:
         """Call a service; it answers, whatever it says."""
-        asked = self._client.ask(name)
+        call = self._client.ask(name)
         if then:        # a leg ends when its topics have passed the mark
             rng, share = then
             self._play(rng, seen, STOP_S, LAST_S, share)
-        answer = answer_of(asked)
+        answer = answer_of(call)
         seen.calls += 1
         if not answer.message:
             seen.wrong.append(f'{name} answers nothing')
