@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The running estimate beside the recording: when it looks, what it costs, and no harm."""
+"""The running estimate during the recording: times of its updates, their cost, and errors."""
 
 import time
 from types import SimpleNamespace
@@ -13,8 +13,8 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.forecast.forecast import Forecast, Prospect
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
-from odocal_ros.live import running_estimate as watch
-from odocal_ros.live.running_estimate import UPDATE_PERIOD_NS, RunningEstimate
+from odocal_ros.live import running_estimate
+from odocal_ros.live.running_estimate import RunningEstimate, UPDATE_PERIOD_NS, UpdateResult
 from odocal_ros.live.worker import Worker
 
 pytestmark = pytest.mark.slow
@@ -81,7 +81,7 @@ def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypa
     def fail(*_):
         raise ValueError('a bug')
 
-    monkeypatch.setattr(watch, 'forecast_of', fail)
+    monkeypatch.setattr(running_estimate, 'forecast_of', fail)
     log = Log()
     estimate, now_ns = watched(drive, config, worker, log)
     estimate.update(now_ns)
@@ -107,16 +107,16 @@ def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
     assert estimate.forecast is None
 
 
-def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
-    looks, good = [], Prospect(430e-6, 1e-3, 0.0)
+def test_updates_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
+    updates, good = [], Prospect(430e-6, 1e-3, 0.0)
 
-    def dear(*args):
-        looks.append(1)
-        return Forecast(good, good), (), 1.0, None    # a second of CPU
+    def costly_update(*args):
+        updates.append(1)
+        return UpdateResult(Forecast(good, good), cpu_time_s=1.0)
 
-    monkeypatch.setattr(watch, '_look', dear)
+    monkeypatch.setattr(running_estimate, '_compute_update', costly_update)
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
-    monkeypatch.setattr(watch, 'time', clock)
+    monkeypatch.setattr(running_estimate, 'time', clock)
     estimate, now_ns = watched(drive, config, worker, Log())
     for _ in range(320):
         clock.now += 1.0
@@ -124,4 +124,4 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
         estimate.update(now_ns)
         finished(worker)
     # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
-    assert len(looks) == 7
+    assert len(updates) == 7

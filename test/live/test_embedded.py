@@ -130,7 +130,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert not client.call('start_leg').success
     monkeypatch.undo()
     # a fault after the numbers are there is an answer, too, and the node lives
-    monkeypatch.setattr(answers, 'outcome', explode)
+    monkeypatch.setattr(answers, 'result_answer', explode)
     assert 'MemoryError: not enough for this leg' in client.result(client.ask('stop_leg')).message
     client.until(state='calibrated', leg_id='1', legs='1')
     monkeypatch.undo()
