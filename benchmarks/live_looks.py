@@ -22,7 +22,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
-from odocal_ros.live.running_estimate import UPDATE_PERIOD_NS, UPDATE_CPU_SHARE
+from odocal_ros.live.running_estimate import UPDATE_CPU_SHARE, UPDATE_PERIOD_NS
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate

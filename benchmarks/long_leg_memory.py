@@ -73,7 +73,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.forecast.leg_so_far import SmootherSoFar
     from odocal_ros.forecast.thinned_leg import ThinnedLeg
     import odocal_ros.live.node  # noqa: F401 all that a node holds
-    from odocal_ros.live.worker import compute, release_memory, limit_kept_memory
+    from odocal_ros.live.worker import compute, limit_kept_memory, release_memory
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
     limit_kept_memory()

@@ -255,12 +255,12 @@ def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
 def test_a_restored_result_is_said_to_be_one():
     kept = Restored(estimates(scale_factor=1e-4, yaw_mounting_angle=None), 2, True,
                     '2026-01-02T03:04:05Z')
-    success, text = answers.restored(kept, 'm/pulse', 'OK: scale')
+    success, text = answers.restored_answer(kept, 'm/pulse', 'OK: scale')
     assert success
     assert text == (
         'no leg is running; restored result of 2026-01-02T03:04:05Z: scale factor 1.00000 ± '
         '0.00010 m/pulse (1.00000 ± 0.00010 pulses/m), yaw mounting not determined, pitch '
         'mounting not determined; from 2 legs. OK: scale. Next: drive a leg to update it')
-    success, text = answers.restored(replace(kept, valid=False), '', '')
+    success, text = answers.restored_answer(replace(kept, valid=False), '', '')
     assert not success
     assert 'which was rejected' in text

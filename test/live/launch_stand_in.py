@@ -44,39 +44,19 @@ def _truth(text) -> bool:
 
 
 def of_python(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
-    """
-    Return declared arguments (default, description) and the nodes of a Python launch file.
-
-    The defaults are those of its XML twin, so that substitutions are texts from the beginning.
-    """
-    twin, _ = of_xml(path.with_suffix('.xml'), {})
-    arguments, declared = {name: default for name, (default, _) in twin.items()} | given, {}
-
-    def declare(name, default_value, description):
-        declared[name] = default_value, description
-
+    """Return declared arguments and the nodes of a Python launch file that includes one of XML."""
     stand_ins = {
         'launch': {'LaunchDescription': list},
-        'launch.actions': {'DeclareLaunchArgument': declare},
-        'launch.conditions': {'IfCondition': _truth, 'UnlessCondition': lambda t: not _truth(t)},
-        'launch.substitutions': {
-            'LaunchConfiguration': arguments.__getitem__, 'PathJoinSubstitution': '/'.join,
-            'PythonExpression': lambda parts: str(eval(''.join(parts)))},
-        'launch_ros': {}, 'launch_ros.actions': {'Node': dict},
-        'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: (
-            _truth if value_type is bool else value_type)(value)},
-        'launch_ros.substitutions': {'FindPackageShare': {'odocal_ros': str(ROOT)}.__getitem__}}
+        'launch.actions': {'IncludeLaunchDescription': lambda source: source},
+        'launch.launch_description_sources': {'AnyLaunchDescriptionSource': Path}}
     modules = {name: ModuleType(name) for name in stand_ins}
     for name, content in stand_ins.items():
         modules[name].__dict__.update(content)
     with patch.dict(sys.modules, modules):
-        scope: dict = {}
+        scope: dict = {'__file__': str(path)}
         exec(compile(path.read_text(encoding='utf-8'), str(path), 'exec'), scope)
-        nodes = [e for e in scope['generate_launch_description']() if e is not None]
-    return declared, [
-        Started(node['package'], node['executable'], node.get('name'), node['namespace'],
-                dict(node.get('remappings', ())), node['parameters'], node.get('arguments', []))
-        for node in nodes if node.get('condition', True)]
+        included, = scope['generate_launch_description']()
+    return of_xml(included, given)
 
 
 def of_xml(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Launch files are twins with names that the node has; parameters of its own are refused."""
+"""Launch files have names that the node has; parameters of its own are refused."""
 
 import math
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_it_runs_where_launch_is_installed():
     launch = pytest.importorskip('launch', reason='launch is not on PyPI')
     pytest.importorskip('launch_ros', reason='launch_ros is not on PyPI')
     from launch.frontend import Parser
-    scope: dict = {}
+    scope: dict = {'__file__': str(PYTHON)}
     exec(compile(PYTHON.read_text(), str(PYTHON), 'exec'), scope)
     assert isinstance(scope['generate_launch_description'](), launch.LaunchDescription)
     entity, parser = Parser.load(str(XML))
