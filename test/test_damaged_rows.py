@@ -16,7 +16,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline import methods as leg_methods
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.screening.glitches import about_clumps
+from odocal_ros.screening.glitches import near_impossible_groups
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
@@ -105,12 +105,12 @@ def test_wild_rows_and_rows_off_by_little_are_a_clump_together(made):
 
 def test_what_a_clump_is():
     wild = np.zeros(1000, bool)
-    assert not about_clumps(wild).any()
+    assert not near_impossible_groups(wild).any()
     wild[[100, 400, 800]] = True
-    assert not about_clumps(wild).any()              # alone
+    assert not near_impossible_groups(wild).any()              # alone
     wild[[405, 410, 414, 419]] = True                # 400 to 419: five apart at most
-    assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(390, 430))
-    assert not about_clumps(np.zeros(0, bool)).any()
+    assert np.flatnonzero(near_impossible_groups(wild)).tolist() == list(range(390, 430))
+    assert not near_impossible_groups(np.zeros(0, bool)).any()
 
 
 @pytest.mark.parametrize('yaw', [0, 2])

@@ -17,7 +17,7 @@ from odocal_ros.estimator.result.wheel_result import Wheel, wheel_estimates
 from odocal_ros.output.summary import screen as printed
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.screening.axles import axles_of, steering_path
+from odocal_ros.screening.axles import pair_wheels, steering_path
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.wheels import wheels_of
@@ -203,7 +203,7 @@ def test_the_wheel_that_departs_is_named():
 
 
 def test_wheels_go_in_pairs():
-    assert axles_of(('a', 'b', 'c', 'd', 'e')) == [('a', 'b'), ('c', 'd'), ('e',)]
+    assert pair_wheels(('a', 'b', 'c', 'd', 'e')) == [('a', 'b'), ('c', 'd'), ('e',)]
 
 
 def test_the_summary_has_a_line_for_each_wheel():

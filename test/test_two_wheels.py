@@ -13,7 +13,7 @@ import pytest
 from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
-from odocal_ros.screening.wheel_travel import unrolled
+from odocal_ros.screening.wheel_travel import correct_rollovers
 
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
 
@@ -84,7 +84,7 @@ def test_damaged_counts_are_no_span(made):
         value[row:row + 2] = 2**63 - 1, -2**63
     count = changed(count, value=lambda _: value)
     step = np.diff(value.astype(float))
-    same, found, doubt_t, _ = unrolled(count.stamp_ns * 1e-9, count, step, 'odometer')
+    same, found, doubt_t, _ = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
     assert same is count
     assert not found
     assert not len(doubt_t)
@@ -96,7 +96,7 @@ def test_one_rollover_between_dense_rows_is_undone(made, span, found, per_row):
     total = span - 100 + np.floor(per_row * np.arange(300)).astype(np.int64)
     count = changed(take(made.odometer, slice(300)), value=lambda _: total % span)
     step = np.diff(count.value.astype(float))
-    same, why, *_ = unrolled(count.stamp_ns * 1e-9, count, step, 'odometer')
+    same, why, *_ = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
     assert [r.code for r in why] == [Code.COUNTER_ROLLOVER] * found
     assert np.array_equal(np.diff(same.value), np.diff(total)) == found
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import math
 
 from odocal_ros.data.samples import Reading
-from odocal_ros.screening.imu_rhythm import APART
+from odocal_ros.screening.even_imu_times import LEAST_STEP
 from odocal_ros.screening.late_rows import LEAST_JITTER
 
 # judgement: limits of a stamp: lag below the least one, and age relative to the newest stamp, ns;
@@ -165,7 +165,7 @@ class RowTimes:
         if len(self._rows) == 3:
             self._test(quantum)
         row_time = self._rows[-1][1] if self._in_use() else t
-        self._t = max(row_time, self._t + APART, math.nextafter(self._t, math.inf))
+        self._t = max(row_time, self._t + LEAST_STEP, math.nextafter(self._t, math.inf))
         return self._t
 
     @property
@@ -251,13 +251,13 @@ class RowTimes:
         for k, (a, b, c) in enumerate(((t0, t1, t2), (p0, p1, p2))):
             even = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
             self._roughness[k] += ((s1 - even)**2 - self._roughness[k]) * share
-        self._moved += (((s2 - s0) / max(p2 - p0, APART))**2 - self._moved) * share
+        self._moved += (((s2 - s0) / max(p2 - p0, LEAST_STEP))**2 - self._moved) * share
         self._rounding += (quantum**2 / 12 - self._rounding) * share
         limit = ROUGHNESS_LIMIT if self._line_is_smoother else ROUGHNESS_REUSE_LIMIT
         known = self._tested > FIRST_ROWS
         self._line_is_smoother = not known or self._roughness[1] <= limit**2 * self._roughness[0]
         # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
         left = max(self._roughness[self._in_use()] / 1.5 - self._rounding, 0.0)
-        self.error_s = math.sqrt(left / max(self._moved, APART))
+        self.error_s = math.sqrt(left / max(self._moved, LEAST_STEP))
         if not known:       # few rows: times of arrival may be correct
             self.error_s = max(self.error_s, LATE_SIGMA * self._late)

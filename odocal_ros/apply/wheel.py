@@ -5,7 +5,7 @@
 Travel of one wheel in a stream, with the variance of lost travel.
 
 Rollovers are corrected, and resets are interpolated. A leg is screened as a whole
-(``nav/odometer.py``, ``screening/odometer_care.py``). A stream has only earlier rows, but its
+(``nav/odometer.py``, ``screening/odometer_rows.py``). A stream has only earlier rows, but its
 scale is known: rows that no vehicle can cause are refused.
 """
 

@@ -26,7 +26,7 @@ from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.nav.statistics import gaps_in_rhythm, gaps_longer
-from odocal_ros.screening.clocks import without_sets
+from odocal_ros.screening.clocks import without_clock_steps
 from odocal_ros.screening.fix_screen import sigma_limit
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
@@ -134,7 +134,7 @@ def _pinned(path: Path, pin: MarkFix) -> Path:
 def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
           config: Config) -> tuple[Ints, NDArray[Any], list[str]]:
     """Return the status of kept fixes, the times of the others, and why those are excluded."""
-    leg, _ = without_sets(leg)      # as in the screening: inputs have these stamps
+    leg, _ = without_clock_steps(leg)      # as in the screening: inputs have these stamps
     fix, gnss = leg.fix, config.gnss
     later = gnss.time_offset - config.imu.time_offset
     t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + later

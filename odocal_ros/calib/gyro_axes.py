@@ -24,8 +24,8 @@ from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.statistics import gaps_longer
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import Facing
-from odocal_ros.screening.gravity_turn import gravity_fit
+from odocal_ros.screening.gravity_fit import gravity_fit
+from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, Placed
 
 Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
@@ -61,7 +61,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
                   for axis in nearest]
 
 
-def turning(inputs: Inputs, placed: Placed, faces: Facing | None,
+def turning(inputs: Inputs, placed: Placed, faces: ImuOrientation | None,
             gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
@@ -78,7 +78,7 @@ def turning(inputs: Inputs, placed: Placed, faces: Facing | None,
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
 
-def gyro_axes(inputs: Inputs, placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:
+def gyro_axes(inputs: Inputs, placed: Placed, faces: ImuOrientation | None) -> tuple[Reason, ...]:
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
@@ -108,7 +108,7 @@ def gyro_axes(inputs: Inputs, placed: Placed, faces: Facing | None) -> tuple[Rea
                    'rotates gyro and accelerometer together.'),)
 
 
-def _inverted_turns(faces: Facing, found: Found, names: list[str]) -> tuple[Reason, ...]:
+def _inverted_turns(faces: ImuOrientation, found: Found, names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     seen = (f'accelerations in turns are opposite to turn rate and speed (ratio {faces.inward:.2f}'
             f' ± {faces.inward_sigma:.2f} instead of 1)')

@@ -14,7 +14,7 @@ from odocal_ros.data.pieces import medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import AXES, FEWEST_BINS_FACING, pushes
+from odocal_ros.screening.imu_orientation import AXES, bin_accelerations, FEWEST_BINS_FACING
 from odocal_ros.screening.inputs import Inputs
 
 # rad of yaw from nominal: beyond it a nominal rotation or heading is wrong; beyond it reversed.
@@ -119,7 +119,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
     # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
     # accelerations; else turns are inverted, as by a mirrored axis, which is tested later
-    found = pushes(t, w_i, f_i, up_i, travel, metres_per_unit)
+    found = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if found is None:
         return None, np.pi
     A, F = found.onward + 1j * found.inward, found.force

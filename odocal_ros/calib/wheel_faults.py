@@ -42,7 +42,7 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.wheel_pair import Pair, pair
+from odocal_ros.screening.wheel_faults import WheelPair, wheels_on_grid
 
 Event = tuple[float, float, float]      # begin, end, s, and size, m
 # steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s; others are detected too.
@@ -68,7 +68,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     travel that is uncertain for other reasons (gaps, resets).   max_deviation : limit of the ratio
     of the counts minus one.   count : number of wheels in the mean.
     """
-    two = pair(axle, imu, between, SLIP_GRID,
+    two = wheels_on_grid(axle, imu, between, SLIP_GRID,
                np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
@@ -101,7 +101,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     return reasons + wheel_slip_reason(slips, two.names), slips
 
 
-def _without_slope(two: Pair, apart: Floats, quantum_m: float) -> Floats:
+def _without_slope(two: WheelPair, apart: Floats, quantum_m: float) -> Floats:
     """Return the difference of the paths, m, without its slope on most of the drive."""
     # slopes by rounding at a steady speed, at most two counts over a window, are not removed
     path, n = _mean_path(two), 200     # steps of a slope, 20 s: longer than most slips
@@ -115,7 +115,7 @@ def _without_slope(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     return out
 
 
-def _without_slips(two: Pair, events: list[Event]) -> Pair:
+def _without_slips(two: WheelPair, events: list[Event]) -> WheelPair:
     """Return the wheels, with the cells of slips marked as unknown."""
     known, around = two.known.copy(), 2.0       # s each side, possibly part of the slip
     for begin, end, _ in events:
@@ -123,7 +123,7 @@ def _without_slips(two: Pair, events: list[Event]) -> Pair:
     return replace(two, known=known)
 
 
-def _events(two: Pair, apart: Floats, quantum_m: float,
+def _events(two: WheelPair, apart: Floats, quantum_m: float,
             width: float) -> tuple[list[Event], list[Event]]:
     """Return the jumps of the difference that end, and those that may change the ratio."""
     apart = _without_slope(two, apart, quantum_m)
@@ -150,7 +150,7 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
     return over, lasting
 
 
-def _is_finished(two: Pair, apart: Floats, event: Event) -> bool:
+def _is_finished(two: WheelPair, apart: Floats, event: Event) -> bool:
     """Return True if a slip ends: it is short, or its slope is absent before and after it."""
     path = _mean_path(two)
     begin, end = np.interp(event[:2], two.t, path)
@@ -164,18 +164,19 @@ def _is_finished(two: Pair, apart: Floats, event: Event) -> bool:
     return True
 
 
-def _slope(two: Pair, event: Event) -> float:
+def _slope(two: WheelPair, event: Event) -> float:
     """Return the slope of a slip, size by path, between a tenth and nine tenths of its size."""
     begin, end = np.interp(event[:2], two.t, _mean_path(two))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out
 
 
-def _mean_path(two: Pair) -> Floats:
+def _mean_path(two: WheelPair) -> Floats:
     return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
 
 
-def _jump_limits(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
+def _jump_limits(two: WheelPair, jump: Floats, span: int, quantum_m: float,
+                 width: float) -> Floats:
     """Return the limit of jumps between two means that occur by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     path = _mean_path(two)
@@ -195,7 +196,7 @@ def _jump_limits(two: Pair, jump: Floats, span: int, quantum_m: float, width: fl
     return out
 
 
-def _measure_jump(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]],
+def _measure_jump(two: WheelPair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]],
                   a: int, b: int) -> Event:
     """Return (begin, end, size) of the jump within steps a to b, by its best window."""
     found = (0.0, 0.0, 0, 0)
@@ -218,7 +219,7 @@ def _measure_jump(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Flo
     return float(two.t[k + min(begin, end)]), float(two.t[k + max(begin, end)]), size
 
 
-def _find_wheel(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
+def _find_wheel(two: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
                 latitude: float, event: Event) -> int:
     """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
     # a slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import runs
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_pair import Pair, robust_fit
+from odocal_ros.screening.wheel_faults import robust_fit, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH
 
 # statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
@@ -30,7 +30,7 @@ MOST_DRIFT = np.deg2rad(2.0)
 MEAN_STEPS = 10     # steps over which speed, turn rate and the ends of a window are averaged: 1 s
 
 
-def without_gyro_drift(two: Pair) -> Pair:
+def without_gyro_drift(two: WheelPair) -> WheelPair:
     """Return the wheels with the turn rate of standstills, the gyro bias, removed in between."""
     still = two.known & (np.diff(two.left) == 0) & (np.diff(two.right) == 0)
     # half a second after a stop and before a start the body rocks
@@ -45,7 +45,7 @@ def without_gyro_drift(two: Pair) -> Pair:
     return replace(two, turn=two.turn - np.append(0.0, np.cumsum(bias * two.step)))
 
 
-def regressors(two: Pair, metres_per_unit: float) -> Floats:
+def regressors(two: WheelPair, metres_per_unit: float) -> Floats:
     """
     Return the regressors of the right path, at the edges of the cells: (n, 6).
 
@@ -65,7 +65,7 @@ def _smooth(x: Floats, reach: int) -> Floats:
     return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
 
 
-def fit_signals(two: Pair, signals: Floats, metres_per_unit: float,
+def fit_signals(two: WheelPair, signals: Floats, metres_per_unit: float,
            ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return the coefficients of the signals, fitted to cells of a second, and covariance."""
     at = np.arange(0, len(two.t), MEAN_STEPS)
@@ -84,7 +84,8 @@ def fit_signals(two: Pair, signals: Floats, metres_per_unit: float,
     return x, covariance
 
 
-def side_reasons(two: Pair, width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
+def side_reasons(two: WheelPair, width: float, sigma: float,
+                 track_width: float) -> tuple[Reason, ...]:
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
                                                      track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
@@ -100,7 +101,7 @@ def side_reasons(two: Pair, width: float, sigma: float, track_width: float) -> t
                    f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)
 
 
-def find_ratio_change(two: Pair, signals: Floats, metres_per_unit: float,
+def find_ratio_change(two: WheelPair, signals: Floats, metres_per_unit: float,
                       count: int) -> tuple[tuple[Reason, ...], float]:
     """
     Return a reason if the wheels' ratio differs before and after a place of the path, and by what.
@@ -136,7 +137,8 @@ def find_ratio_change(two: Pair, signals: Floats, metres_per_unit: float,
                    f'{50 * abs(held):.2f} % to that of each wheel'),), held
 
 
-def counter_reasons(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
+def counter_reasons(two: WheelPair, ratio: float, width: float,
+                    limit: float) -> tuple[Reason, ...]:
     """Return a reason if one wheel counts far more: the mean is not at the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()

@@ -14,7 +14,7 @@ from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.forecast.predict import plan_alignment
 from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
-from odocal_ros.screening.glitches import Oriented, oriented
+from odocal_ros.screening.glitches import Oriented, without_invalid_orientations
 from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, OMNI, SKID, with_settings
 
 EXACT_HEADING = 1e-6      # rad; judgement: sigma of a heading whose configured sigma is 0
@@ -119,7 +119,7 @@ def _alignment(config: Config, received: Received) -> Alignment:
 
 def stated_variance(sent: Oriented) -> float:
     """Return the median yaw variance in orientation messages, rad^2; inf if none is sent."""
-    variance = oriented(sent).yaw_variance
+    variance = without_invalid_orientations(sent).yaw_variance
     stated = variance[~np.isnan(variance)]
     return float(np.median(stated)) if len(stated) else math.inf
 

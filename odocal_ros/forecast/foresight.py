@@ -31,7 +31,7 @@ from odocal_ros.forecast.forecast import (
 )
 from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
-from odocal_ros.screening.leg_kind import lacking
+from odocal_ros.screening.leg_kind import missing_force_cause
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
@@ -69,7 +69,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
-    unusable = lacking(leg.imu, config.imu.accel_scale)
+    unusable = missing_force_cause(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.look(leg, config, smoother, wanted)
     only_smoother = deciding(config.method) == smoother_forecast.ONLY
     if only_smoother or smoother_forecast.gives_all(running):     # the end points add nothing

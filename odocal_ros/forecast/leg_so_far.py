@@ -33,7 +33,11 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.facing import axes_reasons, facing, UNUSABLE
+from odocal_ros.screening.imu_orientation import (
+    estimate_orientation,
+    orientation_reasons,
+    UNUSABLE,
+)
 from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
@@ -207,7 +211,8 @@ class SmootherSoFar:
         placed = place(inputs, config)
         if not placed.rough:
             raise BadData('the scale is not known yet')
-        _refuse_unusable(axes_reasons(facing(inputs, placed.rough), config.imu.nominal_yaw))
+        _refuse_unusable(orientation_reasons(estimate_orientation(inputs, placed.rough),
+                                             config.imu.nominal_yaw))
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin = placed.origin
             self._growing.forget()
@@ -215,7 +220,7 @@ class SmootherSoFar:
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
-                                      placed.rough, t_stop)
+                            placed.rough, t_stop)
         few = too_little_of(view)
         if few:
             raise BadData(few.text)

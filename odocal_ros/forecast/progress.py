@@ -12,9 +12,9 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, Samples
 from odocal_ros.forecast.ability import Received, stated_variance
 from odocal_ros.nav.earth import radii
-from odocal_ros.screening.clocks import offsets, remedy
+from odocal_ros.screening.clocks import clock_remedy, stamp_offsets
 from odocal_ros.screening.leg_kind import has_accelerometer
-from odocal_ros.screening.odometer_care import Steps
+from odocal_ros.screening.odometer_rows import StepReader
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT, DAY_NS, FASTEST
 from odocal_ros.settings.nominal import nominal_scale
@@ -66,7 +66,7 @@ class Clocks:
         """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
         result = []
         for slot, ahead in self._ahead_s.items():
-            offset = offsets(config)[slot]
+            offset = stamp_offsets(config)[slot]
             # latency makes a row look older: a clock is only behind if its newest row is; latency
             # of IMU rows makes others look newer: a clock is ahead if most of its rows are
             value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
@@ -79,7 +79,7 @@ def clocks_differ(clocks: list[tuple[str, float]]) -> str:
     """Return the sentence about clocks that differ from the IMU's."""
     seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} '
                      'the IMU stamps' for slot, s in clocks)
-    return f'CLOCKS_DIFFER: {seen}. {remedy(max((s for _, s in clocks), key=abs))}'
+    return f'CLOCKS_DIFFER: {seen}. {clock_remedy(max((s for _, s in clocks), key=abs))}'
 
 
 def _apart(seconds: float) -> str:
@@ -104,7 +104,7 @@ class Travel:
         self.total = 0.0
         self.moved_ns = 0        # stamp of the last motion
         self.newest_ns = 0
-        self._rows = Steps(form)
+        self._rows = StepReader(form)
         self._anchor = 0.0
         self._rest = 0.0, 0      # length, s, and end of the last standstill
         self.top = 0.0           # highest speed, units/s

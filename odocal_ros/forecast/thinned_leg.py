@@ -19,7 +19,7 @@ from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.nav.odometer import without_rollover
-from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
+from odocal_ros.screening.late_rows import ON_TIME_WINDOW, sampling_times
 
 # judgement: a tenth of the time between keyframes; per topic 26 minutes of them with pre-roll, so
 # that the time of an update is bounded
@@ -166,6 +166,6 @@ class LateSoFar:
 
 
 def _on_time(rows: data.OdometerSamples) -> data.OdometerSamples:
-    true_s = on_time(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
+    true_s = sampling_times(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
     true_ns = rows.stamp_ns[0] + np.rint(true_s * 1e9).astype(np.int64)
     return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

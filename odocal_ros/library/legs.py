@@ -132,7 +132,7 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
 
     def stops_known() -> Stops:
         return stops or stops_of(screen(recorder.close(first, last, preroll=0.0), config,
-                                        judged=False)[0], first, config)
+                                        check_faults=False)[0], first, config)
     legs = [_placed(a, bag, first, last) for a in asked if isinstance(a, LegSpan)]
     if EACH_STOP in asked:
         legs += _each_stop(stops_known(), settings_by_frame(recorder.rows('fix'), config))

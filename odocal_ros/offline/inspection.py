@@ -29,7 +29,7 @@ from odocal_ros.offline.survey import fix_path, FixPath, Match
 from odocal_ros.output.figures import counted
 from odocal_ros.output.files import plain
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.glitches import beyond
+from odocal_ros.screening.glitches import is_impossible
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES, with_settings
 from odocal_ros.settings.config_file import parse_set
@@ -172,7 +172,7 @@ def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
 def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
-                   'rate_hz': info.count / seconds if seconds > 0 else None}
+                             'rate_hz': info.count / seconds if seconds > 0 else None}
     if tap is None:
         return facts | ({'trouble': trouble} if trouble else {})
     slot = tap.reader.slot
@@ -255,7 +255,7 @@ def _read_again(bag: Bag, taps: dict[str, _Tap], topic: str, config: Config,
 def _turn(imu: _Tap) -> tuple[Ints, Floats] | None:
     """Return stamps and the turn rate to the left, rad/s, None without usable rows."""
     rows = imu.recorder.rows('imu')
-    rows = take(rows, ~(beyond('f_i', rows.f_i) | beyond('w_i', rows.w_i)))
+    rows = take(rows, ~(is_impossible('f_i', rows.f_i) | is_impossible('w_i', rows.w_i)))
     if not len(rows.stamp_ns):
         return None
     up_i = medians(rows.f_i)

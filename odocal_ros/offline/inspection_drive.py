@@ -25,13 +25,17 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.clocks import TOO_FAR
-from odocal_ros.screening.facing import facing, imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
-from odocal_ros.screening.imu_changes import turned_over, unit_changes
+from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
+from odocal_ros.screening.imu_orientation import (
+    estimate_orientation,
+    MAX_RATE,
+    unit_and_axis_reasons,
+)
 from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.leg_kind import settings_by_frame
+from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
@@ -109,8 +113,9 @@ def _units(inputs: Inputs, config: Config,
            findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
-        turned_over(inputs) or imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
-                                          config.imu)[0] or unit_changes(inputs), inputs)
+        gravity_turn_reasons(inputs)
+        or unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
+        or unit_change_reasons(inputs), inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
         w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi
@@ -151,8 +156,9 @@ def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Conf
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    faces = facing(inputs, placed.rough) if inputs.has_accelerometer and placed.rough else None
-    ratio, wrong = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, faces,
+    orientation = estimate_orientation(inputs, placed.rough) \
+        if inputs.has_accelerometer and placed.rough else None
+    ratio, wrong = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, orientation,
                            config.imu.gyro_scale)
     found['drive']['gyro_over_course'] = ratio
     findings += wrong

@@ -13,8 +13,8 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
-from odocal_ros.screening.fix_screen import origin_amid, placed as has_place, usable_fixes
-from odocal_ros.screening.glitches import beyond, oriented
+from odocal_ros.screening.fix_screen import has_position, median_origin, usable_fixes
+from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.config import Config, GnssConfig
@@ -66,9 +66,9 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
 
 def imu(samples: ImuSamples) -> dict[str, Any]:
     """Return gravity, units and orientation of an IMU topic."""
-    samples = oriented(samples)
-    f_i = samples.f_i[~beyond('f_i', samples.f_i)]
-    w_i = samples.w_i[~beyond('w_i', samples.w_i)]
+    samples = without_invalid_orientations(samples)
+    f_i = samples.f_i[~is_impossible('f_i', samples.f_i)]
+    w_i = samples.w_i[~is_impossible('w_i', samples.w_i)]
     mean = medians(f_i) if len(f_i) else np.zeros(3)
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
@@ -93,7 +93,7 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
 
 def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return quantity, unit and range of an odometer topic."""
-    finite = samples.value[~beyond('value', samples.value)]
+    finite = samples.value[~is_impossible('value', samples.value)]
     order = np.sort(finite)
     ends = {'first': finite[:1], 'last': finite[-1:], 'least': order[:1], 'most': order[-1:]}
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
@@ -104,10 +104,10 @@ def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
 def fixes(samples: FixSamples) -> dict[str, Any]:
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
-        & ~beyond('covariance_n', covariance)
+        & ~is_impossible('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    place = has_place(samples)
-    heights = samples.height[place & ~beyond('height', samples.height)]
+    place = has_position(samples)
+    heights = samples.height[place & ~is_impossible('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {
         'status': dict(zip(map(str, values.tolist()), counts.tolist(), strict=True)),
@@ -184,7 +184,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     t_ns = rows.received_ns[use]
     t = (t_ns - t_ns[0]) * 1e-9
     geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[use]
-    fixes_n = origin_amid(t, geodetic).to_n(geodetic)
+    fixes_n = median_origin(t, geodetic).to_n(geodetic)
     near = find_reachable(t, fixes_n)
     t, t_ns, fixes_n = t[near], t_ns[near], fixes_n[near, :2]
     path_length = path_and_chord(t, fixes_n)[0]

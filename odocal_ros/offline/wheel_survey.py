@@ -14,7 +14,7 @@ from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
 from odocal_ros.offline.survey import FixPath
-from odocal_ros.screening.glitches import beyond
+from odocal_ros.screening.glitches import is_impossible
 from odocal_ros.settings.config import SIDES
 
 FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('data',),
@@ -60,7 +60,7 @@ class Values:
                                     key=lambda entry: sum(len(block[0]) for block in entry[1]))
         stamp_ns, received_ns, value = (np.concatenate(parts) for parts in zip(
             *blocks, strict=True))
-        keep = np.append(True, np.diff(stamp_ns) > 0) & ~beyond('value', value)
+        keep = np.append(True, np.diff(stamp_ns) > 0) & ~is_impossible('value', value)
         stamp_ns, received_ns, value = stamp_ns[keep], received_ns[keep], value[keep]
         if len(stamp_ns) < 3:
             return []

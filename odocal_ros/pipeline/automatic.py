@@ -22,7 +22,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.odometer_care import Steps
+from odocal_ros.screening.odometer_rows import StepReader
 from odocal_ros.settings.config import Config
 
 SECOND = 10**9    # definition: ns
@@ -43,7 +43,7 @@ class LegSearch:
     """Search for legs in rows, in blocks of any size; ``spans`` are found, the open one last."""
 
     def __init__(self, config: Config) -> None:
-        self._steps: Steps | None = None
+        self._steps: StepReader | None = None
         self._still = 0.0
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(LEG_END_REST_NS, self._standstill_ns)
@@ -75,7 +75,7 @@ class LegSearch:
         if slot == 'imu':
             self._add_imu_stamps(block.stamp_ns)
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
-            self._steps = self._steps or Steps(form)
+            self._steps = self._steps or StepReader(form)
             self._still = self._steps.still
             steps, stamps, _ = self._steps.of(block)
             travel = self._travel + np.cumsum(steps)

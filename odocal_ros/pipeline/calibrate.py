@@ -29,12 +29,12 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.clock_offset import screen_aligned
-from odocal_ros.screening.facing import imu_sanity, UNUSABLE
-from odocal_ros.screening.imu_changes import turned_over, unit_changes
+from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
+from odocal_ros.screening.imu_orientation import unit_and_axis_reasons, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
-from odocal_ros.screening.reversing import BY_FIT, doubled, reversing_reasons
+from odocal_ros.screening.reversing import BY_FIT, reversing_reasons, sections_slipped_twice
+from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
@@ -103,9 +103,10 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
         seen = {r.code for r in reasons}
         return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in seen)),
                         False)
-    sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
-    moved = turned_over(inputs)     # before imu_sanity, whose mean gravity is then meaningless
-    sanity, z_down = (moved, False) if moved else (sanity or unit_changes(inputs), z_down)
+    sanity, z_down = unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
+    # takes precedence: the mean gravity of the other test is then meaningless
+    moved = gravity_turn_reasons(inputs)
+    sanity, z_down = (moved, False) if moved else (sanity or unit_change_reasons(inputs), z_down)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:      # forward-right-down: rotated to forward-left-up
@@ -120,7 +121,7 @@ def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
     scale = None if smoother is None else smoother.estimates['scale_factor'].value
     if smoother is None or not scale:
         return np.empty((0, 2)), None
-    return doubled(smoother.details['slips'], inputs.travel, scale), scale
+    return sections_slipped_twice(smoother.details['slips'], inputs.travel, scale), scale
 
 
 def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:

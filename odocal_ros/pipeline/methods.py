@@ -34,7 +34,7 @@ from odocal_ros.pipeline.prepared_leg import (
 )
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.fix_screen import median_origin
 from odocal_ros.screening.inputs import Inputs
 
 # judgement: relative computing time of the methods, and of the tracks after them
@@ -127,7 +127,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
     if 'distance' not in more:      # of a leg that is refused: by the fixes
         t_fix, geodetic = inputs.t_fix[between], inputs.geodetic[between]
         more['distance'] = path_and_chord(
-            t_fix, origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic)),
+            t_fix, median_origin(t_fix, geodetic).to_n(np.nan_to_num(geodetic)),
             inputs.least_motion)[0] if len(t_fix) else 0.0
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,

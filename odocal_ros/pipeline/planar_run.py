@@ -20,7 +20,7 @@ from odocal_ros.nav.integral import integral_at
 from odocal_ros.pipeline.methods import leg_result
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.fix_screen import median_origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
@@ -46,7 +46,7 @@ def is_planar(leg: Leg, config: settings.Config) -> bool:
 def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
                progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
-    inputs, found = screen(leg, config, judged=False)
+    inputs, found = screen(leg, config, check_faults=False)
     reasons = [*notes, *(r for r in found if r.code not in OF_IMU)]
     progress(Stage(PLANAR))
     run, lacking = _run_of(inputs, config)
@@ -96,7 +96,7 @@ def _run_of(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[R
     t, node, used = _nodes(inputs.t_fix[inside])
     used = inside[used]
     place = np.nan_to_num(inputs.geodetic)
-    position = origin_amid(inputs.t_fix, inputs.geodetic).to_n(place[used])[:, :2]
+    position = median_origin(inputs.t_fix, inputs.geodetic).to_n(place[used])[:, :2]
     covariance = inputs.covariance_n[used]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(one.at(t)) for one in travels])
@@ -125,7 +125,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
     have = ~np.isnan(inputs.geodetic[:, 2])
     if have.sum() < FEWEST_POSITIONS:
         return 0.0
-    place = origin_amid(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
+    place = median_origin(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
     variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(place[:, :2], axis=0).T)))
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))

@@ -26,9 +26,9 @@ from odocal_ros.pipeline.align import align, with_observed_walk
 from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared_leg import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening import facing
-from odocal_ros.screening.axles import axles_of
-from odocal_ros.screening.imu_changes import turned_about
+from odocal_ros.screening import imu_orientation
+from odocal_ros.screening.axles import pair_wheels
+from odocal_ros.screening.imu_faults import forward_turn_reasons
 from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
@@ -52,15 +52,15 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     refusal_reasons = _missing_drive_reasons(inputs, placed)
     if refusal_reasons is not None:
         return None, (*reasons, *refusal_reasons)
-    accelerations = (facing.accelerations(inputs, placed.rough)
+    accelerations = (imu_orientation.accelerations(inputs, placed.rough)
                      if inputs.has_accelerometer else None)
-    orientation = None if accelerations is None else facing.facing_of(accelerations)
+    orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *odometer_span_reasons(inputs.travel, inputs.t_stop))
-    axis_faults = turned_about(accelerations) or turning(inputs, placed, orientation,
+    axis_faults = forward_turn_reasons(accelerations) or turning(inputs, placed, orientation,
                                                          config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
-    axes = facing.axes_reasons(orientation, config.imu.nominal_yaw)
+    axes = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
     reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
@@ -70,7 +70,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
 
 
 def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
-                   orientation: facing.Facing | None, reasons: Sequence[Reason],
+                   orientation: imu_orientation.ImuOrientation | None, reasons: Sequence[Reason],
                    alignment: Alignment | None, holdout: bool) -> PreparedLeg:
     spans = inputs.standstills(placed.rough, config)
     alignment_reasons: tuple[Reason, ...] = ()
@@ -125,7 +125,7 @@ def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...]
 def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track,
                     reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
-    fixed = [axle for axle in axles_of(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
+    fixed = [axle for axle in pair_wheels(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
     if not fixed or not inputs.has_accelerometer or WHEEL_FAULT_CODES & {r.code for r in reasons}:
         return (), NO_SLIPS
     from odocal_ros.calib.wheel_faults import wheel_faults

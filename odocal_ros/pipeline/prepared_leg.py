@@ -38,7 +38,7 @@ from odocal_ros.nav.dead_reckoning import (
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import Facing
+from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 
@@ -96,7 +96,7 @@ class PreparedLeg(Placed):
     leg: Leg                             # raw
     inputs: Inputs                       # screened
     config: Config
-    facing: Facing | None                # IMU orientation, None if not determined
+    facing: ImuOrientation | None                # IMU orientation, None if not determined
     lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
     spans: NDArray[np.float64]           # (s, 2) s, standstills
     alignment: Alignment

@@ -33,7 +33,7 @@ from odocal_ros.pipeline.prepared_leg import (
     without_outliers,
 )
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import toward
+from odocal_ros.screening.imu_orientation import corrected_forward_axis
 
 NAMES = ('start', 'end')
 
@@ -87,7 +87,8 @@ class TwoPointRun:
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
-        slips = slip_check(self.prepared, self.track, toward(self.prepared.facing, f), ends)
+        forward = corrected_forward_axis(self.prepared.facing, f)
+        slips = slip_check(self.prepared, self.track, forward, ends)
         self.slip = slip_reasons(slips, self.config.odometer.time_offset)
         one = self.prepared.wheel_slips      # of one wheel: its share in the mean
         inside = (one.t >= ends[0]) & (one.t <= ends[1])

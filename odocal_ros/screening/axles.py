@@ -13,8 +13,14 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.odometer import mean_travel, Travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_faults import broken_wheels, in_per_cent, STILL_SHARE
-from odocal_ros.screening.wheel_pair import Imu, pair, robust_fit
+from odocal_ros.screening.wheel_faults import (
+    broken_wheel_reasons,
+    Imu,
+    percent_text,
+    robust_fit,
+    STILL_SHARE,
+    wheels_on_grid,
+)
 from odocal_ros.screening.wheel_travel import Wheels
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
@@ -28,7 +34,7 @@ SLOW = 0.05               # judgement: of the top speed, below which a turn rate
 LEAST_STEERED = 2e-5
 
 
-def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
+def pair_wheels(wheels: Sequence[T]) -> list[tuple[T, ...]]:
     """Return wheels in pairs, left and right; an odd last one is alone."""
     return [tuple(wheels[k:k + 2]) for k in range(0, len(wheels), 2)]
 
@@ -43,21 +49,22 @@ def usable_axles(wheels: Wheels, imu: Imu,
     A broken axle is left out if another one is usable and does not steer: with one wheel its mean
     is not that of the axle's middle.
     """
-    axles = axles_of(wheels.each)
+    axles = pair_wheels(wheels.each)
     faults = [_faults(axle, axles, imu, between) for axle in axles]
     reasons = [reason for why in faults for reason in why]
     if len(axles) < 2:
         return wheels, reasons
     # the working wheel of a broken axle is used to detect steering of the others
-    seen = [axle if not why else _counting(axle, why) for axle, why in zip(
+    usable = [axle if not why else _working_wheel(axle, why) for axle, why in zip(
         axles, faults, strict=True)]
-    ahead = iter(_ahead([axle for axle in seen if axle], imu, between, wheels.doubt_t))
-    places = [next(ahead) if axle else np.inf for axle in seen]
-    whole = [replace(wheel, ahead=x) for axle, why, x in zip(axles, faults, places, strict=True)
-             if not why for wheel in axle]
-    turning, fixed = ([wheel for wheel in whole if bool(wheel.ahead) is steers]
+    ahead = iter(_distances_ahead([axle for axle in usable if axle], imu, between, wheels.doubt_t))
+    distances = [next(ahead) if axle else np.inf for axle in usable]
+    working = [replace(wheel, ahead=x)
+               for axle, why, x in zip(axles, faults, distances, strict=True)
+               if not why for wheel in axle]
+    turning, fixed = ([wheel for wheel in working if bool(wheel.ahead) is steers]
                       for steers in (True, False))
-    if reasons and (not fixed or sum(map(bool, seen)) < 2):
+    if reasons and (not fixed or sum(map(bool, usable)) < 2):
         return wheels, reasons
     found = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_listed(axle)} left out of the mean')
              for axle, why in zip(axles, faults, strict=True) for reason in why]
@@ -65,39 +72,39 @@ def usable_axles(wheels: Wheels, imu: Imu,
         found.append(Reason(Code.WHEELS_STEERED, f'{_listed(turning)} steered: a '
                             'steered wheel travels farther in turns. The scale factor is that of '
                             f'the mean of {_names(fixed)}'))
-    return wheels.only(whole), found
+    return wheels.only(working), found
 
 
-def _counting(axle: Axle, why: Sequence[Reason]) -> Axle:
+def _working_wheel(axle: Axle, why: Sequence[Reason]) -> Axle:
     """Return the working wheel of a broken axle, () if it is not certain."""
-    rolled = [_rolled(wheel) for wheel in axle]
+    rolled = [_path_length(wheel) for wheel in axle]
     alone = len(axle) > 1 and {reason.code for reason in why} == {Code.WHEEL_DEAD}
     return (axle[int(np.argmax(rolled))],) if alone and max(rolled) > 0 else ()
 
 
-def _rolled(wheel: Travel) -> float:
+def _path_length(wheel: Travel) -> float:
     return float(np.abs(np.diff(wheel.s)).sum())
 
 
 def _faults(axle: Axle, axles: list[Axle], imu: Imu,
             between: tuple[float, float]) -> tuple[Reason, ...]:
     """Return the faults of an axle; a single wheel is compared with the first axle."""
-    most = max(_rolled(wheel) for other in axles for wheel in other)
-    own = max(map(_rolled, axle))
+    most = max(_path_length(wheel) for other in axles for wheel in other)
+    own = max(map(_path_length, axle))
     if own <= STILL_SHARE * most:
         return (Reason(Code.WHEEL_DEAD, f'{_names(axle)} did not count: the travel is '
-                       f'{in_per_cent(own, most)} of that of the wheel that travels most (limit '
+                       f'{percent_text(own, most)} of that of the wheel that travels most (limit '
                        f'{100 * STILL_SHARE:g} %)'),) if most else ()
     if len(axle) == 1:
         axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
-    return broken_wheels(axle, imu, between)
+    return broken_wheel_reasons(axle, imu, between)
 
 
-def _ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
-           doubt_t: Floats) -> list[float]:
+def _distances_ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
+                     doubt_t: Floats) -> list[float]:
     """Return the distance of each axle ahead of the one that steers least, scale units."""
     first = mean_travel(axles[0])
-    found = [(0.0, 0.0), *(_square(mean_travel(axle), first, imu, between, doubt_t)
+    found = [(0.0, 0.0), *(_squared_distance(mean_travel(axle), first, imu, between, doubt_t)
                            for axle in axles[1:])]
     squares, sigmas = np.transpose(found)
     least = int(np.argmin(squares))
@@ -106,10 +113,10 @@ def _ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
     return ahead
 
 
-def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
-            doubt_t: Floats) -> tuple[float, float]:
+def _squared_distance(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
+                      doubt_t: Floats) -> tuple[float, float]:
     """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
-    two = pair((own, other), imu, between, STEER_GRID, doubt_t)
+    two = wheels_on_grid((own, other), imu, between, STEER_GRID, doubt_t)
     if two is None:
         return 0.0, 0.0
     at = np.arange(0, len(two.t), CELL)

@@ -1,8 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Clocks: offsets between the stamps of topics, and clocks that were set during the leg."""
+"""
+Clocks: offsets between the stamps of topics, and clocks that were set during the leg.
 
+Sensors of two computers may have clocks that are seconds apart although stamps and arrivals agree.
+Such an offset is estimated from the motion that IMU, odometer and fixes all measure: the
+acceleration of the odometer is compared with the specific force at all offsets, the speed of the
+fixes with that of the odometer. Offsets up to OFFSET_REACH are delays, which the smoother
+estimates.
+"""
+
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,15 +19,25 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import by_step, median, pieces
+from odocal_ros.data.pieces import bin_means, by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 
 OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
 # judgement, s: least step of a clock that is detected; rows on each side that give the lag
 CLOCK_SET, LAG_NEIGHBOURS = 0.01, 50
+OFFSET_CELL = 0.25          # s, judgement: of means; an acceleration of the vehicle takes longer
+FARTHEST_OFFSET = 90.0      # s, judgement: largest offset that is found
+# s, judgement: slower changes are slopes in the force, and traffic in the speed
+SLOW_FORCE, SLOW_SPEED = 20.0, 60.0
+# s, judgement: duration of one acceleration, which counts as one sample
+EVENT = 4.0
+# statistical: log likelihood of the best offset less that of small ones and of all farther than
+# EVENT from it; the margin above 10 (once in 20,000) is for signals that repeat themselves
+LEAST_LOG_ODDS = 20.0
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock, or set arrival_time of imu, odometer or gnss: '
            'the difference exceeds the range of time_offset. '
@@ -26,7 +45,7 @@ TOO_FAR = ('Stamp all sensors with one clock, or set arrival_time of imu, odomet
            'with use_sim_time:=true.')
 
 
-def offsets(config: Config) -> dict[str, float]:
+def stamp_offsets(config: Config) -> dict[str, float]:
     """Return the s to add to the stamps of each input; 0 for the IMU, which stamps the marks."""
     def of(group: str) -> float:
         return float(getattr(config, group).time_offset) if group else 0.0
@@ -36,7 +55,7 @@ def offsets(config: Config) -> dict[str, float]:
 def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
     """Return reasons for clocks that differ from the IMU's at equal times of arrival."""
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
-    offset = offsets(config)
+    offset = stamp_offsets(config)
     found: list[Reason] = []
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
@@ -54,11 +73,11 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
                 Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
                 'from IMU stamps that arrive at the same time; the limit is '
                 f'{CLOCK_DIFFERENCE_LIMIT:g} s'
-                f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', remedy(ahead)))
+                f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', clock_remedy(ahead)))
     return found
 
 
-def remedy(ahead: float) -> str:
+def clock_remedy(ahead: float) -> str:
     """Return the remedy for a clock that is ``ahead`` s ahead of the IMU clock."""
     return TOO_FAR if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
@@ -101,13 +120,13 @@ def _may_be_odd(stamp_ns: Ints) -> Bools:
     return (step <= 0) | (step > CLOCK_SET)
 
 
-def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
+def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
     """Return a leg without the steps of clocks that were set during it; CLOCK_SET of each."""
     rows: dict[str, Samples] = {}
     found: list[Reason] = []
     for slot in ('imu', *TOPICS):
         sent = _stamped(leg.rows(slot))
-        at, moved = _sets(sent)
+        at, moved = _clock_steps(sent)
         if not len(at):
             continue
         piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # ends at a step
@@ -128,7 +147,7 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
     return leg.with_rows(**rows), found
 
 
-def _sets(samples: Samples) -> tuple[Ints, Floats]:
+def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
     """Return the rows after which a clock was set, and its steps, s: arrivals do not step."""
     if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
             _may_be_odd, samples.stamp_ns).any():
@@ -146,3 +165,71 @@ def _sets(samples: Samples) -> tuple[Ints, Floats]:
             at.append(k)
             moved.append(by)        # of the stamps, relative to arrival
     return np.array(at, np.int64), np.array(moved)
+
+
+def late_clocks(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
+    """Yield the clocks that are late relative to the IMU, and by how much, s; < 0: early."""
+    t, travel, t_fix = inputs.t_imu, inputs.travel, inputs.t_fix
+    if not inputs.has_accelerometer or min(len(t), len(travel.t), len(t_fix)) < 2:
+        return
+    edges = np.arange(min(t[0], travel.t[0]), max(t[-1], travel.t[-1]), OFFSET_CELL)
+    if len(edges) < 3:      # no change of speed between two cells
+        return
+    count, (force,) = bin_means(t, edges, inputs.f_b)
+    force[count == 0] = inputs.usual_f_b
+    moved = np.diff(travel.at(edges))
+    odometer = _delay(_without_slow_changes(np.gradient(moved)[:, None], SLOW_FORCE),
+                      _without_slow_changes(force, SLOW_FORCE))
+    if odometer:
+        yield 'odometer', odometer
+    place = np.stack([np.interp(edges, t_fix, axis) for axis in placed.fixes_n[:, :2].T], -1)
+    fix = _delay(_without_slow_changes(_chords(place), SLOW_SPEED),
+                 _without_slow_changes(_chords(travel.at(edges)[:, None]), SLOW_SPEED), odometer)
+    if fix:
+        yield 'gnss', fix
+
+
+def _chords(place: Floats) -> Floats:
+    """Return the distances between the means of adjacent EVENTs: (n, 1)."""
+    cells = round(EVENT / OFFSET_CELL)
+    total = np.cumsum(np.pad(place, ((cells, cells), (0, 0)), mode='edge'), axis=0)
+    mean = total[cells:] - total[:-cells]
+    out: Floats = np.linalg.norm(mean[cells:] - mean[:-cells], axis=1)[:, None]
+    return out
+
+
+def _without_slow_changes(x: Floats, slow: float) -> Floats:
+    """Return columns without their changes slower than some seconds: (n, k)."""
+    half = min(round(slow / OFFSET_CELL / 2), (len(x) - 1) // 2)
+    total = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode='edge'), axis=0)
+    return x - (total[2 * half + 1:] - total[:-2 * half - 1]) / (2 * half + 1)
+
+
+def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
+    """Return the delay, s, of y (n, 1) by its fit with x (n, k); 0: not above OFFSET_REACH."""
+    reach = round(FARTHEST_OFFSET / OFFSET_CELL)
+    size = 2 * max(len(x), reach)
+    product = np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj()
+    at = np.arange(-reach, reach + 1)
+    correlation = np.fft.irfft(product, axis=0)[at]
+    share = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
+        float((y**2).sum()), 1e-12)
+    best = 1 + int(np.argmax(share[1:-1]))
+    before, here, after = share[best - 1:best + 2]      # their parabola has its maximum there:
+    top = (after - before) / max(2 * (2 * here - before - after), 1e-12)
+    delay_s = OFFSET_CELL * (at[best] + np.clip(top, -0.5, 0.5))
+    small = np.abs(OFFSET_CELL * at + x_delay) <= OFFSET_REACH
+    others = share[(np.abs(OFFSET_CELL * at - delay_s) > EVENT) | small].max()
+    events = len(y) * OFFSET_CELL / EVENT
+    left = np.maximum(1.0 - np.array([others, here]), 1e-6)      # of the variance
+    log_odds = events / 2 * np.log(left[0] / left[1])
+    return float(delay_s + x_delay) if log_odds > LEAST_LOG_ODDS else 0.0
+
+
+def shift_stamps(samples: SomeSamples, by_ns: int, imu: ImuSamples) -> SomeSamples:
+    """Return samples with moved stamps; arrivals too, unless stamps then lag like the IMU's."""
+    lag, usual = (float(np.median(one.received_ns - one.stamp_ns)) if len(one.stamp_ns) else 0.0
+                  for one in (samples, imu))
+    by_stamps = abs(lag - by_ns - usual) < abs(lag - usual)
+    return replace(samples, received_ns=samples.received_ns + (0 if by_stamps else by_ns),
+                   stamp_ns=samples.stamp_ns + by_ns * (samples.stamp_ns > 0))

@@ -44,7 +44,7 @@ SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
 JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
 # s, physical: in 0.1 s a change of acceleration by 5 m/s^2 (hard braking) gives SHORTEST_JUMP
 JUMP_DELAY = 0.1
-SPANS_SAID = 3           # judgement: number of spans in a reason
+SPANS_LISTED = 3           # judgement: number of spans in a reason
 
 
 def usable_fixes(fix: FixSamples, sent: int,
@@ -52,8 +52,8 @@ def usable_fixes(fix: FixSamples, sent: int,
     """Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons."""
     no_fix = fix.status < gnss.min_status
     most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
-    lost = ~placed(fix) | (abs(fix.height) > most_height)
-    lost = lost | _away(fix, ~(lost | no_fix))
+    lost = ~has_position(fix) | (abs(fix.height) > most_height)
+    lost = lost | _far_from_most(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
     limit = sigma_limit(sigma[~unknown & ~no_fix & ~lost], gnss.max_sigma)
@@ -77,9 +77,9 @@ def usable_fixes(fix: FixSamples, sent: int,
          'its own uncertainty.')) if m.any()]
     if bad:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
-        said, do = zip(*bad, strict=True)
+        listed, do = zip(*bad, strict=True)
         found += (Reason(code, f'{int((~use).sum())} of {sent} fixes are not used: '
-                         f'{", ".join(said)}', ' '.join(do)),)
+                         f'{", ".join(listed)}', ' '.join(do)),)
     return use, covariance, found
 
 
@@ -100,21 +100,21 @@ def sigma_limit(sigma: Floats, max_sigma: float) -> float:
     return max_sigma or np.inf
 
 
-def placed(fix: FixSamples) -> Bools:
+def has_position(fix: FixSamples) -> Bools:
     """Return a mask of fixes on the Earth, not NaN, whose angles are not both zero: (n,) bool."""
     nowhere = (fix.latitude == 0) & (fix.longitude == 0)
     there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
     return there
 
 
-def _away(fix: FixSamples, good: Bools) -> Bools:
+def _far_from_most(fix: FixSamples, good: Bools) -> Bools:
     """Return a mask of good fixes far from most others: (n,) bool."""
-    away = np.zeros(len(good), bool)
+    far = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
         away_from_most = 1e6    # m from the median fix: not a real position
-        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
-    return away
+        far[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
+    return far
 
 
 def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
@@ -125,8 +125,8 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     If only the height's part is unknown, it is derived from the horizontal part.
     """
     covariance = fix.covariance_n.copy()
-    unknown = ~_proper(covariance[:, :2, :2]) | (fix.covariance_type == 0)
-    flat = unknown | ~_proper(covariance)
+    unknown = ~_is_covariance(covariance[:, :2, :2]) | (fix.covariance_type == 0)
+    flat = unknown | ~_is_covariance(covariance)
     covariance[unknown] = np.eye(3) * default_sigma**2
     covariance[flat, 2, :] = covariance[flat, :, 2] = 0.0
     # satellites are only above: the sigma of a height is about twice as large
@@ -134,7 +134,7 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     return covariance, unknown
 
 
-def _proper(matrices: Floats) -> Bools:
+def _is_covariance(matrices: Floats) -> Bools:
     """Return a mask of invertible covariance matrices: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
     largest_sigma = 1e8    # m, larger ones are invalid: products and roots would overflow
@@ -155,7 +155,7 @@ def _proper(matrices: Floats) -> Bools:
     return sane
 
 
-def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
+def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
     """Return the origin of n: the median fix of those near the start, so it is not an outlier."""
     about_start = 11    # fixes nearest to the start mark, whose median is used
     near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
@@ -166,8 +166,8 @@ def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
     return Origin(latitude, longitude, float(np.median(known)) if len(known) else 0.0)
 
 
-def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
-                 covariance_n: Floats) -> tuple[Reason, ...]:
+def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
+                     covariance_n: Floats) -> tuple[Reason, ...]:
     """
     Return VELOCITY_UNUSABLE if the velocity contradicts the fixes, otherwise ().
 
@@ -209,8 +209,8 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
                    'unit, swapped axes, or vehicle axes'),)
 
 
-def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
-             track: Complexes) -> tuple[Bools, tuple[Reason, ...]]:
+def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
+                        track: Complexes) -> tuple[Bools, tuple[Reason, ...]]:
     """
     Return a mask of fixes that a receiver has dead-reckoned, and FIXES_DEAD_RECKONED.
 
@@ -223,11 +223,11 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
         found |= (t_fix >= begin) & (t_fix < end)
     if not spans:
         return found, ()
-    said = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
-                     for begin, end, jump in spans[:SPANS_SAID])
-    more = f' and {len(spans) - SPANS_SAID} more' * (len(spans) > SPANS_SAID)
-    return found, (Reason(Code.FIXES_DEAD_RECKONED, f'the receiver dead-reckoned at {said}{more}: '
-                          f'{int(found.sum())} of {len(t_fix)} fixes not used'),)
+    listed = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
+                       for begin, end, jump in spans[:SPANS_LISTED])
+    more = f' and {len(spans) - SPANS_LISTED} more' * (len(spans) > SPANS_LISTED)
+    return found, (Reason(Code.FIXES_DEAD_RECKONED, 'the receiver dead-reckoned at '
+                          f'{listed}{more}: {int(found.sum())} of {len(t_fix)} fixes not used'),)
 
 
 def _spans(t: Floats, place: Complexes, sigma: Floats,
@@ -248,38 +248,38 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     if driven.sum() <= SMOOTH_ROWS:
         return []
     ratio, onward = moved[before] / steps[before], np.gradient(steps) / np.median(dt)
-    off = _without_delay(moved[rows] - ratio * steps[rows],
-                         ratio * (onward[rows] - onward[before] * steps[rows] / steps[before]))
-    usual, at = float(np.median(off[driven])), rows[driven]
-    smooth = off[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
+    change = onward[rows] - onward[before] * steps[rows] / steps[before]
+    deviation = _without_delay(moved[rows] - ratio * steps[rows], ratio * change)
+    usual, at = float(np.median(deviation[driven])), rows[driven]
+    smooth = deviation[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
     # jumps below the stated error are caused by changes of satellites
     least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
-    for k in np.flatnonzero(off > least):
+    for k in np.flatnonzero(deviation > least):
         last = int(np.searchsorted(at, rows[k]))
-        first = _begin(smooth[:last])
+        first = _smooth_begin(smooth[:last])
         if first == last:
             continue
         # fixes since the previous compared one may be dead-reckoned too
         begin = float(t[max(at[first] - 2, 0)])
         # the row after a jump has the same deviation
         if not spans or begin > spans[-1][1]:
-            spans.append((begin, float(t[rows[k] + 1]), float(off[k])))
+            spans.append((begin, float(t[rows[k] + 1]), float(deviation[k])))
     return spans
 
 
-def _without_delay(off: Complexes, by_second: Complexes) -> Floats:
+def _without_delay(deviation: Complexes, by_second: Complexes) -> Floats:
     """Return sizes of deviations (n,), m, without the part by a delay, m per s of it."""
     size = np.maximum(np.abs(by_second), 1e-9)
-    delays = (off * by_second.conj()).real / size**2
+    delays = (deviation * by_second.conj()).real / size**2
     order = np.argsort(delays)
     weight = np.cumsum(size[order])
     delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
-    rest: Floats = np.abs(off - delay * by_second * (abs(delay) > JUMP_DELAY))
+    rest: Floats = np.abs(deviation - delay * by_second * (abs(delay) > JUMP_DELAY))
     return rest
 
 
-def _begin(smooth: Bools) -> int:
+def _smooth_begin(smooth: Bools) -> int:
     """Return the first row of the smooth section at the end, or the length if there is none."""
     begin = len(smooth)
     while begin >= SMOOTH_ROWS and smooth[begin - SMOOTH_ROWS:begin].mean() >= SMOOTH_SHARE:

@@ -42,7 +42,7 @@ FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
-def beyond(name: str, column: NDArray[Any]) -> Bools:
+def is_impossible(name: str, column: NDArray[Any]) -> Bools:
     """Return a mask of rows with NaN, Inf or an impossible value: (n, ...) to (n,) bool."""
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
@@ -61,7 +61,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
         return by_row(odd, column)
 
 
-def oriented(samples: Oriented) -> Oriented:
+def without_invalid_orientations(samples: Oriented) -> Oriented:
     """Return IMU or heading rows without invalid orientations; their variance is NaN."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
@@ -70,7 +70,7 @@ def oriented(samples: Oriented) -> Oriented:
         return ((length < 1 / unit_length) | (length > unit_length)
                 | (np.abs(variance) > widest_variance))
 
-    wild = beyond('q_ni', samples.q_ni)
+    wild = is_impossible('q_ni', samples.q_ni)
     none = by_row(no_attitude, wild, samples.q_ni, samples.yaw_variance)
     if not (wild | none & ~np.isnan(samples.yaw_variance)).any():
         return samples
@@ -78,7 +78,7 @@ def oriented(samples: Oriented) -> Oriented:
                    yaw_variance=np.where(none, np.nan, samples.yaw_variance))
 
 
-def about_clumps(wild: Bools) -> Bools:
+def near_impossible_groups(wild: Bools) -> Bools:
     """
     Return a mask of rows in or near a group of impossible rows: (n,) bool.
 
@@ -94,7 +94,7 @@ def about_clumps(wild: Bools) -> Bools:
     return suspect
 
 
-def spikes(t: Floats, x: Floats, least: float) -> Bools:
+def find_spikes(t: Floats, x: Floats, least: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back: (n,) bool.
 
@@ -121,7 +121,7 @@ def spikes(t: Floats, x: Floats, least: float) -> Bools:
     return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
-def isolated(x: Floats, least: float) -> Bools:
+def isolated_outliers(x: Floats, least: float) -> Bools:
     """
     Return a mask of isolated outliers with no motion before and after.
 
@@ -154,8 +154,9 @@ def isolated(x: Floats, least: float) -> Bools:
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
     """Return a mask of IMU rows that are spikes or isolated outliers; imu : its scale factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
-    return (spikes(t, w_i, TURN_STEP / gyro) | isolated(w_i, SINGLE_TURN / gyro)
-            | spikes(t, f_i, FORCE_STEP / accel) | isolated(f_i, SINGLE_FORCE / accel))
+    return (find_spikes(t, w_i, TURN_STEP / gyro) | isolated_outliers(w_i, SINGLE_TURN / gyro)
+            | find_spikes(t, f_i, FORCE_STEP / accel)
+            | isolated_outliers(f_i, SINGLE_FORCE / accel))
 
 
 def speed_glitches(t: Floats, speed: Floats) -> Bools:
@@ -164,10 +165,10 @@ def speed_glitches(t: Floats, speed: Floats) -> Bools:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
     speed_step = 0.3    # of the top speed, least jump from row to row of a glitch
-    return spikes(t, speed[:, None], max(speed_step * top, 1e-12))
+    return find_spikes(t, speed[:, None], max(speed_step * top, 1e-12))
 
 
-def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
+def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
     """
     Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
 
@@ -194,7 +195,8 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
                    'wheels turn: its output is frozen'),)
 
 
-def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[Reason, ...]:
+def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
+                       imu: ImuConfig) -> tuple[Reason, ...]:
     """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
     found = []
     for sensor, x_i, scale, unit, least in (

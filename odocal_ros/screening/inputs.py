@@ -18,7 +18,7 @@ from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.fix_screen import median_origin
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
@@ -101,7 +101,7 @@ def place(inputs: Inputs, config: Config) -> Placed:
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):
         return Placed(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
-    origin = origin_amid(inputs.t_fix, inputs.geodetic)
+    origin = median_origin(inputs.t_fix, inputs.geodetic)
     if inputs.local:
         latitude = np.deg2rad(config.reference.latitude_deg)
         origin = replace(origin, local=rate_without_north(float(latitude)))

@@ -16,8 +16,8 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import median, runs
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.imu_rhythm import APART, TESTED_ROWS
-from odocal_ros.screening.odometer_care import counter_steps
+from odocal_ros.screening.even_imu_times import LEAST_STEP, TESTED_ROWS
+from odocal_ros.screening.odometer_rows import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: some row in it is on time
 EVEN_BESIDE = 5           # judgement: rows to either side that determine the time of a row
@@ -29,21 +29,21 @@ LEAST_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm tha
 ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
-def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
-            name: str = 'odometer') -> Floats:
+def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
+                   name: str = 'odometer') -> Floats:
     """Return the sampling times of rows stamped at t, (n,) s: late ones are moved back."""
     if len(t) < 4 * EVEN_BESIDE:
         return t
     whole = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
         # a speed is as smooth as travel, but does not determine the time of a row in a burst
-        _, even, evener = _rhythm(t, samples.value.astype(float))
-        true = _rising(even) if evener else t
+        _, even, is_smoother = _smoothest_rhythm(t, samples.value.astype(float))
+        true = _rising(even) if is_smoother else t
     else:
         step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
                 else samples.value[1:].astype(float))
         travel = np.concatenate([[0.0], np.cumsum(step)])
-        true = _put_back(t, travel, ROUNDING_COUNTS if whole else 0.0)
+        true = _correct_bursts(t, travel, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
     named_late, named_late_share = 0.02, 0.3    # s, of an interval: larger delays are reported
     named = late > max(named_late, named_late_share * intervals(t)[0])
@@ -60,7 +60,7 @@ def arrival_jitter(t: Floats) -> float | None:
     """Return the standard deviation of arrivals from the rhythm, s, None with few rows."""
     if len(t) < 4 * EVEN_BESIDE or t[-1] <= t[0]:
         return None
-    late = [t - _soonest(t, usual) for usual in intervals(t)]
+    late = [t - _rhythm_of_earliest(t, usual) for usual in intervals(t)]
     # of the middle 95 %, four sigmas of a normal distribution
     return float(min(np.subtract(*np.percentile(x, [97.5, 2.5])) / 4 for x in late))
 
@@ -85,28 +85,28 @@ def intervals(t: Floats) -> list[float]:
     return [median((t[n:] - t[:-n]) / np.maximum(sent[n:] - sent[:-n], 1.0)), mean]
 
 
-def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
-    usual, even, evener = _rhythm(t, travel)
+def _correct_bursts(t: Floats, travel: Floats, least: float) -> Floats:
+    usual, even, is_smoother = _smoothest_rhythm(t, travel)
     least_late, late_share = 0.004, 0.1    # s, of an interval: the larger is the limit
-    late = t - even > (usual if evener else max(least_late, late_share * usual))
-    true = even.copy() if evener else t.copy()
-    for begin, end, fits in _fitting(t, even, travel, late, least):
+    late = t - even > (usual if is_smoother else max(least_late, late_share * usual))
+    true = even.copy() if is_smoother else t.copy()
+    for begin, end, fits in _fitting_runs(t, even, travel, late, least):
         if fits:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
-            true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
+            true[begin:end] = _times_by_travel(t, travel, begin - 1, end, usual)
     return _rising(true)
 
 
 def _rising(t: Floats) -> Floats:
     """Return strictly rising times: each at least APART after the previous one."""
-    order = APART * np.arange(len(t))
+    order = LEAST_STEP * np.arange(len(t))
     out: Floats = np.maximum.accumulate(t - order) + order
     return out
 
 
-def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
-             least: float) -> list[tuple[int, int, bool]]:
+def _fitting_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
+                  least: float) -> list[tuple[int, int, bool]]:
     """Return begin and end of the runs of late rows, and True if they fit the rhythm."""
     begin, end = runs(late).T
     if not len(begin):
@@ -117,7 +117,7 @@ def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
         about[np.clip(np.flatnonzero(late) + shift, 0, len(t) - 1)] = True
     off = np.zeros((2, len(t) + 1))
     rows = np.flatnonzero(about)
-    off[:, rows] = [_off(x, travel, rows) for x in (t, even)]
+    off[:, rows] = [_cubic_deviation(x, travel, rows) for x in (t, even)]
     # by reduceat, between the ends of each run
     ends = np.stack([low, high], -1).ravel()
     sent, put = np.sqrt(np.add.reduceat(off**2, ends, axis=1)[:, ::2])
@@ -127,44 +127,45 @@ def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
     return list(zip(begin.tolist(), end.tolist(), fits.tolist(), strict=True))
 
 
-def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
+def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     """Return the interval, times on the smoothest rhythm, True if travel is smoother on it."""
     # of two equally smooth ones, that of the median rows: the earliest rows have steps
     found = [(_unevenness(t, even, travel), usual, even) for usual in reversed(intervals(t))
-             for even in (*_middle(t, usual), _soonest(t, usual))]
+             for even in (*_rhythm_of_median(t, usual), _rhythm_of_earliest(t, usual))]
     least = min(ratio for ratio, _, _ in found)
     evener_share, as_even = 0.9, 1.1
-    evener = least < evener_share
-    _, usual, even = next(x for x in found if x[0] <= as_even * least) if evener else found[-1]
-    return usual, even, evener
+    is_smoother = least < evener_share
+    _, usual, even = next(
+        x for x in found if x[0] <= as_even * least) if is_smoother else found[-1]
+    return usual, even, is_smoother
 
 
 def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
     """Return roughness of travel on a rhythm over that at t, by rows that are not on it."""
     rows = np.flatnonzero(np.abs(t - even) > LEAST_JITTER)
     rows = rows[::1 + len(rows) // TESTED_ROWS]
-    off = np.array([np.abs(_off(x, travel, rows)) for x in (t, even)])
+    off = np.array([np.abs(_cubic_deviation(x, travel, rows)) for x in (t, even)])
     off = off[:, off.any(axis=0)]       # of rows in motion
     if not off.size:
         return 1.0
     most = 90    # percentile: a lost row makes the rhythm wrong for some adjacent rows
     sent, put = np.percentile(off, most, axis=1)
-    return float(put / max(sent, APART))
+    return float(put / max(sent, LEAST_STEP))
 
 
-def _soonest(t: Floats, usual: float) -> Floats:
+def _rhythm_of_earliest(t: Floats, usual: float) -> Floats:
     """Return the rhythm of the rows with the smallest delays, by morphological opening."""
     rows = usual * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
-    least = _least_of_next(t - rows, window)
+    least = _running_minimum(t - rows, window)
     # in the last window, an increase by whole intervals is caused by lost rows
     end, jitter = least[len(t) - window:], 0.25     # of an interval: allowance for jitter
     end[:] = end[0] + usual * np.floor((end - end[0]) / usual + jitter)
-    even = rows - _least_of_next(-least[::-1], window)[::-1]
+    even = rows - _running_minimum(-least[::-1], window)[::-1]
     return even + np.median(t - even)      # a constant delay is not corrected
 
 
-def _middle(t: Floats, usual: float) -> list[Floats]:
+def _rhythm_of_median(t: Floats, usual: float) -> list[Floats]:
     """Return the rhythm by median times, with early and late rows; [] if rows are lost."""
     row = np.arange(len(t))
     late = t - usual * row
@@ -187,7 +188,7 @@ def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
     return np.cumsum(size) - size / 2, np.array([np.median(block) for block in blocks])
 
 
-def _least_of_next(x: Floats, count: int) -> Floats:
+def _running_minimum(x: Floats, count: int) -> Floats:
     """Return the minimum of each value and those after it, ``count`` in total."""
     n, count = len(x), min(count, len(x))       # an invalid interval may give any number
     blocks = np.append(x, np.full(count - n % count + count, np.inf)).reshape(-1, count)
@@ -196,7 +197,7 @@ def _least_of_next(x: Floats, count: int) -> Floats:
     return np.minimum(until[:n], since[count - 1:count - 1 + n])
 
 
-def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
+def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
     """Return the deviation of the travel of rows from the cubic through adjacent rows: (m,)."""
     last = len(t) - 1
     nodes = [np.clip(rows + step, 0, last) for step in CUBIC]
@@ -212,7 +213,7 @@ def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
     return np.where((rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last), -meant, 0.0)
 
 
-def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:
+def _times_by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:
     """Return the times of the rows between a and b by travel; their stamps if no burst."""
     rows = np.arange(a + 1, b)
 

@@ -42,7 +42,7 @@ def has_accelerometer(f_i: Floats) -> bool:
         return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
-def lacking(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
+def missing_force_cause(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
     """
     Return the reason why the accelerations of a leg cannot be used, '' if they can.
 
@@ -64,9 +64,9 @@ def lacking(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
     return ''
 
 
-def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
+def with_assumed_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """Return a leg, upright on level ground if its IMU has no usable force, and the reason."""
-    why = lacking(leg.imu, config.imu.accel_scale)
+    why = missing_force_cause(leg.imu, config.imu.accel_scale)
     if not why:
         return leg, ()
     up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]

@@ -46,7 +46,7 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
                   min(travel.t[-1], t_imu[-1]) - PUSH_TIME, REVERSING_STEP)
     if len(t) < 2 * (STOP_BEFORE + PUSH_TIME) / REVERSING_STEP:
         return none
-    begins, ends = _stretches(t, travel)
+    begins, ends = _sections_between_stops(t, travel)
     if len(begins) < 2:
         return none
     force = _Forces(t, t_imu, w_b, f_b)
@@ -69,7 +69,8 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     return np.stack([t[begins[back]] - PUSH_TIME, t[ends[back]] + PUSH_TIME], -1)
 
 
-def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: float) -> Floats:
+def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
+                           metres_per_unit: float) -> Floats:
     """
     Return the sections between stops with a slip of twice their length: reversed, (m, 2) s.
 
@@ -77,7 +78,7 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
     travel.   A wheel that spins on the spot slips by once its travel.
     """
     t = np.arange(travel.t[0] + PUSH_TIME, travel.t[-1] - PUSH_TIME, REVERSING_STEP)
-    begins, ends = _stretches(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
+    begins, ends = _sections_between_stops(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
     spans = np.stack([t[begins] - PUSH_TIME, t[ends] + PUSH_TIME], -1)
     driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
@@ -106,7 +107,7 @@ def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | No
                    f'{"; ".join(each[:most_listed])}{more}'),)
 
 
-def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
+def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     """Return the first and the last step of each section of motion that begins with a stop."""
     speed = np.abs(travel.at(t + PUSH_TIME / 2) - travel.at(t - PUSH_TIME / 2)) / PUSH_TIME
     top = np.percentile(speed, 95)
@@ -154,5 +155,5 @@ def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[flo
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     spread = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
     left = float(np.sqrt(np.mean((y - A @ x)**2)))
-    alike = 2 * PUSH_TIME / REVERSING_STEP          # neighbours share their samples
-    return float(x[0]), left * float(np.sqrt(alike * spread)) + 1e-12
+    rows_per_sample = 2 * PUSH_TIME / REVERSING_STEP          # neighbours share their samples
+    return float(x[0]), left * float(np.sqrt(rows_per_sample * spread)) + 1e-12

@@ -22,7 +22,7 @@ FEWEST_DIFFERENCES = 10
 OFF_GRID = 0.02         # judgement: of a step, limit of the deviation of a multiple
 
 
-def rounding_of(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[Reason, ...]]:
+def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[Reason, ...]]:
     """
     Return the variances by rounding, (n, 3) m^2, and FIXES_NOISIER_THAN_SAID if they are large.
 
@@ -35,7 +35,7 @@ def rounding_of(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[R
     n = len(geodetic)
     variance = np.zeros((n, 3))
     angles = geodetic[:, 1::-1]     # along east and north
-    steps = np.array([step_of(angle) for angle in angles.T])
+    steps = np.array([common_step(angle) for angle in angles.T])
     if not steps.any():
         return variance, ()
     # a coordinate that hardly changes has too few differences
@@ -58,7 +58,7 @@ def rounding_of(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[R
         'double, with 8 decimals of a degree (NMEA: 6 decimals of a minute).'),)
 
 
-def step_of(angle: Floats) -> float:
+def common_step(angle: Floats) -> float:
     """
     Return the step of which all differences of values are multiples, (n,) rad; 0: none.
 

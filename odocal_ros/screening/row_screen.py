@@ -23,8 +23,8 @@ from odocal_ros.screening.leg_kind import is_local
 from odocal_ros.settings.config import Config
 
 LABEL = {slot: one.label for slot, one in INPUTS.items()}
-NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
-           **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
+NO_ROW_CODES = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
+                **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
 UNSTAMPED = 'Set {}.arrival_time to true, or let the driver stamp its messages.'
 NO_RECEPTION = ('Drive under open sky if possible: the likely cause is a tunnel, buildings or '
@@ -62,11 +62,11 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     """Return the usable rows of a topic, and their times from the start mark, s: (n,)."""
     sent = leg.rows(slot)
     if slot in WHEELS:
-        sent = _stood(sent)
+        sent = _zero_faded_speeds(sent)
     good, wild = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
-    clean = _one_by_one(clean) if slot in WHEELS else clean
-    clean = _unpacked(clean, found) if slot == 'imu' else clean
+    clean = _separate_equal_stamps(clean) if slot in WHEELS else clean
+    clean = _spread_packets(clean, found) if slot == 'imu' else clean
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
     t = room(len(clean.stamp_ns))
@@ -81,15 +81,17 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
                             f'{t[np.argmax(spikes)]:.2f} s; dropped'))
-        if not glitches.about_clumps(wild).any():      # else adjacent rows are already dropped
+        # else adjacent rows are already dropped
+        if not glitches.near_impossible_groups(wild).any():
             at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
             wild[at[spikes]] = True
             spikes |= _damaged(wild, good, slot, found)[at]
         clean, t = take(clean, ~spikes), t[~spikes]
-    if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
+    if len(sent.stamp_ns) and not len(t) and slot in NO_ROW_CODES:
         zero = int((sent.stamp_ns <= 0).sum())
         found.append(Reason(
-            NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
+            NO_ROW_CODES[slot],
+            f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
             + f': {zero} have no stamp (0)' * (zero > 0),
             UNSTAMPED.format(INPUTS[slot].clock or slot) * (zero > 0)))
     return clean, t
@@ -108,7 +110,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
     possible = INPUTS[slot].possible
     for name in INPUTS[slot].needed:
         column = getattr(samples, name)
-        odd = glitches.beyond(name, column)
+        odd = glitches.is_impossible(name, column)
         if possible is not None:
             odd |= ~((column >= possible[0]) & (column <= possible[1]))
         finite &= ~odd
@@ -135,7 +137,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
 def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
              most: float = np.inf) -> Bools:
     """Return a mask of rows near groups of invalid rows, and the reason if there are many."""
-    suspect = glitches.about_clumps(wild)
+    suspect = glitches.near_impossible_groups(wild)
     if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
                             'messages hold impossible values or are outliers; '
@@ -144,14 +146,14 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
     return suspect
 
 
-def _stood(samples: Any) -> Any:
+def _zero_faded_speeds(samples: Any) -> Any:
     """Return odometer samples with zero for the tiny values of a decaying low-pass filter."""
     least_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
     faded = (samples.value != 0) & (np.abs(samples.value) < least_value)
     return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
 
 
-def _one_by_one(samples: Any) -> Any:
+def _separate_equal_stamps(samples: Any) -> Any:
     """Return samples stamped at arrival, equal stamps 1 ns apart; repeated samples unchanged."""
     stamp, twice_share = samples.stamp_ns, 1 / 3    # of all; with each sample twice it is a half
     step = np.diff(stamp)
@@ -164,7 +166,7 @@ def _one_by_one(samples: Any) -> Any:
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
 
 
-def _unpacked(imu: Any, found: list[Reason]) -> Any:
+def _spread_packets(imu: Any, found: list[Reason]) -> Any:
     """Return IMU samples; those with one stamp are distributed over the time since the last."""
     stamp, packed_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
     step = np.diff(stamp)

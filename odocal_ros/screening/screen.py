@@ -22,47 +22,58 @@ from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import usable_axles
-from odocal_ros.screening.clocks import clock_reasons, offsets, without_sets
-from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
-from odocal_ros.screening.glitches import frozen, oriented, saturated
-from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.clocks import (
+    clock_reasons,
+    late_clocks,
+    shift_stamps,
+    stamp_offsets,
+    without_clock_steps,
+)
+from odocal_ros.screening.even_imu_times import even_imu_times
+from odocal_ros.screening.fix_screen import dead_reckoned_fixes, usable_fixes, velocity_reasons
+from odocal_ros.screening.glitches import (
+    frozen_gyro_reasons,
+    saturation_reasons,
+    without_invalid_orientations,
+)
+from odocal_ros.screening.imu_faults import alternating_imu_reasons, other_frame_reasons
 from odocal_ros.screening.inputs import Inputs, place, UsableRows
-from odocal_ros.screening.leg_kind import with_force, without_north
+from odocal_ros.screening.leg_kind import with_assumed_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
-from odocal_ros.screening.rounded_fixes import rounding_of
+from odocal_ros.screening.rounded_fixes import rounding_variance
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
-from odocal_ros.screening.several_imus import alternating, other_imus
-from odocal_ros.screening.wheel_travel import Wheels, wheels
+from odocal_ros.screening.wheel_travel import travel_of_wheels, Wheels
 from odocal_ros.settings.config import Config, SIDES
 
 # judgement: of a rough track, an hour at 146 Hz; more only take memory. 2 h at 1 kHz: 0.16 m off
 TRACK_ROWS = 2**19
 
 
-def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
+def screen(leg: Leg, config: Config,
+           check_faults: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
     """
     Return the usable arrays of a leg, empty if no row is usable, and reasons.
 
-    judged : False if only its motion is needed: faults of clocks, gyro and wheels are not tested,
-    and orientations are unchanged.
+    check_faults : False if only its motion is needed: faults of clocks, gyro and wheels are not
+    tested, and orientations are unchanged.
     """
-    leg, levelled = with_force(leg, config)
+    leg, levelled = with_assumed_force(leg, config)
     leg, local = without_north(leg, config)
-    found: list[Reason] = [*levelled, *local, *other_imus(leg, config.imu)]
+    found: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
     found += _missing(leg, found)
-    if judged:
-        leg, sets = without_sets(leg)
+    if check_faults:
+        leg, sets = without_clock_steps(leg)
         found += [*sets, *clock_reasons(leg, config)]
-    rows = _usable(leg, config, judged, found)
-    inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
+    rows = _usable(leg, config, check_faults, found)
+    inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
     wheels = rows.wheels      # the mean has the rows of the first one
     for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.each[1:]), strict=False):
         found += topic_gap(slot, one.t)
-    if judged:
-        found += alternating(rows.imu.w_i, rows.imu.f_i)
-        found += saturated(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
-        found += frozen(inputs.t_imu, rows.imu.w_i, rows.wheels.mean, config.leg.max_gap)
+    if check_faults:
+        found += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
+        found += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
+        found += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
         if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
             wheels, why = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
@@ -70,9 +81,29 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
             found += why
         inputs = replace(inputs, **_travel(leg, wheels))
     let_go()
-    if judged and not local:
-        inputs = _without_reckoned(inputs, config, found)
+    if check_faults and not local:
+        inputs = _without_dead_reckoned(inputs, config, found)
     return (inputs if levelled else _without_reversing(inputs, config, found)), tuple(found)
+
+
+def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
+    """Return a leg with all stamps on the clock of the IMU, its inputs, and reasons of both."""
+    inputs, reasons = screen(leg, config)
+    found, late_by = [], dict(late_clocks(inputs, place(inputs, config)))
+    for clock, late in late_by.items():
+        slots = [slot for slot, one in INPUTS.items() if one.clock == clock]
+        by_ns = -round(late * 1e9)
+        leg = leg.with_rows(**{
+            slot: shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
+        found.append(Reason(
+            Code.DELAY_SEEN, f'{INPUTS[slots[0]].label} stamps are about {abs(late):.1f} s '
+            f'{"late" if late > 0 else "early"} relative to the IMU (estimated from the '
+            'motion); the stamps were corrected',
+            'Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with one clock.'))
+    if found:
+        inputs, reasons = screen(leg, config)
+        inputs = replace(inputs, aligned=late_by)
+    return leg, inputs, (*found, *reasons)
 
 
 def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
@@ -95,18 +126,20 @@ class Usable:
     outside: dict[str, UsableRows]
 
 
-def _usable(leg: Leg, config: Config, judged: bool, found: list[Reason]) -> Usable:
-    offset = offsets(config)
+def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> Usable:
+    offset = stamp_offsets(config)
 
     def rows(slot: str) -> UsableRows:
         sent, t = usable_rows(slot, leg, config, offset[slot], found)
-        return UsableRows(oriented(sent) if judged and hasattr(sent, 'q_ni') else sent, t)
+        if check_faults and hasattr(sent, 'q_ni'):
+            sent = without_invalid_orientations(sent)
+        return UsableRows(sent, t)
 
     imu, t_imu = rows('imu')
-    t_imu = on_rhythm(t_imu, imu.w_i, imu.f_i)
+    t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
     outside = {slot: rows(slot) for slot in OUTSIDE}
     let_go()
-    travelled = wheels(leg, config, rows, found)
+    travelled = travel_of_wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]
     return Usable(imu, t_imu, travelled, *rows('fix'), outside)
@@ -123,26 +156,27 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     height = fix.height if fix.height.any() or (fix.status == LOCAL).any() else np.full(
         len(fix.height), np.nan)
     geodetic = np.stack([fix.latitude, fix.longitude, height], -1)[use]
-    rounding, rounded = rounding_of(geodetic, covariance[use])
+    rounding, rounded = rounding_variance(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
     found += rounded
-    unlike = contradicted(velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance) \
-        if config.gnss.use_velocity else ()
-    found += unlike
-    if unlike:
+    contradiction = velocity_reasons(
+        velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance
+    ) if config.gnss.use_velocity else ()
+    found += contradiction
+    if contradiction:
         outside = outside | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'outside': outside,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
 
 
-def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
+def _inputs_of(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
     imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
         t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=rows.t_imu,
-        w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
-        f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
+        w_b=_rotated(imu.w_i, config.imu.gyro_scale, C_bi),
+        f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
         scale_unit=leg.form.scale_unit, **_travel(leg, rows.wheels), **fixes)
 
@@ -163,7 +197,7 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
     return inputs.mirrored(back)
 
 
-def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
     placed = place(inputs, config)
     if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
@@ -176,14 +210,15 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     steps = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, np.interp(inputs.t_fix, t, track))
+    lost, why = dead_reckoned_fixes(inputs.t_fix, placed.fixes_n, sigma,
+                                    np.interp(inputs.t_fix, t, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
                    covariance_n=inputs.covariance_n[~lost], rounding_n=inputs.rounding_n[~lost],
                    fixes_rejected=inputs.fixes_rejected + int(lost.sum())) if why else inputs
 
 
-def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
+def _rotated(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
     """Return scale * C_bi @ vector_i by row; a matrix product of (n, 3) costs 40 ns a row."""
     if np.array_equal(C_bi, np.eye(3)):
         return vector_i if scale == 1.0 else vector_i * scale

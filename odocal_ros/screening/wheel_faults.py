@@ -1,40 +1,124 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Faults of wheels: one does not count, or counts in the opposite direction.
-
-They are detected from the wheels and the gyro, before attitude or scale is known. With such a
-fault the mean of both wheels is not the travel.
-"""
+"""Two wheels and the gyro on one time grid, and a robust linear fit."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.pieces import medians, runs
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.statistics import GAP_INTERVALS, robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import ROLLS
-from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, TUKEY
+from odocal_ros.settings.config import SIDES
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
+Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
+# robust sigmas beyond which a row has no weight; statistical: 95 % efficient on normal errors
+TUKEY = 4.685
 FAULT_GRID = 0.5          # s, judgement
 STILL_SHARE = 0.02        # judgement: of the other wheel's travel: limit for not moving
 OTHER_WHEEL_COUNTS = 8    # judgement: least counts of the other wheel meanwhile
 
 
-def broken_wheels(axle: Sequence[Travel], imu: Imu,
-                  between: tuple[float, float]) -> tuple[Reason, ...]:
+@dataclass(frozen=True, eq=False)
+class WheelPair:
+    """Travel of both wheels and the vehicle's turn at the edges of equal cells."""
+
+    t: NDArray[np.float64]        # (n,) s
+    left: NDArray[np.float64]     # (n,) scale units
+    right: NDArray[np.float64]    # (n,) scale units
+    turn: NDArray[np.float64]     # (n,) rad about the vehicle's up axis, with gyro bias
+    known: NDArray[np.bool_]      # (n - 1,) cells without a gap
+    quantum: float                # scale units
+    names: tuple[str, ...] = SIDES
+
+    @property
+    def step(self) -> float:
+        """Return the length of a cell, s."""
+        length: float = self.t[1] - self.t[0]
+        return length
+
+    def least_sigma(self, steps: Floats) -> float:
+        """Return the least sigma of steps: rounding, and a part of their median."""
+        return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
+
+
+def wheels_on_grid(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
+                   doubt_t: Sequence[float] | Floats = ()) -> WheelPair | None:
+    """
+    Return the wheels on a grid of ``step`` s, None with fewer than 20 common cells.
+
+    imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
+    """
+    t_imu, w_b, f_b = imu
+    left, right = axle
+    if min(len(left.t), len(right.t), len(t_imu)) < 2:
+        return None
+    begin = max(left.t[0], right.t[0], t_imu[0], between[0])
+    end = min(left.t[-1], right.t[-1], t_imu[-1], between[1])
+    t = begin + step * np.arange(max(0, int((end - begin) / step) + 1))
+    if len(t) < 21:
+        return None
+    up_b = medians(f_b)          # the mean of gravity: roll and pitch of the mounting
+    rate = w_b @ (up_b / max(float(np.linalg.norm(up_b)), 1e-9))
+    known = np.ones(len(t) - 1, bool)
+    for times in (left.t, right.t, t_imu):
+        gap = np.diff(times)
+        for k in np.flatnonzero(gap > max(GAP_INTERVALS * np.median(gap), 0.2)):
+            known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
+    for at in doubt_t:
+        known &= (t[1:] < at - step) | (t[:-1] > at + step)
+    return WheelPair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
+                     max(left.quantum, right.quantum),
+                     tuple(one.name or side for one, side in zip(axle, SIDES, strict=True)))
+
+
+def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floats | None = None,
+               start: Sequence[float] | Floats | None = None) -> tuple[Floats, Floats, float]:
+    """
+    Return x of y = A x by least squares with Tukey's weights, its covariance, sigma of a value.
+
+    A, y : (n, k), (n,) design and values.   floor : least sigma of a value.   prior : (k,) sigmas
+    of the coefficients about zero, inf: free.   start : (k,) coefficients that fit many rows;
+    default: least squares. The sigma is by the median of the residuals.
+    """
+    size = np.abs(A).max(axis=0)
+    size[size == 0] = 1.0
+    A = A / size
+    weak = np.zeros(A.shape[1]) if prior is None else 1 / (np.asarray(prior) * size)**2
+    weight, sigma = np.ones(len(y)), 0.0
+    x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * size
+    tukey_passes = 20
+    for turn in range(tukey_passes):
+        if turn or start is not None:
+            residual = y - A @ x
+            sigma = max(robust_sigma(residual), floor)
+            u = residual / (TUKEY * sigma)
+            # absolute values first (Huber): without a start Tukey's weights can converge anywhere
+            huber = start is None and turn < tukey_passes // 2
+            weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
+                np.abs(u) < 1, (1 - u**2)**2, 0.0)
+        H = (A * weight[:, None]).T @ A + np.diag(weak * max(sigma, floor)**2 + 1e-12 * len(y))
+        x = np.linalg.solve(H, A.T @ (weight * y))
+    return x / size, np.linalg.inv(H) * sigma**2 / np.outer(size, size), sigma
+
+
+def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
+                         between: tuple[float, float]) -> tuple[Reason, ...]:
     """
     Return WHEEL_DEAD and WHEEL_REVERSED, once each, if one wheel fails; () if both count.
 
     axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
     (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with bias.   between : (2,) the marks, s.
     """
-    two = pair(axle, imu, between, FAULT_GRID)
+    two = wheels_on_grid(axle, imu, between, FAULT_GRID)
     if two is None:
         return ()
     steps = np.diff([two.left, two.right])          # (2, n)
@@ -44,23 +128,24 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
         return ()                                   # neither moves: the odometer is still
     if rolled[weak] <= STILL_SHARE * rolled.max():
         return (Reason(Code.WHEEL_DEAD, f'the {two.names[weak]} wheel does not count: its travel '
-                       f'is {in_per_cent(rolled[weak], rolled.max())} of that of the '
+                       f'is {percent_text(rolled[weak], rolled.max())} of that of the '
                        f'{two.names[1 - weak]} wheel (limit {100 * STILL_SHARE:g} %). The mean of '
                        'both is not the travel'),)
     left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
                        'twice'),)
-    held = [_held(two, steps, k) for k in (0, 1)]
-    hung = np.any(held, axis=0)
+    stalled = [_stalled_cells(two, steps, k) for k in (0, 1)]
+    any_stalled = np.any(stalled, axis=0)
     turn = np.diff(two.turn)
-    keep = two.known & ~hung & _rolling(steps, two.quantum).any(axis=0)
+    keep = two.known & ~any_stalled & _rolling(steps, two.quantum).any(axis=0)
     if keep.sum() < 10:
-        return _dead(two, steps, held)
+        return _dead_reasons(two, steps, stalled)
     A = np.stack([steps[0], turn, np.full(len(turn), FAULT_GRID)], -1)
     x, covariance = _line(A[keep], steps[1][keep], two.least_sigma(steps))
-    held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
-    return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0], imu)
+    stalled = [_without_pivots(stalled[k], steps, A, x, k) for k in (0, 1)]
+    return _dead_reasons(two, steps, stalled) + _reversed_reasons(
+        two, steps, A @ x, x[0], covariance[0, 0], imu)
 
 
 def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
@@ -87,7 +172,7 @@ def _rolling(steps: Floats, quantum: float) -> Bools:
     return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
 
 
-def _held(two: Pair, steps: Floats, k: int) -> Bools:
+def _stalled_cells(two: WheelPair, steps: Floats, k: int) -> Bools:
     """Return a mask of cells in which wheel k is still for 2 s or more while the other rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
     still: Bools = two.known & (own <= STILL_SHARE * other) & _rolling(steps, two.quantum)[1 - k]
@@ -98,29 +183,29 @@ def _held(two: Pair, steps: Floats, k: int) -> Bools:
     return still
 
 
-def _not_pivoting(held: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> Bools:
-    """Return the cells of ``held`` in which the wheel is not the centre of a turn."""
-    held = held.copy()
+def _without_pivots(stalled: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> Bools:
+    """Return the cells of ``stalled`` in which the wheel is not the centre of a turn."""
+    stalled = stalled.copy()
     ratio, turn_part = x[0], A[:, 1:] @ x[1:]
-    for a, b in runs(held):
+    for a, b in runs(stalled):
         if k == 1:
             there, alone = (A[a:b] @ x).sum(), ratio * steps[0][a:b].sum()
         else:
             there, alone = steps[1][a:b].sum() - turn_part[a:b].sum(), steps[1][a:b].sum()
         if abs(there) < abs(alone) / 2:
-            held[a:b] = False
-    return held
+            stalled[a:b] = False
+    return stalled
 
 
-def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
+def _dead_reasons(two: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple[Reason, ...]:
     """Return WHEEL_DEAD with the times, for the wheel that is still for longer."""
-    k = int(held[1].sum() > held[0].sum())
-    spans = runs(held[k])
+    k = int(stalled[1].sum() > stalled[0].sum())
+    spans = runs(stalled[k])
     if not len(spans):
         return ()
     first, last = spans[0][0], spans[-1][1]
     other = np.abs(steps[1 - k])
-    lost = other[held[k]].sum()
+    lost = other[stalled[k]].sum()
     after = np.abs(steps[k][last:]).sum() <= STILL_SHARE * other[last:].sum() + two.quantum
     within = np.abs(steps[k][first:]).sum() <= STILL_SHARE * other[first:].sum() + two.quantum
     begin = two.t[first]
@@ -131,20 +216,20 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
                 f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
         where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(after and len(spans) > 1)
     return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where}, in '
-                   f'{in_per_cent(lost, other.sum())} of the travel of the {two.names[1 - k]} '
+                   f'{percent_text(lost, other.sum())} of the travel of the {two.names[1 - k]} '
                    'wheel: the mean of both is not the travel'),)
 
 
-def in_per_cent(part: float, whole: float) -> str:
+def percent_text(part: float, whole: float) -> str:
     """Return a share of a travel as text."""
     return f'{100 * part / whole:.2g} %'
 
 
-def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,
-              imu: Imu) -> tuple[Reason, ...]:
+def _reversed_reasons(two: WheelPair, steps: Floats, expected: Floats, ratio: float,
+                      variance: float, imu: Imu) -> tuple[Reason, ...]:
     """Return WHEEL_REVERSED if the right wheel contradicts left wheel and gyro."""
     if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
-        k = _against_imu(two, steps, imu)
+        k = _wheel_against_imu(two, steps, imu)
         which = (f'the {two.names[k]} wheel counts down when the vehicle drives forward, the '
                  f'{two.names[1 - k]} wheel counts up' if k is not None else
                  'one wheel counts up while the other counts down; the IMU data cannot decide '
@@ -165,7 +250,7 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
                    f'first at t = {two.t[a]:.1f} s for {(b - a) * FAULT_GRID:.1f} s'),)
 
 
-def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
+def _wheel_against_imu(two: WheelPair, steps: Floats, imu: Imu) -> int | None:
     """Return the wheel that accelerates opposite to the IMU's x axis, None if uncertain."""
     t_imu, _, f_b = imu
     push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))

@@ -22,8 +22,12 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.odometer import FEWEST_STEPS, mean_travel, Travel, travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.late_rows import on_time
-from odocal_ros.screening.odometer_care import counter_steps, with_uncertainty, without_false_rows
+from odocal_ros.screening.late_rows import sampling_times
+from odocal_ros.screening.odometer_rows import (
+    counter_steps,
+    with_gap_uncertainty,
+    without_false_rows,
+)
 from odocal_ros.settings.config import Config
 
 SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
@@ -69,7 +73,7 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     if abs(known - middle) <= min(typical, most_off):
         span = known
     elif len(rows) >= fewest_jumps:
-        span, sigma = _measured(value, rows, middle, typical) if whole else (
+        span, sigma = _measured_span(value, rows, middle, typical) if whole else (
             middle, typical / np.sqrt(3 * len(rows)))
     else:
         return None
@@ -80,19 +84,19 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     if agree.mean() < same_span_share:
         return None
     rows = rows[agree]
-    if _taken(value, rows) > span + typical:     # rows out of order, two counters
+    if _value_range(value, rows) > span + typical:     # rows out of order, two counters
         return None
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
 
 
-def _taken(value: Values, rows: Ints) -> float:
+def _value_range(value: Values, rows: Ints) -> float:
     """Return the range of the values before and after the jumps, which is within one span."""
     return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
 
 
-def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
+def _measured_span(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
     """Return a span that is no power of two, and its sigma: the roundest number that fits."""
-    low = _taken(value, rows) + 1
+    low = _value_range(value, rows) + 1
     high = max(low, middle + 2 * slack / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
         span = np.ceil(low / unit) * unit
@@ -101,14 +105,15 @@ def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[f
     return float(round((low + high) / 2)), max(1.0, (high - low) / np.sqrt(12))
 
 
-def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
-             of_one: bool = True) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
+def correct_rollovers(
+        t: Floats, samples: OdometerSamples, step: Floats, name: str, *, only_counter: bool = True,
+        ) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
     Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
 
-    t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
-    steps, rollovers of the type's span corrected.   name : of the counter, in reasons.   of_one :
-    it is the only one. Times are (k,) s, sigmas (k,) counts.
+    t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its steps, rollovers
+    of the type's span corrected.   name : of the counter, in reasons.   only_counter : there is no
+    other one. Times are (k,) s, sigmas (k,) counts.
     """
     span = hidden_span(samples.value, step)
     none = np.empty(0)
@@ -122,8 +127,8 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
     about = f'about {span.size:.0f} (± {span.sigma:.0f})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
     angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
-    code = Code.COUNTER_ROLLOVER if of_one or angle else Code.WHEEL_COUNTERS_DIFFER
-    do = f'Set odometer.wrap to {span.size:.0f}.' if of_one and not angle else ''
+    code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
+    do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
     twice = times > 0.1 * len(step)     # judgement: few counters do so; the steps of two alternate
     found = Reason(code, f'{name} rolls over at {about}, '
                    f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
@@ -165,14 +170,14 @@ class Wheels:
     def _fixed(self) -> list[int]:
         return [k for k, one in enumerate(self.each) if not one.ahead]
 
-    def only(self, wheels: Sequence[Travel]) -> 'Wheels':
+    def only(self, travel_of_wheels: Sequence[Travel]) -> 'Wheels':
         """Return the travel of the given wheels, a part of ``each``, and their uncertain parts."""
         doubts = {one.name: doubt for one, doubt in zip(self.each, self.doubts, strict=True)}
-        return Wheels(tuple(wheels), tuple(doubts[one.name] for one in wheels))
+        return Wheels(tuple(travel_of_wheels), tuple(doubts[one.name] for one in travel_of_wheels))
 
 
-def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
-           found: list[Reason]) -> Wheels:
+def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
+                     found: list[Reason]) -> Wheels:
     """Return the travel of the wheels of a leg; rows: of a slot the usable rows and times, s."""
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
@@ -180,43 +185,45 @@ def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
     if len(slots) == 1 and len(config.odometer.keys) > 1 and len(t):
         found.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                             'marks: only the left wheel is used'))
-    each = [_one(samples, t, leg.form, config, found, names[0])]
+    each = [_corrected_travel(samples, t, leg.form, config, found, names[0])]
     for slot, name in zip(slots[1:], names[1:], strict=True):
         form = leg.form_of(slot)
-        if _words(form) != _words(leg.form):
-            found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes '
-                                f'{_words(form)}, the {names[0]} wheel {_words(leg.form)}: they '
-                                f'cannot be averaged, so only the {names[0]} wheel is used'))
-            return _together(each[:1])
+        if _form_text(form) != _form_text(leg.form):
+            found.append(Reason(
+                Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
+                f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
+                f'{names[0]} wheel is used'))
+            return _joined(each[:1])
         samples, t = rows(slot)
         if not len(t):
             found.append(Reason(Code.WHEEL_DEAD, f'the {name} wheel has no usable value between '
                                 f'the marks: only the {names[0]} wheel is used'))
-            return _together(each[:1])
-        each.append(_one(samples, t, form, config, found, name))
-    return _together(each)
+            return _joined(each[:1])
+        each.append(_corrected_travel(samples, t, form, config, found, name))
+    return _joined(each)
 
 
-def _together(each: list[tuple[Travel, Floats, Floats]]) -> Wheels:
+def _joined(each: list[tuple[Travel, Floats, Floats]]) -> Wheels:
     return Wheels(tuple(one[0] for one in each), tuple(one[1:] for one in each))
 
 
-def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
-         found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
+def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
+                      found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
     name = f"the {side} wheel's counter" if side else 'the counter'
     doubt_t = doubt = np.empty(0)
     if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, why, doubt_t, doubt = unrolled(t, samples, step, name, of_one=not side)
+        samples, why, doubt_t, doubt = correct_rollovers(
+            t, samples, step, name, only_counter=not side)
         found.extend(why)
     samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
-    t = on_time(samples, t, form, found, f'{side} odometer'.strip())
+    t = sampling_times(samples, t, form, found, f'{side} odometer'.strip())
     counts, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
-    counts, more_t, more = with_uncertainty(counts, samples.value, form)
+    counts, more_t, more = with_gap_uncertainty(counts, samples.value, form)
     return replace(counts, name=side), np.append(doubt_t, more_t), np.append(doubt, more)
 
 
-def _words(form: OdometerForm) -> str:
+def _form_text(form: OdometerForm) -> str:
     what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
     return f'{what[form.quantity]} ({form.scale_unit})'

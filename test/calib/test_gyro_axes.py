@@ -20,7 +20,7 @@ from odocal_ros.nav.dead_reckoning import level_track
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.screening.gravity_turn import gravity_fit, GravityFit
+from odocal_ros.screening.gravity_fit import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 

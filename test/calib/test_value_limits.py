@@ -19,7 +19,7 @@ from odocal_ros.calib.track_check import (
 )
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.reasons import Code
-from odocal_ros.screening.facing import imu_sanity
+from odocal_ros.screening.imu_orientation import unit_and_axis_reasons
 from odocal_ros.settings.config import Config, ImuConfig, with_settings
 from odocal_ros.settings.nominal import nominal_scale
 
@@ -101,8 +101,8 @@ class TestImu:
             (2000, 3)) * size / 9.81
         w = 0.002 * rng.standard_normal((2000, 3))
         w[500:520, 2] = fast
-        return imu_sanity(np.median(f, axis=0), w, np.eye(3) if C_bi is None else C_bi,
-                          imu or ImuConfig())
+        return unit_and_axis_reasons(np.median(f, axis=0), w, np.eye(3) if C_bi is None else C_bi,
+                                     imu or ImuConfig())
 
     def test_a_sound_imu_says_nothing(self):
         assert self.say([0, 0, 1]) == ((), False)
@@ -132,7 +132,8 @@ class TestImu:
         assert turned == (code is Code.IMU_LOOKS_Z_DOWN)
 
     def test_an_imu_that_shows_nothing_is_no_crash(self):
-        reasons, turned = imu_sanity(np.zeros(3), np.zeros((50, 3)), np.eye(3), ImuConfig())
+        reasons, turned = unit_and_axis_reasons(
+            np.zeros(3), np.zeros((50, 3)), np.eye(3), ImuConfig())
         assert codes(reasons) == [Code.NO_IMU, Code.NO_IMU]
         assert not turned
 

@@ -16,7 +16,7 @@ from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
-from odocal_ros.screening.wheel_faults import broken_wheels
+from odocal_ros.screening.wheel_faults import broken_wheel_reasons
 
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
@@ -131,10 +131,10 @@ def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
 
 def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
     wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
-    assert broken_wheels(wheels, imu, (0.0, 200.0)) == ()
+    assert broken_wheel_reasons(wheels, imu, (0.0, 200.0)) == ()
     # the same wheels with a gyro that does not turn: dead for a while, and against each other
     still = (imu[0], imu[1] * 0, imu[2])
-    codes = {r.code for r in broken_wheels(wheels, still, (0.0, 200.0))}
+    codes = {r.code for r in broken_wheel_reasons(wheels, still, (0.0, 200.0))}
     assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -142,7 +142,7 @@ def test_a_wheel_without_direction_is_named_in_reverse_gear():
     wheels, imu = robot(right_speed=[0.5, 0.6, -0.3, 0.7, 0.3],
                         left_speed=[0.5, 0.5, -0.3, 0.7, 0.4])
     up = replace(wheels[1], s=np.append(0.0, np.cumsum(np.abs(np.diff(wheels[1].s)))))
-    (reason,) = broken_wheels((wheels[0], up), imu, (0.0, 200.0))
+    (reason,) = broken_wheel_reasons((wheels[0], up), imu, (0.0, 200.0))
     assert reason.code is Code.WHEEL_REVERSED
     assert reason.text.startswith('the right wheel also counts up in reverse')
     assert 'first at t = 20.' in reason.text

@@ -24,7 +24,7 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import FRAME_LONGITUDE, geodetic_of, LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
-from odocal_ros.screening.fix_screen import covariances, placed
+from odocal_ros.screening.fix_screen import covariances, has_position
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
@@ -169,7 +169,7 @@ def test_the_core_sees_every_distance_as_the_frame_has_it(latitude_deg):
 def test_a_frame_at_the_equator_has_an_origin_too():
     """There latitude and longitude zero would mean 'no position'."""
     block = fixes_of([make.pose(1, (0.0, 0.0, 0.0))], reference__latitude_deg=0.0)
-    assert placed(block).all()
+    assert has_position(block).all()
 
 
 @pytest.mark.parametrize('message', [
@@ -205,8 +205,8 @@ def test_an_odometry_as_reference_is_its_pose():
 def test_map_coordinates_and_nan_are_no_positions():
     far = (LARGEST_FRAME + 1.0, 0.0, 0.0)
     block = fixes_of([make.pose(1, (500_000.0, 5_300_000.0, 300.0)), make.pose(2, far),
-                  make.pose(3, (math.nan, 0.0, 0.0)), make.pose(4, (1.0, 2.0, 3.0))])
-    assert placed(block).tolist() == [False, False, False, True]
+                      make.pose(3, (math.nan, 0.0, 0.0)), make.pose(4, (1.0, 2.0, 3.0))])
+    assert has_position(block).tolist() == [False, False, False, True]
 
 
 def test_other_types_are_refused_with_those_that_serve():

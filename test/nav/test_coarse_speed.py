@@ -10,7 +10,7 @@ import pytest
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid, held_speed
 from odocal_ros.nav.odometer import travel
-from odocal_ros.screening.odometer_care import with_uncertainty
+from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.wheels import coarse, held
 
@@ -219,7 +219,7 @@ BAND = 0.25
 def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
     zeroed = np.where(np.abs(TO_AND_FRO) < BAND, 0.0, TO_AND_FRO)
     raw, _ = travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
-    way, t, sigma = with_uncertainty(raw, zeroed, RATE)
+    way, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
     true, _ = travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
     lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
     left = np.abs(np.diff(way.s)).sum() - np.abs(np.diff(true.s)).sum()
@@ -234,6 +234,6 @@ def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
 
 def test_a_speed_that_falls_to_zero_stays_as_it_is():
     exact, _ = travel(AT, TO_AND_FRO, RATE)
-    way, t, _ = with_uncertainty(exact, TO_AND_FRO, RATE)
+    way, t, _ = with_gap_uncertainty(exact, TO_AND_FRO, RATE)
     np.testing.assert_array_equal(way.s, exact.s)
     assert not len(t)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.reasons import Code
-from odocal_ros.screening.fix_screen import reckoned
+from odocal_ros.screening.fix_screen import dead_reckoned_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
@@ -54,8 +54,8 @@ def stated(sigma):
 @pytest.mark.parametrize('sigma', [0.05, 0.5])
 def test_a_tunnel_is_found_with_its_ends_at_a_standstill_too(sigma, length, stop):
     begin, end = 150, 150 + length
-    found, why = reckoned(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
-                          1j * driven(stop))
+    found, why = dead_reckoned_fixes(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
+                                     1j * driven(stop))
     assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
     assert f'to {end - 1} s' in why[0].text
     # the window holds three rows of noise at most
@@ -67,7 +67,7 @@ def test_a_tunnel_is_found_with_its_ends_at_a_standstill_too(sigma, length, stop
 def test_fixes_of_one_moment_are_too_few():
     t = at_s * 1e-6       # stamps whose nanoseconds the driver divides by 1000
     with np.errstate(all='raise'):
-        found, why = reckoned(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
+        found, why = dead_reckoned_fixes(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
     assert not found.any()
     assert not why
 
@@ -76,7 +76,7 @@ def test_fixes_of_one_moment_are_too_few():
 def test_noise_and_a_wrong_fix_are_none(sigma):
     fixes = received(sigma, (0, 0))
     fixes[200:230, 0] += 20.0          # a false fix, and back
-    found, why = reckoned(at_s, fixes, stated(sigma), 1j * driven())
+    found, why = dead_reckoned_fixes(at_s, fixes, stated(sigma), 1j * driven())
     assert not found.any()
     assert not why
 
@@ -87,7 +87,7 @@ def test_satellites_that_change_are_no_tunnel(change):
     fixes = received(0.1, (0, 0))
     fixes[150:200] = received(0.0, (0, 0))[150:200] + fixes[149] - received(0.0, (0, 0))[149]
     fixes[200:, 0] += change
-    found, why = reckoned(at_s, fixes, stated(1.4), 1j * driven())
+    found, why = dead_reckoned_fixes(at_s, fixes, stated(1.4), 1j * driven())
     assert bool(why) == (change > 1.4)
     assert found.any() == (change > 1.4)
 
@@ -107,8 +107,8 @@ def test_an_odometer_that_is_late_at_each_braking_is_no_tunnel(lag, tunnel):
     noise = 0.003 * stream(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
     inside = tunnel & (at_s >= 210) & (at_s < 226)
     place = true + np.where(inside, 0.02 * (true - true[210]), noise)
-    found, why = reckoned(at_s, np.stack([place.real, place.imag, 0 * at_s], -1), stated(0.01),
-                          1j * track)
+    place_n = np.stack([place.real, place.imag, 0 * at_s], -1)
+    found, why = dead_reckoned_fixes(at_s, place_n, stated(0.01), 1j * track)
     assert len(why) == tunnel
     assert not found[(at_s < 168) | (at_s >= 226)].any()      # smooth from the last braking on
     assert found[inside].sum() >= 0.8 * inside.sum()

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening.odometer_care import held_counts
+from odocal_ros.screening.odometer_rows import held_counts
 
 STAND, ROWS = 40, 200
 

@@ -9,10 +9,10 @@ import pytest
 
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
-from odocal_ros.screening.glitches import saturated
-from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.even_imu_times import even_imu_times
+from odocal_ros.screening.glitches import saturation_reasons
+from odocal_ros.screening.imu_faults import alternating_imu_reasons
 from odocal_ros.screening.screen import screen
-from odocal_ros.screening.several_imus import alternating
 from odocal_ros.settings.config import Config, ImuConfig
 from odocal_ros.settings.nominal import G
 
@@ -45,7 +45,7 @@ def rng():
 
 def test_stamps_that_jitter_are_put_on_the_rhythm(rng):
     true = np.arange(SECONDS * RATE) / RATE
-    found = on_rhythm(late(true, rng), *signals(true, rng))
+    found = even_imu_times(late(true, rng), *signals(true, rng))
     # means over 20 s: of 2000 rows each, between them a line
     assert np.abs(found - true - 4e-3).max() < 5 * JITTER / np.sqrt(2000)
     assert (np.diff(found) > 0).all()
@@ -54,14 +54,14 @@ def test_stamps_that_jitter_are_put_on_the_rhythm(rng):
 def test_rows_stamped_in_pairs_are_put_on_the_rhythm(rng):
     true = np.arange(SECONDS * RATE) / RATE
     pairs = np.repeat(true[1::2], 2) + np.tile([0.0, 1e-6], len(true) // 2)
-    found = on_rhythm(pairs, *signals(true, rng))
+    found = even_imu_times(pairs, *signals(true, rng))
     # the first of two is stamped an interval later than it was taken, the second as it was
     np.testing.assert_allclose(found - true, 0.5 / RATE, atol=2e-6)
 
 
 def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
     asked = np.sort(np.arange(SECONDS * RATE) / RATE + JITTER * rng.standard_normal(12000))
-    assert on_rhythm(asked, *signals(asked, rng)) is asked
+    assert even_imu_times(asked, *signals(asked, rng)) is asked
 
 
 @pytest.mark.parametrize('t', [
@@ -69,7 +69,7 @@ def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
     np.cumsum(np.random.default_rng(3).exponential(0.01, 12000))],
     ids=['even', 'few', 'at once', 'none', 'at random'])
 def test_what_shows_no_rhythm_stays(rng, t):
-    np.testing.assert_array_equal(on_rhythm(t, *signals(t, rng)), t)
+    np.testing.assert_array_equal(even_imu_times(t, *signals(t, rng)), t)
 
 
 @pytest.mark.parametrize('noise', [0.01, 0.0])
@@ -77,7 +77,7 @@ def test_noise_alone_tells_no_rhythm(rng, noise):
     true = np.arange(SECONDS * RATE) / RATE
     stamps = late(true, rng)
     w, f = signals(true, rng, vibration=0.0, noise=noise)
-    assert on_rhythm(stamps, w, f + 9.81) is stamps
+    assert even_imu_times(stamps, w, f + 9.81) is stamps
 
 
 def test_lost_rows_move_no_others(rng):
@@ -86,7 +86,7 @@ def test_lost_rows_move_no_others(rng):
     kept[rng.integers(500, len(true) - 500, 16)] = False
     true = true[kept]
     stamps = late(true, rng)
-    found = on_rhythm(stamps, *signals(true, rng))
+    found = even_imu_times(stamps, *signals(true, rng))
     left = np.abs(found - true - 4e-3)
     # a row lost in the first or last quarter of a block moves its mean by less than is seen
     assert np.median(left) < 0.1 * JITTER
@@ -102,7 +102,7 @@ def shaken(size, step=0.0):
 
 
 def words(*signals, imu=None):
-    reasons = saturated(T, *signals, imu or ImuConfig())
+    reasons = saturation_reasons(T, *signals, imu or ImuConfig())
     assert {reason.code for reason in reasons} <= {Code.IMU_SATURATED}
     return [reason.text for reason in reasons]
 
@@ -161,7 +161,8 @@ def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
 @pytest.mark.parametrize('repeat', [1, 2])
 def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repeat):
     imu = drive(scenario='yard', duration=250.0, imu_grade=grade, imu_rate=rate, seed=9).leg().imu
-    assert not alternating(*(np.repeat(x[::repeat], repeat, axis=0) for x in (imu.w_i, imu.f_i)))
+    assert not alternating_imu_reasons(
+        *(np.repeat(x[::repeat], repeat, axis=0) for x in (imu.w_i, imu.f_i)))
 
 
 @pytest.mark.parametrize(('off_hz', 'on_s'), [(0.002, 60.0), (0.0, 40.0), (0.001, 40.0)])
@@ -169,15 +170,15 @@ def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repea
 def test_a_vibration_at_half_the_rate_is_no_second_imu(leg, off_hz, on_s, size):
     t = seconds(leg, leg.imu)
     shaken = size * np.cos(2 * np.pi * (25.0 - off_hz) * t + 1.0) * (t % 60.0 < on_s)
-    assert not alternating(leg.imu.w_i, leg.imu.f_i + shaken[:, None])
-    assert not alternating(leg.imu.w_i + 0.01 * shaken[:, None], leg.imu.f_i)
+    assert not alternating_imu_reasons(leg.imu.w_i, leg.imu.f_i + shaken[:, None])
+    assert not alternating_imu_reasons(leg.imu.w_i + 0.01 * shaken[:, None], leg.imu.f_i)
 
 
 @pytest.mark.parametrize('drift', [0.0, 0.1])
 def test_biases_that_drift_are_of_two_imus(leg, drift):
     t = seconds(leg, leg.imu)[:, None]
-    assert alternating(second(leg.imu.w_i, lambda w: w + BIAS * (1 + drift * t / t[-1])),
-                       leg.imu.f_i)
+    assert alternating_imu_reasons(
+        second(leg.imu.w_i, lambda w: w + BIAS * (1 + drift * t / t[-1])), leg.imu.f_i)
 
 
 @pytest.mark.parametrize('seed', [8, 9, 11, 12, 14])
@@ -186,10 +187,10 @@ def test_a_section_that_tilts_and_vibrates_more_is_no_second_imu(seed):
     lifted = (np.arange(N) > 0.9 * N)[:, None]
     f = np.array([0.0, 0.0, G]) + rng.standard_normal((N, 3)) * np.where(lifted, 0.072, 0.006)
     f[:, 0] -= 1.4 * lifted[:, 0] * np.sin(np.linspace(0.0, 10 * np.pi, N))**2
-    assert not alternating(NONE, f)
+    assert not alternating_imu_reasons(NONE, f)
 
 
 def test_a_spike_is_no_second_imu(leg):
     w = leg.imu.w_i.copy()
     w[len(w) // 2] += 50.0
-    assert not alternating(w, leg.imu.f_i)
+    assert not alternating_imu_reasons(w, leg.imu.f_i)

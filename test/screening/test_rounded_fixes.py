@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.nav.earth import radii
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening.rounded_fixes import rounding_of
+from odocal_ros.screening.rounded_fixes import rounding_variance
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import stream
 
@@ -67,7 +67,7 @@ def errors(kind, geodetic):
     (decimals(6), (1e-6, 1e-6))])
 def test_equal_coordinates_have_one_error_that_is_uniform_in_the_step(kind, steps_deg):
     made, error = errors(kind, fixes())
-    variance, why = rounding_of(made, stated(made))
+    variance, why = rounding_variance(made, stated(made))
     step = np.deg2rad(steps_deg) * RADII
     # closed form: the mean of the standstill has the variance of one rounding
     np.testing.assert_allclose(variance[-STOP:, :2].mean(axis=0) / STOP, step**2 / 12, rtol=0.1)
@@ -83,7 +83,7 @@ def test_means_of_standstills_are_as_uncertain_as_stated():
     z = []
     for seed in range(40):
         made, error = errors(nmea, fixes(seed))
-        variance, _ = rounding_of(made, stated(made))
+        variance, _ = rounding_variance(made, stated(made))
         z.append(error[-STOP:].mean(axis=0) / np.sqrt(variance[-STOP:, :2].mean(axis=0) / STOP))
     # statistical: a uniform error, 80 values: its rms has a sigma of 0.05
     assert abs(np.sqrt(np.mean(np.square(z))) - 1) < 0.2
@@ -91,7 +91,7 @@ def test_means_of_standstills_are_as_uncertain_as_stated():
 
 def test_a_coordinate_that_hardly_changes_has_the_step_of_the_other():
     made, _ = errors(nmea, fixes(side=0.002))
-    variance, _ = rounding_of(made, stated(made))
+    variance, _ = rounding_variance(made, stated(made))
     step = np.deg2rad(1e-4 / 60) * MERIDIAN
     assert len(np.unique(made[:, 0])) < 5
     equal = np.argmin(made[::-1, 0] == made[-1, 0])     # fixes up to the end, more than the stop
@@ -103,7 +103,7 @@ def test_a_coordinate_that_hardly_changes_has_the_step_of_the_other():
         fixes()[:100], 5, axis=0), fixes() * [-1, 1, 1], fixes()[-STOP - 3:]],
     ids=['drive', 'one', 'none', 'held', 'repeated', 'south', 'parked'])
 def test_ordinary_doubles_are_not_rounded(geodetic):
-    variance, why = rounding_of(geodetic, stated(geodetic))
+    variance, why = rounding_variance(geodetic, stated(geodetic))
     assert variance.shape == geodetic.shape
     assert not variance.any()
     assert not why
@@ -112,7 +112,7 @@ def test_ordinary_doubles_are_not_rounded(geodetic):
 def test_a_step_far_below_the_stated_sigma_is_no_reason():
     for kind, sigma in ((decimals(8), 0.01), (decimals(7), 0.01), (decimals(6), 0.7)):
         made, _ = errors(kind, fixes())
-        variance, why = rounding_of(made, stated(made, sigma))
+        variance, why = rounding_variance(made, stated(made, sigma))
         assert variance[:, :2].all()
         assert not why
 

@@ -210,7 +210,7 @@ def test_the_motion_alone_is_that_of_the_whole_screening(options):
                  **options)
     leg = spoilt(some.leg(), 'imu', w_i=(slice(1500, 3500), 0.5), q_ni=(slice(40, 60), 1e200))
     whole, found = screen(leg, settings(some))
-    alone, _ = screen(leg, settings(some), judged=False)
+    alone, _ = screen(leg, settings(some), check_faults=False)
     assert Code.IMU_GAP in {r.code for r in found}        # which the search for legs does not ask
     for name in ('t_imu', 'w_b', 'f_b', 't_fix', 'geodetic', 'covariance_n'):
         np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))

@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.axles import axles_of
+from odocal_ros.screening.axles import pair_wheels
 from odocal_ros.settings import levels
 from odocal_ros.settings.config import Config, SIDES
 from odocal_ros.settings.levels import TRACK_WIDTH
@@ -86,7 +86,7 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
 
 def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the names of the track widths, and the left and the right wheel of each."""
-    axles = [axle for axle in axles_of(names) if len(axle) == len(SIDES)]
+    axles = [axle for axle in pair_wheels(names) if len(axle) == len(SIDES)]
     return {'_'.join(('track_width', *(axle if axle != SIDES else ()))): axle for axle in axles}
 
 

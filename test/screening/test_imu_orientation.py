@@ -17,9 +17,15 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, wrap
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.screening.facing import accelerations, axes_reasons, Facing, facing, toward
-from odocal_ros.screening.imu_changes import turned_about, turned_over
-from odocal_ros.screening.reversing import doubled, reversed_starts
+from odocal_ros.screening.imu_faults import forward_turn_reasons, gravity_turn_reasons
+from odocal_ros.screening.imu_orientation import (
+    accelerations,
+    corrected_forward_axis,
+    estimate_orientation,
+    ImuOrientation,
+    orientation_reasons,
+)
+from odocal_ros.screening.reversing import reversed_starts, sections_slipped_twice
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
@@ -40,7 +46,7 @@ def town(yaw, **options):
 def seen(made, leg=None, **scale):
     inputs, _ = screen(leg or made.leg(), settings(made))
     inputs = replace(inputs, w_b=inputs.w_b * scale.get('gyro', 1.0))
-    return facing(inputs, made.options.nominal_scale)
+    return estimate_orientation(inputs, made.options.nominal_scale)
 
 
 @pytest.mark.parametrize('yaw', [1.0, 40.0, 90.0, -170.0])
@@ -67,31 +73,33 @@ def test_nothing_is_seen_where_nothing_pushes():
 
 
 def test_what_is_far_off_is_said_by_its_side_and_size():
-    assert axes_reasons(None, np.nan) == ()
+    assert orientation_reasons(None, np.nan) == ()
     for yaw in (0.0, 60.0, -60.0, 75.0):
-        assert axes_reasons(Facing(yaw * DEG, 1 * DEG), np.nan) == ()
-    left, = axes_reasons(Facing(-90 * DEG, 1 * DEG), np.nan)
+        assert orientation_reasons(ImuOrientation(yaw * DEG, 1 * DEG), np.nan) == ()
+    left, = orientation_reasons(ImuOrientation(-90 * DEG, 1 * DEG), np.nan)
     assert left.code is Code.IMU_AXES
     assert 'to the left in the IMU frame (yaw mounting -90 deg, ± 1)' in left.text
-    right, = axes_reasons(Facing(90 * DEG, 1 * DEG), np.nan)
+    right, = orientation_reasons(ImuOrientation(90 * DEG, 1 * DEG), np.nan)
     assert 'to the right' in right.text
-    back, = axes_reasons(Facing(-179 * DEG, 1 * DEG), np.nan)
+    back, = orientation_reasons(ImuOrientation(-179 * DEG, 1 * DEG), np.nan)
     assert back.code is Code.ODOMETER_REVERSED
-    assert axes_reasons(Facing(-179 * DEG, 1 * DEG), np.pi) == ()      # as the settings have it
+    # as configured
+    assert orientation_reasons(ImuOrientation(-179 * DEG, 1 * DEG), np.pi) == ()
     # said as it is seen, whatever the nominal
-    ahead, = axes_reasons(Facing(0.0, 1 * DEG), np.pi)
+    ahead, = orientation_reasons(ImuOrientation(0.0, 1 * DEG), np.pi)
     assert ahead.code is Code.ODOMETER_REVERSED
     assert 'forwards in the IMU frame (yaw mounting +0 deg, ± 1, nominal +180)' in ahead.text
-    ahead, = axes_reasons(Facing(0.0, 1 * DEG), 90 * DEG)
+    ahead, = orientation_reasons(ImuOrientation(0.0, 1 * DEG), 90 * DEG)
     assert ahead.code is Code.IMU_AXES
     assert 'accelerations point forwards' in ahead.text
 
 
 def test_only_a_far_forward_axis_is_turned():
     f = 0.02 * forward_b(0.02, 0.01)
-    assert toward(None, f) is f
-    assert toward(Facing(5 * DEG, 1 * DEG), f) is f
-    yaw, pitch = mounting_from_forward(toward(Facing(40 * DEG, 1 * DEG), f))
+    assert corrected_forward_axis(None, f) is f
+    assert corrected_forward_axis(ImuOrientation(5 * DEG, 1 * DEG), f) is f
+    yaw, pitch = mounting_from_forward(
+        corrected_forward_axis(ImuOrientation(40 * DEG, 1 * DEG), f))
     # the vertical share stays, and is divided by another cosine
     assert [yaw, np.sin(pitch) * np.cos(yaw)] == pytest.approx(
         [40 * DEG, f[2] / 0.02 * np.cos(40 * DEG) / np.cos(0.02)], rel=1e-9)
@@ -166,8 +174,8 @@ def test_a_moved_imu_rejects_the_leg_with_the_time(rpy_deg, text, share):
 def test_slopes_and_turns_move_no_imu(options):
     made = drive(**TOWN | options)
     inputs, _ = screen(made.leg(), settings(made))
-    assert turned_over(inputs) == ()
-    assert turned_about(accelerations(inputs, made.options.nominal_scale)) == ()
+    assert gravity_turn_reasons(inputs) == ()
+    assert forward_turn_reasons(accelerations(inputs, made.options.nominal_scale)) == ()
 
 
 def test_a_bend_of_one_g_moves_no_imu():
@@ -175,7 +183,7 @@ def test_a_bend_of_one_g_moves_no_imu():
     inputs, _ = screen(made.leg(), settings(made))
     force = inputs.f_b.copy()
     force[len(force) // 2:] += [0.0, 11.0, 0.0]
-    assert turned_over(replace(inputs, f_b=force)) == ()
+    assert gravity_turn_reasons(replace(inputs, f_b=force)) == ()
 
 
 def reasons_of(leg, config):
@@ -220,10 +228,11 @@ def test_a_stretch_that_slips_by_twice_its_way_was_reversed():
     travel, *_ = starts([8.0, 8.0, 8.0])
     def slip(metres):
         return [{'t': 19.0, 'duration': 8.0, 'metres': metres}]
-    ((begin, end),) = doubled(slip(76.0), travel, 1.0)
+    ((begin, end),) = sections_slipped_twice(slip(76.0), travel, 1.0)
     assert (begin, end) == (pytest.approx(18.0, abs=1.5), pytest.approx(28.0, abs=1.5))
-    assert len(doubled(slip(40.0), travel, 1.0)) == 0, 'a wheel that spins on the spot'
-    assert len(doubled([], travel, 1.0)) == 0
+    # a wheel that spins on the spot
+    assert len(sections_slipped_twice(slip(40.0), travel, 1.0)) == 0
+    assert len(sections_slipped_twice([], travel, 1.0)) == 0
     back = travel.mirrored(np.array([[begin, end]]))
     # 3 runs of 40 m (sin^2 of 8 m/s for 10 s), of which one is driven back
     assert (travel.s[-1], back.s[-1]) == (pytest.approx(120.0, rel=1e-3),

@@ -11,8 +11,8 @@ import pytest
 
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening import clock_offset
-from odocal_ros.screening.clock_offset import OFFSET_CELL
+from odocal_ros.screening import clocks
+from odocal_ros.screening.clocks import OFFSET_CELL
 
 LABELS = {'odometer': {'odometer'}, 'fix': {'fix'}, 'imu': {'odometer', 'fix'}}
 
@@ -69,9 +69,9 @@ def test_a_leg_shorter_than_a_change_of_speed_is_not_aligned(made, seconds):
 def test_nothing_is_aligned_without_accelerations():
     """At a constant speed no offset is better than another; 0.3 m/s of noise is no motion."""
     rng = np.random.default_rng(1)
-    assert clock_offset._late(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) == 0.0
+    assert clocks._delay(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) == 0.0
     steady = np.zeros((1200, 1))
-    assert clock_offset._late(steady, steady) == 0.0
+    assert clocks._delay(steady, steady) == 0.0
 
 
 @pytest.mark.parametrize('by', [-7.3, 0.0, 3.37, 60.0])
@@ -86,7 +86,7 @@ def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
 
     x = signal(t) - signal(t).mean()
     y = signal(t - by) - signal(t - by).mean() + 0.3 * rng.normal(size=(len(t), 1))
-    assert clock_offset._late(y, x) == pytest.approx(by, abs=OFFSET_CELL / 4)
+    assert clocks._delay(y, x) == pytest.approx(by, abs=OFFSET_CELL / 4)
 
 
 def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
@@ -97,4 +97,4 @@ def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
     x, y = (np.exp(-((t[:, None] - bumps - by) / 6)**2 / 2).sum(axis=1, keepdims=True)
             for by in (0.0, 1.4))
     x, y = x - x.mean(), y - y.mean() + 0.4 * x.std() * rng.normal(size=x.shape)
-    assert clock_offset._late(y, x) == 0.0
+    assert clocks._delay(y, x) == 0.0

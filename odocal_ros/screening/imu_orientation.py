@@ -26,7 +26,7 @@ from odocal_ros.settings.nominal import G
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain has an error of 1/6
-WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
+DIRECTIONS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 AXES = 'xyz'
 # no result from such an IMU; further reasons would repeat the cause
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
@@ -57,7 +57,7 @@ class Accelerations:
 
 
 @dataclass(frozen=True)
-class Facing:
+class ImuOrientation:
     """Yaw mounting angle by the accelerations, rad, and its sigma."""
 
     yaw: float
@@ -68,8 +68,8 @@ class Facing:
     inward_sigma: float = np.nan
 
 
-def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
-           metres_per_unit: float) -> Accelerations | None:
+def bin_accelerations(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
+                      metres_per_unit: float) -> Accelerations | None:
     """
     Return the accelerations of a drive, None if it is too short.
 
@@ -99,18 +99,18 @@ def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | Non
     """Return the changes of the accelerations of a leg, None if it is too short."""
     mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))
-    found = pushes(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
-                   metres_per_unit) if size else None
+    found = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
+                              metres_per_unit) if size else None
     return None if found is None else found.changes()
 
 
-def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
+def estimate_orientation(inputs: Inputs, metres_per_unit: float) -> ImuOrientation | None:
     """Return the IMU orientation in the vehicle, None if the drive does not determine it."""
     found = accelerations(inputs, metres_per_unit)
-    return None if found is None else facing_of(found)
+    return None if found is None else orientation_of(found)
 
 
-def facing_of(found: Accelerations) -> Facing | None:
+def orientation_of(found: Accelerations) -> ImuOrientation | None:
     """
     Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
 
@@ -132,11 +132,11 @@ def facing_of(found: Accelerations) -> Facing | None:
     if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
-    return Facing(float(-np.arctan2(forward[1], forward[0])), float(sigma),
-                  float((gain[1] / gain[0]).real), float(inward_sigma))
+    return ImuOrientation(float(-np.arctan2(forward[1], forward[0])), float(sigma),
+                          float((gain[1] / gain[0]).real), float(inward_sigma))
 
 
-def toward(found: Facing | None, f: Floats) -> Floats:
+def corrected_forward_axis(found: ImuOrientation | None, f: Floats) -> Floats:
     """Return scale times forward axis, (3,), turned to the IMU orientation if that is far off."""
     yaw, pitch = mounting_from_forward(f)
     near_facing = np.deg2rad(10.0)    # from the forward axis of a method: no effect on slips
@@ -145,13 +145,13 @@ def toward(found: Facing | None, f: Floats) -> Floats:
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
 
-def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]:
+def orientation_reasons(found: ImuOrientation | None, nominal_yaw: float) -> tuple[Reason, ...]:
     """Return IMU_AXES or ODOMETER_REVERSED if the yaw of the IMU is far from nominal, rad."""
     if found is None:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
     off = abs(float(wrap(found.yaw - nominal)))
-    direction = WAYS[round(found.yaw / (np.pi / 2)) % 4]
+    direction = DIRECTIONS[round(found.yaw / (np.pi / 2)) % 4]
     seen = f'{np.rad2deg(found.yaw):+z.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
         seen += f', nominal {np.rad2deg(nominal):+z.0f}'
@@ -168,8 +168,8 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
                    f'(yaw mounting {seen}): the body frame is not forward-left-up'),)
 
 
-def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
-               imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
+def unit_and_axis_reasons(mean: Floats, w_b: Floats, C_bi: Floats,
+                          imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
     """
     Return reasons about units and axes of an IMU, and True if it must be turned over (z down).
 

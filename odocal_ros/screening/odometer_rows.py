@@ -19,7 +19,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel, without_rollover
 from odocal_ros.nav.statistics import MISSING_INTERVALS
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.glitches import beyond, speed_glitches
+from odocal_ros.screening.glitches import is_impossible, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
 # counts, rad, m: smaller travel is not reported
@@ -75,7 +75,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     for j in jumps:
         if j <= done:
             continue
-        stall = _stall(step, j)
+        stall = _stall_begin(step, j)
         ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= excursion_time]
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
@@ -116,15 +116,15 @@ def held_counts(value: Values, modulus: int) -> Bools:
 def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     """Return True if the counter continues from step a to after step b at adjacent speeds."""
     length = t[b + 1] - t[a]
-    travels = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
-                                         rate[b + 1:b + 1 + STEPS_BESIDE])]
+    travels = [_median_or_zero(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
+                                                     rate[b + 1:b + 1 + STEPS_BESIDE])]
     continuation_share = 0.5    # of the expected travel: limit for a counter that continues
     slack = continuation_share * max(abs(w) for w in travels) + 3
     return bool(min(travels) - slack <= net <= max(travels) + slack)
 
 
-def with_uncertainty(travel: Travel, value: Values,
-                     form: OdometerForm) -> tuple[Travel, Floats, Floats]:
+def with_gap_uncertainty(travel: Travel, value: Values,
+                         form: OdometerForm) -> tuple[Travel, Floats, Floats]:
     """Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel."""
     none = np.empty(0)
     if len(travel.t) < FEWEST_STEPS:
@@ -136,14 +136,14 @@ def with_uncertainty(travel: Travel, value: Values,
         sent = counter_steps(value, form.modulus)
         odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
         # a reset: only the adjacent speeds bound the travel since the last count
-        stall = [_stall(step, k) for k in odd.tolist()]
-        most = [max(abs(_usual(rate[max(0, a - STEPS_BESIDE):a])),
-                    abs(_usual(rate[k + 1:][:STEPS_BESIDE])))
+        stall = [_stall_begin(step, k) for k in odd.tolist()]
+        most = [max(abs(_median_or_zero(rate[max(0, a - STEPS_BESIDE):a])),
+                    abs(_median_or_zero(rate[k + 1:][:STEPS_BESIDE])))
                 * (travel.t[k + 1] - travel.t[a]) for a, k in zip(stall, odd, strict=True)]
         return travel, travel.t[odd], np.array(most) / np.sqrt(3)
     odd = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
-    before = np.array([_usual(rate[max(0, k - STEPS_BESIDE):k]) for k in odd])
-    after = np.array([_usual(rate[k + 1:k + 1 + STEPS_BESIDE]) for k in odd])
+    before = np.array([_median_or_zero(rate[max(0, k - STEPS_BESIDE):k]) for k in odd])
+    after = np.array([_median_or_zero(rate[k + 1:k + 1 + STEPS_BESIDE]) for k in odd])
     missing = dt[odd] - (usual if form.quantity == 'increment' else 0.0)
     if form.quantity == 'increment' and len(odd):
         step = step.copy()
@@ -154,14 +154,14 @@ def with_uncertainty(travel: Travel, value: Values,
         np.abs(before), np.abs(after)) / np.sqrt(3)
     lost, sigma = travel.t[odd], spread * missing
     if form.quantity == 'rate':
-        hidden = np.copysign(_hidden(travel, value), step)
+        hidden = np.copysign(_travel_below_threshold(travel, value), step)
         at = np.flatnonzero(hidden)
         travel = replace(travel, s=travel.s + np.concatenate([[0.0], np.cumsum(hidden)]))
         lost, sigma = np.r_[lost, travel.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
     return travel, lost, sigma
 
 
-def _hidden(travel: Travel, value: Values) -> Floats:
+def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
     """Return the travel at speeds published as zero, v^2 / 2a at stops and starts: (n - 1,)."""
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     least = 2 * travel.coarse.step if travel.coarse else 0.0
@@ -170,7 +170,7 @@ def _hidden(travel: Travel, value: Values) -> Floats:
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
         rows = np.arange(edge, edge - STEPS_BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
-                                                                          + STEPS_BESIDE)
+                                                                                + STEPS_BESIDE)
         rows = rows[(rows >= 0) & (rows < len(size))]
         v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
         took = abs(travel.t[rows[-1]] - travel.t[rows[0]])
@@ -181,17 +181,17 @@ def _hidden(travel: Travel, value: Values) -> Floats:
     return hidden
 
 
-def _stall(step: Floats, j: int) -> int:
+def _stall_begin(step: Floats, j: int) -> int:
     """Return the first of the zero steps directly before step j, or j if there are none."""
     moves = np.flatnonzero(step[:j])
     return int(moves[-1]) + 1 if len(moves) else 0
 
 
-def _usual(rate: Floats) -> float:
+def _median_or_zero(rate: Floats) -> float:
     return float(np.median(rate)) if len(rate) else 0.0
 
 
-class Steps:
+class StepReader:
     """Conversion of rows to steps, in odometer units; for a leg see ``nav.odometer.travel``."""
 
     def __init__(self, form: OdometerForm) -> None:
@@ -205,7 +205,7 @@ class Steps:
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """Return step, stamp, ns, and duration, s, of each possible row since the one before."""
-        good = ~beyond('value', block.value)
+        good = ~is_impossible('value', block.value)
         stamps, values = block.stamp_ns[good], block.value[good]
         if self._last is not None:
             stamps = np.r_[self._last[0], stamps]

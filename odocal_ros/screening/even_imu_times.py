@@ -25,21 +25,21 @@ JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is c
 TESTED_ROWS = 20_000      # judgement: largest number of tested rows
 TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance
 BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
-APART = 1e-9              # s, judgement: minimum difference between rows
+LEAST_STEP = 1e-9              # s, judgement: minimum difference between rows
 SURE_SIGMAS = 4.0         # statistical: significance of smoother rows: by chance once in 30,000
 
 
-def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
+def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     """Return the sampling times (n,), s, of rows by stamps t; w, f: (n, 3), in any unit."""
     usual = _interval(t)
     per = int(BLOCK_TIME / usual) if usual > 0 else 0
     if per < 10 or len(t) < WINDOW_BLOCKS * per:
         return t
-    rhythm = _Rhythm(t, usual, per)
+    rhythm = _EvenTimes(t, usual, per)
     tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + BESIDE
     sent, even = t[tested], rhythm.at(t, tested)
     jitters = np.median(np.abs(sent - even)) > JITTER_SHARE * usual
-    if not jitters or not _evener(sent, even, (column[tested] for column in (*w.T, *f.T))):
+    if not jitters or not _is_smoother(sent, even, (column[tested] for column in (*w.T, *f.T))):
         return t
     return rhythm.times(t)
 
@@ -50,7 +50,7 @@ def _interval(t: Floats) -> float:
     return float(np.median(np.diff(stretch))) / 100 if len(stretch) > 1 else 0.0
 
 
-class _Rhythm:
+class _EvenTimes:
     """
     Even times by the mean stamps of blocks without lost rows; other rows keep their stamps.
 
@@ -104,12 +104,12 @@ class _Rhythm:
         found, last = room(len(t)), -np.inf
         for rows in chunks(len(t)):
             own = np.arange(rows.start, rows.stop)
-            part = np.maximum.accumulate(np.maximum(self.at(t, own) - APART * own, last))
-            found[rows], last = part + APART * own, part[-1]
+            part = np.maximum.accumulate(np.maximum(self.at(t, own) - LEAST_STEP * own, last))
+            found[rows], last = part + LEAST_STEP * own, part[-1]
         return found
 
 
-def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
+def _is_smoother(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
     """Return True if (m, 5) values are significantly smoother at other times than at stamps."""
     weights = _weights(sent), _weights(even)
     gain = np.zeros(len(sent))
@@ -127,7 +127,8 @@ def _weights(times: Floats) -> Floats:
     weights = np.full(times.shape, -1.0)
     for i, j in product(NODES, NODES):
         if i != j:
-            apart = times[:, i] - times[:, j]
-            weights[:, i] *= (times[:, HERE] - times[:, j]) / np.where(apart == 0, APART, apart)
+            difference = times[:, i] - times[:, j]
+            weights[:, i] *= (times[:, HERE] - times[:, j]) / np.where(
+                difference == 0, LEAST_STEP, difference)
     weights[:, HERE] = 1.0
     return weights

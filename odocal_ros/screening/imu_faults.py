@@ -1,0 +1,181 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""An IMU that changes during the leg: gravity or forward turns, or its unit or range changes."""
+
+from collections import Counter
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import medians
+from odocal_ros.nav.rotations import wrap
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.imu_orientation import Accelerations, orientation_of
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.config import ImuConfig
+from odocal_ros.settings.nominal import G
+
+# judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter on one side
+LEAST_TURN, SIDE = 45.0, 20.0
+SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; 1.4 in a bend at 45 deg
+# judgement, deg: a larger turn is by reversing with an unsigned counter (180 deg)
+MOST_YAW = 135.0
+YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
+DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
+TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+# judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
+# at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
+LEAST_RATIO, MOST_RATIO = 0.6, 1.6
+MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
+# judgement, of rows that may alternate: rows of a mean; least number of means, and largest, at the
+# end of the leg; ratio of an outlier to the median; share of rows that repeat
+MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLYING, REPEATED = 50, 40, 2000, 10.0, 0.2
+# statistical: F of a constant and the signals in the differences of odd and even rows. For one IMU
+# it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
+SURE_F = 30.0
+# judgement: least explained variance, in variances of a mean of white noise; 8/3 is that of a mean
+# over that of a row. Smooth signals without noise are below it
+LEAST_POWER = 0.1 * 8 / 3
+# judgement: a vibration near half the rate changes its size and phase. Correlation of adjacent
+# residuals, and the slow part of them over the explained part; two IMUs are below one of them
+MOST_CORRELATED, MOST_SLOW = 0.5, 0.05
+
+
+def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
+    """Return the edges of the tenths of the rows, (11,), their median force, (10, 3), or none."""
+    edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
+    if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
+        return edges[:0], np.empty((0, 3))
+    return edges, np.array([medians(inputs.f_b[a:b])
+                            for a, b in zip(edges[:-1], edges[1:], strict=True)])
+
+
+def unit_change_reasons(inputs: Inputs) -> tuple[Reason, ...]:
+    """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
+    edges, force = _tenths(inputs)
+    size = [float(np.linalg.norm(one)) for one in force]
+    odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
+    if not odd or len(odd) == len(size):      # all tenths: the unit of the whole leg
+        return ()
+    begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
+    return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
+                   f'gravity of {size[odd[0]]:.3g} m/s^2 instead of 9.8 m/s^2', 'Check the IMU '
+                   'driver for a change of unit or range during the drive, or mark a leg on one '
+                   'side of it with --leg.'),)
+
+
+def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
+    """Return IMU_AXES if the direction of gravity changes between two tenths of the leg."""
+    edges, force = _tenths(inputs)
+    for k in range(1, len(force) - 1):
+        sides = force[:k], force[k + 1:]
+        before, after = (side.mean(axis=0) for side in sides)
+        # a bend, or another unit, also changes the size
+        size = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
+        if (_angle_between(before, after) > LEAST_TURN and 1 / SAME_SIZE < size < SAME_SIZE
+                and all(_angle_between(one, mean) < SIDE for side, mean in zip(
+                    sides, (before, after), strict=True) for one in side)):
+            begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
+            turn_deg = _angle_between(before, after)
+            return (_moved_reason(f'gravity turns by {turn_deg:.0f} deg', float(begin),
+                                  float(end)),)
+    return ()
+
+
+def forward_turn_reasons(found: Accelerations | None) -> tuple[Reason, ...]:
+    """Return IMU_AXES if the forward direction changes between two tenths of the leg."""
+    if found is None:
+        return ()
+    edges = np.linspace(0, len(found.t), 11).astype(int)
+    seen = []
+    for a, b in zip(edges[1:-2], edges[2:-1], strict=True):
+        sides = orientation_of(found[:a]), orientation_of(found[b:])
+        if sides[0] is None or sides[1] is None:
+            continue
+        turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
+        sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
+        if LEAST_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < MOST_YAW:
+            seen.append((sigma, -turn_deg, float(found.t[a]), float(found.t[b])))
+    if not seen:
+        return ()
+    sigma, turn_deg, begin, end = min(seen)
+    return (_moved_reason(f'the forward direction turns by {turn_deg:+z.0f} '
+                          f'± {max(sigma, 1.0):.0f} deg', begin, end),)
+
+
+def _moved_reason(what: str, begin: float, end: float) -> Reason:
+    return Reason(Code.IMU_AXES, f'{what} in the IMU frame at about t = {begin:.0f} to '
+                  f'{end:.0f} s: the IMU was moved in the vehicle', DO)
+
+
+def _angle_between(one: Floats, other: Floats) -> float:
+    """Return the angle between two vectors, (3,), deg; 0 if one is zero."""
+    sine, cosine = np.linalg.norm(np.cross(one, other)), float(one @ other)
+    return float(np.rad2deg(np.arctan2(sine, cosine)))
+
+
+def other_frame_reasons(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
+    """Return the reasons about messages whose frame_id is not that of the IMU in use."""
+    other = leg.imu_other
+    count, total = len(other.stamp_ns), len(other.stamp_ns) + len(leg.imu.stamp_ns)
+    if not count or (imu.frame_id and len(leg.imu.stamp_ns)):
+        return ()
+    frames = Counter(frame.decode(errors='replace') for frame in other.frame.tolist())
+    names = ', '.join(f'{n} of {frame!r}' for frame, n in frames.most_common(3))
+    used = other.used[-1].decode(errors='replace')
+    if imu.frame_id:
+        return (Reason(Code.NO_IMU, f'no IMU message has the frame_id {used!r} of imu.frame_id; '
+                       f'received: {names}', 'Set imu.frame_id to a frame_id that is sent.'),)
+    if count < MIXED_SHARE * total:
+        return (Reason(Code.BAD_ROWS_DROPPED, f'{count} of {total} IMU messages have another '
+                       f'frame_id than {used!r} ({names}); dropped'),)
+    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic carries several IMUs: '
+                   f'{len(leg.imu.stamp_ns)} messages of {used!r}, {names}; only {used!r} was '
+                   'used', f'Set imu.frame_id to the IMU to calibrate (imu.frame_id: {used!r}), '
+                   'or publish each IMU on its own topic.'),)
+
+
+def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
+    """Return SEVERAL_IMUS if every second row is from another IMU; (n, 3) in any unit."""
+    share = max(_share_of_two(w_i), _share_of_two(f_i))
+    if not share:
+        return ()
+    return (Reason(Code.SEVERAL_IMUS, 'the IMU topic carries two IMUs: every second message has '
+                   f'other axes or biases ({100 * share:.0f} % of the differences between odd and '
+                   'even messages are constant or in proportion to the signal)',
+                   'Stop the second publisher, or publish each IMU on its own topic.'),)
+
+
+def _share_of_two(x: Floats) -> float:
+    """Return the share of odd minus even rows that a second IMU explains, 0: none; x (n, 3)."""
+    x = x[-MOST_MEANS * MEAN_ROWS - 2:]
+    count = (len(x) - 2) // MEAN_ROWS
+    if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED:
+        return 0.0
+    rows = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
+        * (x[1:-1] - (x[:-2] + x[2:]) / 2)
+    parts = rows[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
+    off = parts.mean(axis=1)
+    size = np.abs(off).max(axis=1)
+    good = size <= OUTLYING * np.median(size)
+    mean = x[1:count * MEAN_ROWS + 1].reshape(parts.shape).mean(axis=1)[good]
+    # a section that tilts and vibrates more would explain its own noise: equal noise of all means
+    parts, A = parts[good], np.column_stack([np.ones(len(mean)), mean])
+    noise = np.sqrt((parts**2).mean(axis=(1, 2)))
+    noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
+    off, A, parts = off[good] / noise, A / noise, parts / noise[:, None]
+    free = len(off) - A.shape[1]
+    if free < FEWEST_MEANS // 2:
+        return 0.0
+    rest = off - A @ np.linalg.lstsq(A, off, rcond=None)[0]
+    left, total = (rest**2).sum(axis=0), (off**2).sum(axis=0)
+    slow = (rest[1:] * rest[:-1]).sum(axis=0)
+    explained, power = total - left, (parts**2).mean(axis=(0, 1))
+    sure = (explained * free > SURE_F * A.shape[1] * left) & (
+        explained / len(off) > LEAST_POWER * power / MEAN_ROWS)
+    vibrating = slow > np.maximum(MOST_CORRELATED * left, MOST_SLOW * explained)
+    if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:
+        return 0.0
+    return float((explained[sure] / total[sure]).max(initial=0.0))
