@@ -111,11 +111,18 @@ def _smooth(t: Floats, t_fix: Floats, y: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state and its uncertainty."""
+    """A first state and its uncertainty; its parts give the state for another yaw."""
 
     state: State
     yaw_sigma: float        # rad, of the heading by acceleration
     fix_spread: float       # m, scatter of the fixes about the track
+    leg: SmootherLeg
+    parts: 'list[_Part]'
+    scale: float            # metres per unit of travel
+
+    def with_yaw(self, yaw: float) -> 'Start':
+        """Return the start with this yaw mounting, rad, instead of the one by acceleration."""
+        return replace(self, state=_state_of_parts(self.leg, self.parts, self.scale, yaw))
 
 
 def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
@@ -134,8 +141,8 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     if yaw is None:       # rad: beyond this sigma, the heading is ambiguous
         turned = [np.exp(1j * (part.psi - part.track.chi)) for part in parts]
         yaw = float(np.angle(weight @ turned)) if sigma <= 0.2 else 0.0
-    return Start(_joined([_state(leg, part, K, yaw) for part in parts]), float(sigma),
-                 float(np.median([part.track.spread for part in parts])))
+    return Start(_state_of_parts(leg, parts, K, yaw), float(sigma),
+                 float(np.median([part.track.spread for part in parts])), leg, parts, K)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,8 +303,9 @@ def _state(leg: SmootherLeg, part: _Part, K: float, yaw: float) -> State:
                  np.zeros((N, 3)), constants)
 
 
-def _joined(states: Sequence[State]) -> State:
+def _state_of_parts(leg: SmootherLeg, parts: 'Sequence[_Part]', K: float, yaw: float) -> State:
     """Return the states of adjacent parts as one; each begins where the one before ends."""
+    states = [_state(leg, part, K, yaw) for part in parts]
     columns = [one.of_keyframes() for one in states]
     return replace(states[0], **{name: np.concatenate([
         column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})

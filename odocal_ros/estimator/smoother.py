@@ -103,12 +103,11 @@ def _held(priors: Priors, value: float, sigma: float) -> Priors:
 
 
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
-    nominal, data = nominal_yaw(config), (problem.leg, problem.imu, problem.priors)
-    level = problem.leg.has_accelerometer
-    start = first_state(*data, None if level else nominal)
+    nominal, level = nominal_yaw(config), problem.leg.has_accelerometer
+    start = first_state(problem.leg, problem.imu, problem.priors, None if level else nominal)
     starts, passes = [start], config.leg.compute_limit
     if level and start.yaw_sigma > TWO_HEADINGS:
-        other = first_state(*data, nominal)
+        other = start.with_yaw(nominal)
         turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
         starts += [other] * bool(abs(turned) > TWO_HEADINGS)
     if len(starts) == 1:

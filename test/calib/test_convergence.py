@@ -5,18 +5,21 @@
 
 from dataclasses import replace
 
-from drives import configured
+from drives import configured, settings
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from smoother_legs import made, said as texts, truth
+from smoother_legs import leg_of, made, said as texts, truth
 
+from odocal_ros.data.leg import part_of
 from odocal_ros.estimator import fit, smooth
 from odocal_ros.estimator.chain import Solved
 from odocal_ros.estimator.cold_start import first_state, with_bias
 from odocal_ros.estimator.fit import damped
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.smoother import TWO_HEADINGS
+from odocal_ros.estimator.state import YAW
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
@@ -125,6 +128,24 @@ def test_a_gyro_that_warms_up_is_level_in_each_part_with_fixes(gap, parts):
     # the bias changes by 2 mrad/s in the first part; a level that swings by it over minutes
     angle = np.linalg.norm(rotvec(transpose(true.C_nb) @ start.C_nb), axis=1)
     assert gap or np.percentile(angle, 90) < 0.3
+
+
+def test_a_heading_that_accelerations_do_not_give_is_tried_at_the_nominal_yaw():
+    """Half a lap at one speed with a reversed IMU: from a yaw of 0 the fit diverges."""
+    yaw = 3.0
+    drive = simulate(SimOptions(scenario='oval', duration=300.0, imu_rate=50.0, yaw=yaw,
+                                imu_grade='consumer', seed=3))
+    config = settings(drive, None, imu__nominal_yaw=yaw)
+    begin, end = (drive.leg().start_ns + s * 10**9 for s in (80, 115))
+    leg = leg_of(part_of(drive.leg(), begin, end, begin), config)
+    problem = problem_of(leg, config)
+    start = first_state(leg, problem.imu, problem.priors)
+    assert start.yaw_sigma > TWO_HEADINGS
+    assert start.state.constants[YAW] == 0.0
+    assert_allclose(start.with_yaw(yaw).state.C_nb,
+                    first_state(leg, problem.imu, problem.priors, yaw).state.C_nb)
+    found = smooth(leg, config).estimates['yaw_mounting_angle']
+    assert abs(found.value - yaw) < 3 * found.sigma < 0.05
 
 
 def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
