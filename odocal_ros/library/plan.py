@@ -186,9 +186,10 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     distance, speed, turns, standstill, acceleration : m, m/s, turns of 90 deg, s at rest at either
     end, m/s^2: a drive by its figures.   scenario, duration : name of a simulated drive, and its
     duration, s.   gpx : a GPX track; one without times is driven at ``speed``.   bag, topics : a
-    recorded bag, with the accuracy and rate of its own fixes.   config : as ``calibrate_bag``:
-    IMU grade, heading source and the like.   figures : fields of ``forecast.predict.Sigmas``:
-    fix, fix_up m, fix_rate Hz, quantum m per count, sway m/s, slip m/sqrt(s).
+    recorded bag, with the accuracy and rate of its own fixes; of a journal with its settings and
+    topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.   figures :
+    fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per count,
+    sway m/s, slip m/sqrt(s).
 
     Raises BadUsage, BadConfig: not exactly one drive is given, or its values are invalid.
     """
@@ -204,14 +205,16 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         raise BadUsage(f'--standstill and --turns require --distance, not --{given[0]}')
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise BadUsage(f'--speed {speed:g}: required: a number above 0')
-    settings = config_of(config)
+    from odocal_ros.library.read_bag import journal_notes
+    journal = journal_notes(Path(bag)) if bag else None
+    settings = config_of(config, journal.settings if journal else None)
     own: dict[str, Any] = {}
     if scenario:
         drive = planned_drives.from_scenario(scenario, duration)
     elif gpx:
         drive = planned_drives.from_gpx(Path(gpx), speed)
     elif bag:
-        drive, own = planned_drives.from_bag(Path(bag), settings, dict(topics or {}))
+        drive, own = planned_drives.from_bag(Path(bag), settings, dict(topics or {}), journal)
     elif speed is None:
         raise BadUsage('--distance needs --speed, m/s')
     else:

@@ -6,7 +6,7 @@
 from datetime import datetime, UTC
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.safe_io.limits import read_bytes
 from odocal_ros.settings.config import Config
+
+if TYPE_CHECKING:
+    from odocal_ros.library.read_bag import JournalNotes
 
 LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of it
 MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
@@ -184,20 +187,16 @@ def _smooth(x: Floats, wide: int) -> Floats:
     return mean
 
 
-def from_bag(path: Path, config: Config,
-             topics: dict[str, str]) -> tuple[PlannedDrive, dict[str, float]]:
+def from_bag(path: Path, config: Config, topics: dict[str, str],
+             journal: 'JournalNotes | None') -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.forecast.leg_so_far import figures, profile_of
     from odocal_ros.library.legs import find_legs, marked_legs
-    from odocal_ros.library.read_bag import recorded
-    from odocal_ros.library.topics import choose_topics
-    from odocal_ros.messages.decode import make_reader
+    from odocal_ros.library.read_bag import readers_of, recorded
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
-        chosen = choose_topics(bag.topics, config, topics)
-        readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
-                   for slot, topic in chosen.items()}
+        chosen, readers = readers_of(bag, topics, config, journal)
         recorder = recorded(bag, chosen, readers)
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     inputs, _ = screen(recorder.close(start_ns, stop_ns, config.leg.preroll), config)

@@ -172,7 +172,7 @@ def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
 def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
-                             'rate_hz': info.count / seconds if seconds > 0 else None}
+                             'rate_hz': survey.rate_of(info.count, seconds)}
     if tap is None:
         return facts | ({'trouble': trouble} if trouble else {})
     slot = tap.reader.slot

@@ -37,7 +37,8 @@ def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
     lines = []
     for topic in found['topics']:
         name, kind = one_line(topic['name']), one_line(short[topic['type']])
-        rate = f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] and topic['count'] > 1 else ''
+        rate = '' if topic['count'] < 2 else (
+            f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] else f'{"unknown":>8} Hz')
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
         if str(LOCAL) in topic.get('fix', {}).get('status', ()):
             role += ' (position reference)' if role else 'position reference, if GNSS is not used'
@@ -237,7 +238,7 @@ def whole_degrees(angle: float) -> str:
 
 def _findings(found: dict[str, Any]) -> list[str]:
     if not found['findings']:
-        return ['all data for a calibration is available']
+        return ['all data for a calibration is available'] if found['command'] else []
     lines = []
     for only, title in ((None, 'before calibrating'), (
             'two_point', 'affects the two-point method only')):

@@ -26,7 +26,14 @@ AXES = 'xyz'
 # temperature 0.48 or less; where fix errors are most of the variance (always 1 m/s, fixes of
 # 0.8 m), odometers 0.65
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
+RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; equal stamps have such rates
 FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
+
+
+def rate_of(count: int, seconds: float) -> float | None:
+    """Return a rate, Hz; None if it is unknown, since stamps are equal or almost equal."""
+    rate = count / seconds if seconds > 0 else 0.0
+    return rate if 0 < rate < RATE_LIMIT_HZ else None
 
 
 def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
@@ -51,7 +58,7 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     # mean between the gaps: bursts and gaps are no rate
     running = float(rising.sum() - step[gaps].sum())
     return {
-        'rate_hz': (len(rising) - len(gaps)) / running if running > 0 else None,
+        'rate_hz': rate_of(len(rising) - len(gaps), running),
         'headerless': headerless,
         'header_to_bag': None if headerless or not len(lag) else median(lag),
         'header_to_bag_spread': None if headerless or not len(lag) else float(

@@ -4,6 +4,7 @@
 """odocal try: inspect a bag, replay it with the suggested options, open the report."""
 
 import argparse
+from collections.abc import Collection
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -20,6 +21,17 @@ if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
     from odocal_ros.settings.config import Config
 
+# why the inspection suggests a setting; imu.mounting_rpy has its own text
+SETTING_REASONS = {
+    'imu.accel_scale': 'the mean specific force is about 1, so its unit is g',
+    'imu.gyro_scale': 'turn rates exceed those of a vehicle in rad/s, so their unit is deg/s',
+    'gnss.max_sigma': 'the stated sigma of most fixes exceeds the limit',
+    'odometer.field': 'this value grows with the distance between the fixes',
+    'odometer.quantity': 'with this meaning the value grows with the distance between the fixes',
+    'odometer.wrap': 'the counter restarts at this value',
+    'odometer.reversed': 'the counts decrease on most of the drive'}
+BY_TOPIC_NAME = 'the names of two topics only differ in left and right'
+BY_MOTION = 'it moves as a wheel; its side is known from its name or from the gyro'
 # what to do if a slot has no topic
 MISSING = {'imu': 'record sensor_msgs/Imu', 'odometer': 'select an odometer of another type with '
            f'{topic_option("odometer")} TOPIC', 'fix': 'convert positions of another type to '
@@ -42,13 +54,16 @@ def run(args: argparse.Namespace) -> int:
     found, choices = _look(args)
     if not found['command']:
         from odocal_ros.offline.inspection_text import text
-        say(text(found))
         missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
+        # the error below states the missing topics
+        codes = {f'NO_{slot.upper()}' for slot in missing}
+        say(text(found | {'open': '', 'findings': [
+            finding for finding in found['findings'] if finding['code'] not in codes]}))
         labels = ', '.join(INPUTS[slot].label for slot in missing)
         raise BadData(f'{args.bag}: no topic was found for: {labels}; '
                       + '; '.join(MISSING[slot] for slot in missing))
     options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
-    say('\n'.join(_overview(found, choices, options)))
+    say('\n'.join(_overview(found, choices, options, args.settings)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
     code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
@@ -141,10 +156,10 @@ def _own_options(args: argparse.Namespace) -> list[str]:
     return words + ['--strict'] * args.strict
 
 
-def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> list[str]:
+def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
+              own_settings: Collection[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.output.figures import wrapped
-    from odocal_ros.settings.config import SETTINGS
     because = {one.slot: f', because {one.why}; other candidates: {", ".join(one.others)} '
                f'({topic_option(one.slot)})' for one in choices}
     lines = ['topics']
@@ -154,20 +169,26 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str])
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)
     for setting in settings:
-        name = setting.partition('=')[0]
-        why = _why_mounting(found['mounting']) if name == 'imu.mounting_rpy' else ''
-        lines += wrapped(f'{setting}: {why or SETTINGS[name].about}')
+        lines += wrapped(f'{setting}: {_setting_reason(setting, found, own_settings)}')
     legs = [value for option, value in pairs if option == '--leg'] or [
         f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['legs']]
     lines += ['legs, seconds from the first message'] * bool(legs)
     return [*lines, *wrapped(', '.join(legs)), '']
 
 
-def _why_mounting(mounting: dict[str, Any] | None) -> str:
-    """Return the source of the IMU orientation; '' if it is not estimated."""
+def _setting_reason(setting: str, found: dict[str, Any], own_settings: Collection[str]) -> str:
+    """Return the reason why a setting has its value for this bag."""
+    name, _, value = setting.partition('=')
+    if setting in own_settings:
+        return 'given by --set'
+    if name == 'imu.mounting_rpy':
+        return _mounting_reason(found['mounting'])
+    return SETTING_REASONS.get(name) or (BY_TOPIC_NAME if value == 'topic' else BY_MOTION)
+
+
+def _mounting_reason(mounting: dict[str, Any]) -> str:
+    """Return the source of the IMU orientation."""
     from odocal_ros.offline.inspection_text import whole_degrees
-    if not mounting or not mounting['needed']:
-        return ''
     if mounting['assumed_forward']:
         return 'up is measured from gravity; x is assumed to be forward'
     return ('up is measured from gravity, forward from accelerations and turns '

@@ -140,4 +140,5 @@ def save_figure(figure: Any, path: Path) -> None:
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise BadUsage(f'--plot {path}: cannot be written ({error.strerror})') from None
+        raise BadUsage(f'{path}: cannot be written ({error.strerror}); give a writable '
+                       'folder') from None

@@ -326,6 +326,12 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     own = asked(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
     assert own['sigmas']['pulse'] == 0.1
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
+    (bag / 'journal.yaml').write_text(
+        '/**/calibrator:\n  ros__parameters:\n    imu.grade: tactical\n'
+        'odocal_journal:\n  ros__parameters:\n    leg_id: 1\n')
+    assert asked(capsys, '--bag', str(bag))['sigmas']['imu_grade'] == 'tactical'
+    given = asked(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
+    assert given['sigmas']['imu_grade'] == 'industrial'
 
 
 def test_a_drive_too_short_for_its_speed_brakes_from_a_lower_one(capsys):

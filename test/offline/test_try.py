@@ -3,6 +3,7 @@
 
 """odocal try: it takes the likeliest topics, says why, and its command gives the same result."""
 
+from dataclasses import replace
 import io
 import json
 import re
@@ -10,6 +11,7 @@ import shlex
 import webbrowser
 
 from drives import drive
+import numpy as np
 import pytest
 import yaml
 
@@ -131,6 +133,20 @@ def test_a_bag_without_the_inputs_shows_what_it_has(tmp_path, monkeypatch, capsy
     assert 'no topic was found for: odometer, fix' in err
     assert err.count('\n') == 1
     assert '/imu/data' in out
+    assert 'NO_ODOMETER' not in out       # the error states it
+    assert 'no odometer' not in out
+
+
+def test_the_rate_of_equal_stamps_is_unknown(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    fixes = drive(scenario='straight', duration=200.0).fix
+    stamps = fixes.stamp_ns[0] + (np.arange(len(fixes.stamp_ns)) > 500)
+    write_bag(tmp_path / 'bag', [fix('/fix', replace(fixes, stamp_ns=stamps, received_ns=stamps))])
+    assert main(['try', 'bag']) == 2
+    line = next(row for row in capsys.readouterr().out.splitlines() if 'NavSatFix' in row)
+    assert 'unknown Hz' in line
+    assert main(['inspect', 'bag', '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['topics'][0]['rate_hz'] is None
 
 
 def test_a_leg_of_the_user_replaces_the_suggested_ones():
