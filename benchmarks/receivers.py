@@ -11,7 +11,7 @@ turns an industrial IMU with RTK and a consumer IMU with slow fix errors. Drives
 two tunnels of 120 s 900 s. Drive k of row e has seed 91_000_000 + 1_000_000 e + k, fixed before
 the first run. Rows go to the file line by line: an interrupted run continues where it stopped.
 
-Printed by row, as a table of docs/honesty.md: drives with a scale that are not rejected; share
+Printed by row, as a table of docs/validation.md: drives with a scale that are not rejected; share
 within 1.96 sigma, rms and largest of scale error over sigma; accepted drives, and how many of them
 are beyond 4 sigma; median sigma; in how many drives a reason of ``names`` is given, and of those
 whose scale the effect moves by more than the stated sigma: against the same drive calibrated
