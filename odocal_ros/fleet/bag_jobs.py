@@ -220,14 +220,15 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     Raises BadUsage, BadConfig: a setting or a settings file is wrong.
     """
     from odocal_ros.library.asked import config_of, legs_of
-    from odocal_ros.offline.replay import asked_config, asked_topics
+    from odocal_ros.offline.replay import config_from_arguments, topics_from_arguments
     settings_of_file: dict[str, dict[str, Any]] = {}
-    jobs, topics = [], asked_topics(args)
+    jobs, topics = [], topics_from_arguments(args)
     before = changed_settings(config_of(config))
     for bag in bags:
         file = bag.config or args.config or ''
         if file not in settings_of_file:
-            settings_of_file[file] = asked_config(Namespace(**vars(args) | {'config': file}))
+            settings_of_file[file] = config_from_arguments(
+                Namespace(**vars(args) | {'config': file}))
         settings = before | settings_of_file[file] | {'vehicle': bag.vehicle}
         legs = bag.legs or tuple(args.leg)
         legs_of(legs)

@@ -16,7 +16,7 @@ import tempfile
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.cli import say, warn
+from odocal_ros.offline.cli import print_text, warn
 from odocal_ros.offline.replay import add_calibration_arguments
 
 if TYPE_CHECKING:
@@ -103,10 +103,10 @@ def run(args: argparse.Namespace) -> int:
     kpi = write_kpi(vehicles, limits, output) if args.kpi else ''
     if args.accept or any(row['decision'] for row in vehicles):
         for row in vehicles:
-            say(row['line'])
+            print_text(row['line'])
     if not args.quiet:
         shown = 20    # vehicles that are named on the terminal
-        say(summary_text(vehicles, output, shown) + kpi)
+        print_text(summary_text(vehicles, output, shown) + kpi)
     return exit_code(vehicles, args.strict)
 
 

@@ -17,7 +17,7 @@ import sys
 from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.offline.cli import say, warn
+from odocal_ros.offline.cli import print_text, warn
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
 
@@ -103,7 +103,7 @@ def main(argv: list[str] | None = None) -> int:
     except OdocalError as error:
         warn(f'against_truth: {error}')
         return 2
-    say(table(found))
+    print_text(table(found))
     return 0 if all(row.agrees for row in found) else 1
 
 

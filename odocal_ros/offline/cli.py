@@ -159,13 +159,13 @@ BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'
 
 
-def say(text: str, end: str = '\n') -> None:
+def print_text(text: str, end: str = '\n') -> None:
     """Print lines on stdout."""
     print(for_terminal(text), end=end)
 
 
-def say_json(content: Any) -> None:
-    say(json.dumps(content, indent=2, allow_nan=False))
+def print_json(content: Any) -> None:
+    print_text(json.dumps(content, indent=2, allow_nan=False))
 
 
 def warn(text: str) -> None:

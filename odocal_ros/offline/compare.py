@@ -7,7 +7,7 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from odocal_ros.offline.cli import say, say_json
+from odocal_ros.offline.cli import print_json, print_text
 
 if TYPE_CHECKING:
     from odocal_ros.library.compare import Change, Comparison, Difference
@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     found = compare(*args.files)
     if args.json:
-        say_json(found.to_dict())
+        print_json(found.to_dict())
     else:
-        say('\n'.join(_screen(found)))
+        print_text('\n'.join(_screen(found)))
     return OK if found.changed is False else REJECTED
 
 
@@ -50,8 +50,8 @@ def _screen(found: 'Comparison') -> list[str]:
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         lines += ['', label(change.parameter), *columns(rows, ' ')]
     # a line for each value that changed
-    said = re.split('; (?=[a-z ]+ changed by )', found.sentence)
-    return [*lines, '', *(f'note: {note}' for note in found.notes), *said,
+    change_texts = re.split('; (?=[a-z ]+ changed by )', found.sentence)
+    return [*lines, '', *(f'note: {note}' for note in found.notes), *change_texts,
             *hints(found.changes, stored)]
 
 

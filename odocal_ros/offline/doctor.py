@@ -14,13 +14,14 @@ import subprocess
 import sys
 
 from odocal_ros import __version__
-from odocal_ros.offline.cli import say
+from odocal_ros.offline.cli import print_text
 
 NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'matplotlib', 'jinja2', 'tqdm')
 OPTIONAL = {'rosbags': 'rosbag1 files, message types of a bag, written bags',
             'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
-WORTH = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY',
-         'ROS_HOME', 'ODOCAL_LIMITS')     # the only environment variables shown
+# the only environment variables shown
+SHOWN_VARIABLES = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
+                   'ROS_LOCALHOST_ONLY', 'ROS_HOME', 'ODOCAL_LIMITS')
 MISSING = 'MISSING'
 PROBE = ('import sys, rclpy\n'
          'from rclpy.utilities import get_rmw_implementation_identifier as rmw\n'
@@ -39,15 +40,16 @@ def run(args: argparse.Namespace) -> int:
     rows += [(name, _version(name)) for name in NEEDED]
     rows += [(name, _version(name, f'not installed: no {use}')) for name, use in OPTIONAL.items()]
     rows += _ros()
-    rows += [(name, os.environ[name]) for name in WORTH if name in os.environ]
-    rows += [('results of a node', _room(Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal')),
-             ('results of a replay', _room(Path.cwd()))]
+    rows += [(name, os.environ[name]) for name in SHOWN_VARIABLES if name in os.environ]
+    rows += [('results of a node',
+              _folder_text(Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal')),
+             ('results of a replay', _folder_text(Path.cwd()))]
     width = max(len(name) for name, _ in rows)
-    say('\n'.join(f'{name:<{width}}  {text}' for name, text in rows))
-    lacking = [name for name, text in rows if text == MISSING]
-    say(f'missing: {", ".join(lacking)}; reinstall with pip or rosdep' if lacking
-        else 'all required packages found')
-    return 1 if lacking else 0
+    print_text('\n'.join(f'{name:<{width}}  {text}' for name, text in rows))
+    missing = [name for name, text in rows if text == MISSING]
+    print_text(f'missing: {", ".join(missing)}; reinstall with pip or rosdep' if missing
+               else 'all required packages found')
+    return 1 if missing else 0
 
 
 def _version(name: str, absent: str = MISSING) -> str:
@@ -68,10 +70,10 @@ def _ros() -> list[tuple[str, str]]:
     return [('rclpy', where), ('rmw', rmw)]
 
 
-def _room(folder: Path) -> str:
+def _folder_text(folder: Path) -> str:
     """Return a folder, whether it is writable, and its free space, as text."""
     folder = folder.expanduser()
-    there = next(p for p in (folder, *folder.parents) if p.exists())
-    free = shutil.disk_usage(there).free / 1e9
-    able = 'can be written' if os.access(there, os.W_OK) else 'CANNOT BE WRITTEN'
-    return f'{folder}, {able}, {free:.1f} GB free'
+    existing = next(p for p in (folder, *folder.parents) if p.exists())
+    free = shutil.disk_usage(existing).free / 1e9
+    access = 'can be written' if os.access(existing, os.W_OK) else 'CANNOT BE WRITTEN'
+    return f'{folder}, {access}, {free:.1f} GB free'

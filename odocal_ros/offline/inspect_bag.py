@@ -6,8 +6,12 @@
 import argparse
 from pathlib import Path
 
-from odocal_ros.offline.cli import say, say_json
-from odocal_ros.offline.replay import add_input_arguments, asked_settings, asked_topics
+from odocal_ros.offline.cli import print_json, print_text
+from odocal_ros.offline.replay import (
+    add_input_arguments,
+    settings_from_arguments,
+    topics_from_arguments,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,11 +25,11 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text
     from odocal_ros.settings.config import Config, with_settings
-    config = with_settings(Config(), asked_settings(args))
+    config = with_settings(Config(), settings_from_arguments(args))
     with open_bag(Path(args.bag)) as bag:
-        found = inspect(bag, args.bag, config, asked_topics(args))
+        found = inspect(bag, args.bag, config, topics_from_arguments(args))
     if args.json:
-        say_json(found)
+        print_json(found)
     else:
-        say(text(found))
+        print_text(text(found))
     return 0

@@ -42,11 +42,11 @@ from odocal_ros.settings.nominal import nominal_scale
 
 # judgement: no vehicle drives this share of a recording backwards; with a counter that counts
 # down, the IMU would seem to be mounted backwards
-MOSTLY = 0.5
+MOST_OF_TRAVEL = 0.5
 
 
-def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
-         findings: list[Reason]) -> list[str]:
+def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
+                  findings: list[Reason]) -> list[str]:
     """
     Inspect the inputs together.
 
@@ -72,11 +72,11 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     placed = place(inputs, config)
-    still = [reason for reason in motion_reasons(
+    still_reasons = [reason for reason in motion_reasons(
         inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.t_stop,
         inputs.least_motion) if reason.code is Code.ODOMETER_STILL]
-    if still:       # scale, speeds, standstills and axes are computed from the counts
-        findings += still
+    if still_reasons:       # scale, speeds, standstills and axes are computed from the counts
+        findings += still_reasons
         return options
     stops, speeds = survey.stops_and_speeds(inputs, placed.rough, config)
     path_length, chord = path_and_chord(inputs.t_fix, placed.fixes_n, inputs.least_motion)
@@ -84,11 +84,11 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
     scale = path_length / driven if long and driven else placed.rough or None
     # speeds with the printed scale
-    truer = scale / placed.rough if scale and placed.rough else 1.0
+    scale_ratio = scale / placed.rough if scale and placed.rough else 1.0
     found['drive'] = {
         'distance': path_length, 'chord': chord, 'fix_sigma': placed.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
-        'slowest': speeds[0] * truer, 'fastest': speeds[1] * truer,
+        'slowest': speeds[0] * scale_ratio, 'fastest': speeds[1] * scale_ratio,
         'usable_fixes': len(inputs.t_fix), 'travel': driven}
     if scale:
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
@@ -131,9 +131,9 @@ def _units(inputs: Inputs, config: Config,
 def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     """Return the default of gnss.max_sigma as an option if the limit drops most of the fixes."""
     rows = recorder.rows('fix')
-    every, kept = (int(usable_fixes(rows, 0, replace(config.gnss, max_sigma=limit))[0].sum())
-                   for limit in (0.0, config.gnss.max_sigma))
-    return ['gnss.max_sigma=nan'] if kept < every / 2 else []
+    all_count, kept = (int(usable_fixes(rows, 0, replace(config.gnss, max_sigma=limit))[0].sum())
+                       for limit in (0.0, config.gnss.max_sigma))
+    return ['gnss.max_sigma=nan'] if kept < all_count / 2 else []
 
 
 def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Config,
@@ -142,7 +142,7 @@ def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Conf
     set_already = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
     options = []
-    if not set_already and step.sum() < -MOSTLY * np.abs(step).sum():
+    if not set_already and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
     m = mounting(inputs.t_imu, w_i, f_i, travel, placed.rough or 1.0)
@@ -158,12 +158,12 @@ def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Conf
         'needed': m.rpy is not None and not agrees and not set_already}
     orientation = estimate_orientation(inputs, placed.rough) \
         if inputs.has_accelerometer and placed.rough else None
-    ratio, wrong = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, orientation,
-                           config.imu.gyro_scale)
+    ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, orientation,
+                                 config.imu.gyro_scale)
     found['drive']['gyro_over_course'] = ratio
-    findings += wrong
+    findings += axis_faults
     # no rotation corrects a mirrored axis
-    if wrong or m.rpy is None or not found['mounting']['needed']:
+    if axis_faults or m.rpy is None or not found['mounting']['needed']:
         return options
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
@@ -177,8 +177,8 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests
 
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
-        here = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
-        path_length, chord = path_and_chord(inputs.t_fix[here], placed.fixes_n[here],
+        in_leg = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
+        path_length, chord = path_and_chord(inputs.t_fix[in_leg], placed.fixes_n[in_leg],
                                             inputs.least_motion)
         return {'start': base + start, 'stop': base + stop, 'distance': path_length,
                 'chord': chord} | more
@@ -194,16 +194,16 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests
             _from_rest(rests, *ends)
             for ends in survey.straight_stretches(inputs, placed, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
-    if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
+    if marks or config.method != 'two_point' or not all(is_closed(leg) for leg in found['legs']):
         return []
     open_legs = [leg for leg in found['each_stop']
-                 if leg['distance'] >= config.leg.min_distance and not closed(leg)]
+                 if leg['distance'] >= config.leg.min_distance and not is_closed(leg)]
     if len(open_legs) > 1 and len(open_legs) == len(found['each_stop']):
         return ['--leg each-stop']
     return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['straight']]
 
 
-def closed(leg: dict[str, Any]) -> bool:
+def is_closed(leg: dict[str, Any]) -> bool:
     """Return True if a leg ends where it starts: ratio of chord to path length."""
     return bool(leg['chord'] < LEAST_CHORD_SHARE * leg['distance'])
 
@@ -214,47 +214,51 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
     return begin, end
 
 
-def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
+def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
+                          config: Config) -> list[Reason]:
     topics = {topic['name']: topic for topic in found['topics']}
-    out = []
+    reasons = []
     for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,
                              'odometer'), ('fix', Code.NO_FIX, 'fixes')):
         facts = topics.get(mapping.get(slot, ''), {})
         if not facts and (slot != 'imu' or config.odometer.needs_imu):
-            out.append(Reason(code, f'no topic for the {word}',
-                              f'Record it, or name it with --{slot}-topic.'))
+            reasons.append(Reason(code, f'no topic for the {word}',
+                                  f'Record it, or name it with --{slot}-topic.'))
         elif 'trouble' in facts and 'timing' not in facts:
-            out.append(Reason(code, f'{facts["name"]}: no message can be used: '
-                              f'{facts["trouble"]}', 'Check the type and the driver of the topic, '
-                              'or name another topic.'))
+            reasons.append(Reason(code, f'{facts["name"]}: no message can be used: '
+                                  f'{facts["trouble"]}',
+                                  'Check the type and the driver of the topic, '
+                                  'or name another topic.'))
     drive = found['drive']
     if not drive:
-        return out
+        return reasons
     legs = found['legs']
     if not found['standstills']:
         slowest = (f': its lowest speed (mean over 1 s) is {drive["slowest"]:.2f} '
                    'm/s') * (drive['slowest'] > 0)
-        out.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
+        reasons.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
     elif legs and not any(abs(leg['start'] - stop) < 1.0
                           for leg in legs for _, stop in found['standstills']):
-        out.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
-                          f'at {found["standstills"][0][0]:.1f} s'))
+        reasons.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
+                              f'at {found["standstills"][0][0]:.1f} s'))
     short = [leg for leg in legs if leg['distance'] < config.leg.min_distance]
-    loops = [leg for leg in legs if leg not in short and closed(leg)]
+    loops = [leg for leg in legs if leg not in short and is_closed(leg)]
     limit = f'{config.leg.min_distance:g} m'
-    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'has a path length of {distance:.0f} m; '
-                              f'the limit is {limit}'), (
-            loops, Code.CHORD_TOO_SHORT, 'is a loop: {chord:.0f} m from start to end, less than a '
-            'fifth of the path length of {distance:.0f} m')):
-        if some:
-            many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs; for example, '
-            out.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s '.format(
-                **some[0]) + said.format(**some[0])))
+    for affected, code, template in (
+            (short, Code.LEG_TOO_SHORT,
+             'has a path length of {distance:.0f} m; ' f'the limit is {limit}'),
+            (loops, Code.CHORD_TOO_SHORT, 'is a loop: {chord:.0f} m from start to end, less than '
+             'a fifth of the path length of {distance:.0f} m')):
+        if affected:
+            count_text = '' if len(affected) == 1 else (
+                f'{len(affected)} of {len(legs)} legs; for example, ')
+            reasons.append(Reason(code, count_text + 'the leg {start:.1f}:{stop:.1f} s '.format(
+                **affected[0]) + template.format(**affected[0])))
     if 0 < drive['fastest'] < config.leg.min_speed:
-        out.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
-                          f'{drive["fastest"]:.1f} m/s; the limit is '
-                          f'{config.leg.min_speed:g} m/s'))
-    return out + _heading(found, mapping, config)
+        reasons.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
+                              f'{drive["fastest"]:.1f} m/s; the limit is '
+                              f'{config.leg.min_speed:g} m/s'))
+    return reasons + _heading(found, mapping, config)
 
 
 def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:

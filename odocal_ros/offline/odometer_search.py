@@ -23,7 +23,7 @@ from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.nav.odometer import travel
 from odocal_ros.offline.survey import FixPath, Match
-from odocal_ros.offline.wheel_survey import sides, suggested
+from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 
 # judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
 MOST_MESSAGES, MOST_FIELDS, MOST_VALUES = 10_000, 128, 400_000
@@ -47,25 +47,26 @@ class Fields:
     def __init__(self, count: int) -> None:
         self.count, self.trouble = count, ''
         self.paths: list[str] = []
-        self.whole: list[bool] = []
-        self._every, self._seen, self._times, self._values = 1, 0, array('q'), array('d')
+        self.is_whole: list[bool] = []
+        self._stride, self._messages_seen, self._times, self._values = 1, 0, array('q'), array('d')
         self._t_ns, self._travel = np.empty(0, np.int64), dict[str, Floats]()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
         """Take every n-th message."""
-        first, self._seen = -self._seen % self._every, self._seen + len(raws)
+        first = -self._messages_seen % self._stride
+        self._messages_seen += len(raws)
         k = first
         while k < len(raws) and not self.trouble:
             self._take(raws[k], int(received_ns[k]), deserialize)
-            k += self._every
+            k += self._stride
         return []
 
     def _take(self, raw: bytes, time_ns: int, deserialize: Deserialize) -> None:
         try:
             view = MessageView(deserialize(raw) if len(raw) <= MOST_BYTES else None)
             if not self.paths:
-                self._learn(view.message)
+                self._find_fields(view.message)
             values = [float(view.value(path)) for path in self.paths]
         except OdocalError as error:
             self.trouble = str(error)
@@ -77,14 +78,14 @@ class Fields:
             self._times.append(time_ns)
             self._values.extend(values)
 
-    def _learn(self, message: object) -> None:
+    def _find_fields(self, message: object) -> None:
         """Find the numeric fields of the first message; raise BadData if there are none."""
         found = list(islice(_numbers(message, ''), MOST_FIELDS))
         if not found:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in found]
-        self.whole = [isinstance(value, Integral) for _, value in found]
-        self._every = max(1, -(-self.count // min(MOST_MESSAGES, MOST_VALUES // len(found))))
+        self.is_whole = [isinstance(value, Integral) for _, value in found]
+        self._stride = max(1, -(-self.count // min(MOST_MESSAGES, MOST_VALUES // len(found))))
 
     def facts(self, path: FixPath) -> dict[str, Any]:
         """Return the number of fields and those that follow the path of the fixes."""
@@ -92,10 +93,10 @@ class Fields:
         values = np.array(self._values).reshape(len(t_ns), len(self.paths))
         keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
         self._t_ns = t_ns[keep]
-        tried = [_best(name, whole, self._t_ns, value, path, self._every) for name, whole, value
-                 in zip(self.paths, self.whole, values[keep].T, strict=True)]
-        self._travel = {one[0]['path']: one[1] for one in tried if one}
-        found = sorted((one[0] for one in tried if one), key=rank)
+        tested = [_best(name, is_whole, self._t_ns, value, path, self._stride) for name, is_whole,
+                  value in zip(self.paths, self.is_whole, values[keep].T, strict=True)]
+        self._travel = {one[0]['path']: one[1] for one in tested if one}
+        found = sorted((one[0] for one in tested if one), key=rank)
         return {'tried': len(self.paths), 'found': [field | {
             'settings': _settings(field, f'odometer.field={field["path"]}')} for field in found]}
 
@@ -108,16 +109,17 @@ class Fields:
         None without an IMU.
         """
         best, t_ns = found[0], self._t_ns
-        alike = 0.3      # judgement: scales of the wheels of a vehicle differ less, relative
+        # judgement: scales of the wheels of a vehicle differ less, relative
+        scale_tolerance = 0.3
         wheels = [field for field in found if all(
             field[key] == best[key] for key in ('quantity', 'wrap', 'whole'))
-            and abs(field['scale'] / best['scale'] - 1) < alike]
+            and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]
         if turned is not None and 1 < len(wheels) <= len(WHEELS):
             s = np.stack([self._travel[field['path']] for field in wheels], -1)
-            named = sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
-                          ((turned[0] - t_ns[0]) * 1e-9, turned[1]))
-            if options := suggested([{'key': field['path'], 'side': side}
-                                     for field, side in zip(wheels, named, strict=True)]):
+            named = find_sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
+                               ((turned[0] - t_ns[0]) * 1e-9, turned[1]))
+            if options := wheel_settings([{'key': field['path'], 'side': side}
+                                          for field, side in zip(wheels, named, strict=True)]):
                 return _settings(best, *options)
         return list(best['settings'])
 
@@ -154,8 +156,8 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
         yield from _numbers(value, f'{path}.')
 
 
-def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
-          every: int) -> tuple[dict[str, Any], Floats] | None:
+def _best(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
+          stride: int) -> tuple[dict[str, Any], Floats] | None:
     """
     Return the meaning of a field that follows the path best, and its travel; or None.
 
@@ -164,14 +166,14 @@ def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
     found: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
     for quantity in _quantities(path):
-        counts = whole and quantity == 'cumulative'
+        counts = is_whole and quantity == 'cumulative'
         wrap = _rollover(value) if counts else 0
         s = travel(seconds, value.astype(np.int64) if counts else value,
                    OdometerForm(quantity, wrap, ''))[0].s
-        s = s * every if quantity == 'increment' else s
+        s = s * stride if quantity == 'increment' else s
         match = fixes.match(t_ns, s)
         if match.follows:
-            found.append(({'path': path, 'whole': whole, 'quantity': quantity, 'wrap': wrap,
+            found.append(({'path': path, 'whole': is_whole, 'quantity': quantity, 'wrap': wrap,
                            'scale': match.scale, 'explained': match.explained}, s))
     return max(found, key=lambda one: one[0]['explained'], default=None)
 
@@ -188,15 +190,15 @@ def _rollover(value: Floats) -> int:
                  and (np.abs(np.diff(value)) > modulus / 2).any()), 0)
 
 
-def searched(topics: Mapping[str, TopicInfo], known: Collection[str],
-             asked: Collection[str]) -> dict[str, Fields]:
+def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
+                    requested: Collection[str]) -> dict[str, Fields]:
     """
     Return a collector for each topic whose fields could be an odometer.
 
     known : topics that have a reader.   asked : topics that the user named.
     """
     found = [name for name, info in topics.items() if info.count and name not in known and (
-        name in asked or _possible(info))]
+        name in requested or _possible(info))]
     return {name: Fields(topics[name].count) for name in found[:MOST_TOPICS]}
 
 
@@ -219,8 +221,8 @@ def match_of(rows: OdometerSamples, form: OdometerForm, path: FixPath) -> Match:
     return path.match(t_ns, s)
 
 
-def meaning(info: TopicInfo, rows: OdometerSamples, form: OdometerForm,
-            path: FixPath) -> OdometerForm:
+def form_by_fixes(info: TopicInfo, rows: OdometerSamples, form: OdometerForm,
+                  path: FixPath) -> OdometerForm:
     """
     Return the form with which a topic of one plain number follows the path of the fixes.
 
@@ -233,25 +235,25 @@ def meaning(info: TopicInfo, rows: OdometerSamples, form: OdometerForm,
     return next((other for other in others if match_of(rows, other, path).follows), form)
 
 
-def still(matches: Mapping[str, Match]) -> set[str]:
+def topics_not_following(matches: Mapping[str, Match]) -> set[str]:
     """Return the topics that do not follow the path of the fixes, if another one does."""
     if not any(match.follows for match in matches.values()):
         return set()
     return {topic for topic, match in matches.items() if not match.follows}
 
 
-def only_near_best(fields: Sequence[dict[str, Any]]) -> None:
+def drop_weak_fields(fields: Sequence[dict[str, Any]]) -> None:
     """Remove fields that explain much less of the variance than the best of all topics."""
     best = max((one['explained'] for facts in fields for one in facts['found']), default=0.0)
     # removes all false signals of benchmarks/odometer_fields.py but energy with fixes of 2.5 m
-    more, least = 3.0, 0.01
+    variance_factor, least = 3.0, 0.01
     for facts in fields:
         facts['found'] = [one for one in facts['found']
-                          if 1 - one['explained'] <= more * (1 - best) + least]
+                          if 1 - one['explained'] <= variance_factor * (1 - best) + least]
 
 
-def best_topic(topics: Sequence[dict[str, Any]], asked: str) -> dict[str, Any] | None:
-    """Return the topic whose field follows the path best, of topic ``asked`` if set, or None."""
+def best_topic(topics: Sequence[dict[str, Any]], requested: str) -> dict[str, Any] | None:
+    """Return the topic whose field follows the path best, only ``requested`` if set, or None."""
     found = [facts for facts in topics if facts.get('fields', {}).get('found') and (
-        not asked or facts['name'].strip('/') == asked.strip('/'))]
+        not requested or facts['name'].strip('/') == requested.strip('/'))]
     return min(found, default=None, key=lambda facts: rank(facts['fields']['found'][0]))

@@ -9,8 +9,8 @@ from typing import Any
 
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.cli import say, say_json
-from odocal_ros.offline.replay import asked_settings
+from odocal_ros.offline.cli import print_json, print_text
+from odocal_ros.offline.replay import settings_from_arguments
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading')
 NOISE = {'white': 0.0, 'correlated': 60.0}
@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> int:
     topics = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
     planned = plan(**drive, topics=topics, config=_config(args), **_figures(args))
     if args.json:
-        say_json(planned.to_dict())
+        print_json(planned.to_dict())
     else:
-        say(screen(planned))
+        print_text(screen(planned))
     return 0
 
 
@@ -90,28 +90,28 @@ def _indoor(args: argparse.Namespace) -> int:
         reference=args.reference, drive=args.drive, size=args.size, rounds=args.rounds,
         speed=args.speed, track_width=args.track_width, slip=args.slip_walk))
     if args.json:
-        say_json([one.to_dict() for one in runs])
+        print_json([one.to_dict() for one in runs])
     else:
-        say(indoor_screen(runs))
+        print_text(indoor_screen(runs))
     return 0
 
 
 def _config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the requested settings: --config < --set < the options of a plan."""
-    asked = asked_settings(args)
+    settings = settings_from_arguments(args)
     if args.imu_grade:
-        asked['imu.grade'] = args.imu_grade
+        settings['imu.grade'] = args.imu_grade
     if args.heading_sigma_deg is not None:
         if not (math.isfinite(args.heading_sigma_deg) and 0 < args.heading_sigma_deg <= 180):
             raise BadUsage(f'--heading-sigma-deg {args.heading_sigma_deg:g}: required: more than '
                            '0, up to 180')
-        asked['alignment.heading_sigma'] = math.radians(args.heading_sigma_deg)
-        asked.setdefault('alignment.heading_source', 'fixed')
+        settings['alignment.heading_sigma'] = math.radians(args.heading_sigma_deg)
+        settings.setdefault('alignment.heading_source', 'fixed')
     if args.heading_source:
-        asked['alignment.heading_source'] = args.heading_source
+        settings['alignment.heading_source'] = args.heading_source
     if args.fix_noise:
-        asked['gnss.correlation_time'] = NOISE[args.fix_noise]
-    return asked
+        settings['gnss.correlation_time'] = NOISE[args.fix_noise]
+    return settings
 
 
 def _figures(args: argparse.Namespace) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.asked import legs_of, Listener
-from odocal_ros.offline.cli import Phase, say, say_json, warn
+from odocal_ros.offline.cli import Phase, print_json, print_text, warn
 from odocal_ros.safe_io.text_formats import one_line
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
 
 def run(args: argparse.Namespace) -> int:
     """Replay bags; return 0 accepted or caution (with --accept: pass), else 1."""
-    config = asked_config(args)
+    config = config_from_arguments(args)
     if args.marks:
         config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.calib.result import traces
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
-    calibration = calibrate_bag(args.bags, asked_topics(args), config, args.leg,
+    calibration = calibrate_bag(args.bags, topics_from_arguments(args), config, args.leg,
                                 holdout=args.holdout, listener=_Screen(args))
     for name, trace in traces(calibration.result.legs):
         warn(f'odocal: method {name} failed with an internal error; please report it with '
@@ -118,28 +118,28 @@ class _Screen(Listener):
         return Phase(title, self._silent)
 
 
-def asked_config(args: argparse.Namespace) -> dict[str, Any]:
+def config_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
     """Return the requested settings: --config < --set < --accept and --method, each checked."""
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.config_groups import parse_accept
-    asked = asked_settings(args)
+    settings = settings_from_arguments(args)
     for text in args.accept:
-        asked |= parse_accept(text)
+        settings |= parse_accept(text)
     if args.strict:
-        asked['accept.strict'] = True
+        settings['accept.strict'] = True
     if args.method:
-        asked['method'] = args.method
-    with_settings(Config(), asked)
-    return asked
+        settings['method'] = args.method
+    with_settings(Config(), settings)
+    return settings
 
 
-def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
+def settings_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
     from odocal_ros.settings.config_file import parse_set, read_config_file
-    asked = read_config_file(Path(args.config)) if args.config else {}
-    return asked | dict(parse_set(text) for text in args.settings)
+    settings = read_config_file(Path(args.config)) if args.config else {}
+    return settings | dict(parse_set(text) for text in args.settings)
 
 
-def asked_topics(args: argparse.Namespace) -> dict[str, str]:
+def topics_from_arguments(args: argparse.Namespace) -> dict[str, str]:
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
@@ -155,25 +155,25 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
     from odocal_ros.output.files import Results
     from odocal_ros.output.stored import replacing, stored_in
     screen = _Screen(args)
-    old = stored_in(output)
+    existing = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
                       calibration.created)
     with results.said_when_interrupted():
         with screen.phase('writing the results'):
             written = results.write(args.force)
-        if worse := replacing(old, output):
+        if worse := replacing(existing, output):
             screen.note(f'{output}: --force replaced a better calibration: {worse}')
-        gone = None if args.quiet or args.json else _show(calibration.result, args)
+        write_error = None if args.quiet or args.json else _show(calibration.result, args)
         with screen.phase('drawing the report'):
-            trouble = results.draw()
-        if gone:
-            raise gone
-        if trouble:
-            screen.note(f'{results.report[0]}: could not be drawn: {trouble}')
+            report_error = results.draw()
+        if write_error:
+            raise write_error
+        if report_error:
+            screen.note(f'{results.report[0]}: could not be drawn: {report_error}')
         if args.json:
-            say_json(calibration.to_dict())
+            print_json(calibration.to_dict())
         elif not args.quiet:
-            _show_files(calibration.result, output, written, results.report * (not trouble))
+            _show_files(calibration.result, output, written, results.report * (not report_error))
         return _exit_code(calibration.result, calibration.config, args)
 
 
@@ -188,9 +188,9 @@ def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespa
         bad = [Verdict.REJECTED, *([Verdict.CAUTION] if config.accept.strict else [])]
         return REJECTED if calibration.verdict in bad else OK
     if not (args.quiet or args.json):
-        say('\n' + '\n'.join(accept_words(acceptance)))
+        print_text('\n' + '\n'.join(accept_words(acceptance)))
     if not args.json:
-        say(accept_line(calibration, acceptance, config))
+        print_text(accept_line(calibration, acceptance, config))
     return OK if acceptance.decision is Decision.PASS else REJECTED
 
 
@@ -201,9 +201,9 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
     styled = (sys.stdout.isatty() and 'NO_COLOR' not in os.environ
               and os.environ.get('TERM') != 'dumb')
     try:
-        say(screen(calibration, styled, columns, rows and rows - 9))
+        print_text(screen(calibration, styled, columns, rows and rows - 9))
         if args.holdout:
-            say('\ntrack against fixes: last fifth of each leg, excluded from the fit')
+            print_text('\ntrack against fixes: last fifth of each leg, excluded from the fit')
         sys.stdout.flush()
     except OSError as error:
         return error
@@ -215,8 +215,8 @@ def _show_files(calibration: 'Combined', output: Path, written: list[Path],
     from odocal_ros.output.summary import sentence
     columns, rows = _size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'
-    say('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
-                     break_on_hyphens=False) if rows else text))
+    print_text('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
+                            break_on_hyphens=False) if rows else text))
     for path in report:
-        say(f'report:  {path}')
-    say(sentence(calibration))      # again, since it scrolled away
+        print_text(f'report:  {path}')
+    print_text(sentence(calibration))      # again, since it scrolled away

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.cli import Phase, say
+from odocal_ros.offline.cli import Phase, print_text
 from odocal_ros.safe_io.atomic_files import write_text
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.levels import DAY_NS
@@ -148,53 +148,53 @@ def _span(text: str) -> tuple[float, float]:
 
 def options_of(args: argparse.Namespace) -> 'SimOptions':
     from odocal_ros.sim.options import SimOptions
-    plain = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
+    names = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
              'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]
-    given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
+    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     for name in DEGREES:
         if getattr(args, f'{name}_deg') is not None:
-            given[name] = math.radians(getattr(args, f'{name}_deg'))
+            options[name] = math.radians(getattr(args, f'{name}_deg'))
     for name in LEVER_ARMS:
         if getattr(args, name) is not None:
-            given[name] = tuple(getattr(args, name))
+            options[name] = tuple(getattr(args, name))
     # each seed has its own date, so that drives do not overlap in time
-    seed = given.get('seed', SimOptions.seed)
+    seed = options.get('seed', SimOptions.seed)
     days = 3650    # then the days of the seeds repeat
-    given['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
+    options['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
     if args.mounting_rpy_deg is not None:
-        given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
+        options['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
     if args.outages:
-        given['outages'] = tuple(args.outages)
-    return _with_figures(args, given)
+        options['outages'] = tuple(args.outages)
+    return _with_figures(args, options)
 
 
-def _with_figures(args: argparse.Namespace, given: dict[str, Any]) -> 'SimOptions':
+def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
     """Return SimOptions of the given options, the random vehicle and the requested figures."""
     from odocal_ros.sim.draw import drawn
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real import parsed, Real
     figures = dict(parsed(text) for text in args.figures)
     if not (args.vehicle or args.effects):
-        return SimOptions(**given, real=Real(**figures))
-    if 'odometer' in given:
-        raise BadUsage(f'--odometer {given["odometer"]}: a random vehicle has its own odometer; '
+        return SimOptions(**options, real=Real(**figures))
+    if 'odometer' in options:
+        raise BadUsage(f'--odometer {options["odometer"]}: a random vehicle has its own odometer; '
                        'omit this option, or use --effect coarse_speed')
     if args.vehicle == 'clean' and args.effects:
         raise BadUsage('--vehicle clean excludes --effect; omit one of them')
     effects = () if args.vehicle == 'clean' else args.effects
-    seed = given.pop('seed', SimOptions.seed)
-    grade = given.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
-    kind = given.pop('scenario')
-    return drawn(seed, kind, grade, effects, **given, real=figures)[0]
+    seed = options.pop('seed', SimOptions.seed)
+    grade = options.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
+    kind = options.pop('scenario')
+    return drawn(seed, kind, grade, effects, **options, real=figures)[0]
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate; write a bag with its two files, or those of a fleet; return 0."""
     if args.fleet is not None:
         return simulate_fleet(args, options_of(args))
-    known = args.known_heading_sigma_deg
-    if known is not None and not 0 <= known <= 180:
-        raise BadUsage(f'--known-heading-sigma-deg {known:g}: required: 0 to 180')
+    heading_sigma_deg = args.known_heading_sigma_deg
+    if heading_sigma_deg is not None and not 0 <= heading_sigma_deg <= 180:
+        raise BadUsage(f'--known-heading-sigma-deg {heading_sigma_deg:g}: required: 0 to 180')
     from odocal_ros.bagio.write import drive_topics
     from odocal_ros.library.simulate import beside, simulate
     from odocal_ros.sim.truth import topic_arguments
@@ -203,13 +203,13 @@ def run(args: argparse.Namespace) -> int:
     with Phase('writing', args.quiet) as progress:
         drive = simulate(options_of(args), out, storage=args.storage,
                          compression=args.compression, force=args.force,
-                         heading_sigma=None if known is None else math.radians(known),
-                         progress=progress)
+                         heading_sigma=None if heading_sigma_deg is None
+                         else math.radians(heading_sigma_deg), progress=progress)
     if not args.quiet:
         replay = ['odocal', 'replay', str(out), '--config', str(settings), *topic_arguments(drive)]
-        say(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
-            f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; truth in {truth}; '
-            f'next: {for_shell(replay)}')
+        print_text(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
+                   f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; '
+                   f'truth in {truth}; next: {for_shell(replay)}')
     return 0
 
 
@@ -223,9 +223,9 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     from odocal_ros.output.tables import csv_text
     from odocal_ros.sim.fleet import fleet_of
     out = Path(args.out)
-    most = 100_000    # vehicles
-    if not (1 <= args.fleet <= most and 1 <= args.bags <= 1000):
-        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: required: 1 to {most} vehicles '
+    limit = 100_000    # vehicles
+    if not (1 <= args.fleet <= limit and 1 <= args.bags <= 1000):
+        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: required: 1 to {limit} vehicles '
                        'with 1 to 1000 bags each')
     if (out / MANIFEST).exists() and not args.force:
         raise BadUsage(f'{out / MANIFEST} already exists; give --force to replace the fleet, or '
@@ -241,8 +241,8 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     write_yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
     write_text(out / MANIFEST, csv_text(rows))      # last: it marks a complete fleet
     if not args.quiet:
-        say(f'{out}: {len(vehicles)} vehicles, {len(rows)} bags; truth in {out}/truth.yaml; next: '
-            f'odocal fleet {out / MANIFEST} --output result')
+        print_text(f'{out}: {len(vehicles)} vehicles, {len(rows)} bags; truth in '
+                   f'{out}/truth.yaml; next: odocal fleet {out / MANIFEST} --output result')
     return 0
 
 

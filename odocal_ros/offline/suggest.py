@@ -16,7 +16,8 @@ from odocal_ros.settings.config import Config, with_settings
 # judgement: names of wheels and their electronics before those of any odometry
 WHEEL_WORDS = ('pulse', 'tick', 'encoder', 'wheel', 'count', 'chassis', 'controller', 'vehicle',
                '/can', 'obd')
-OF_ANOTHER = ('zed', 'camera', 'lidar', 'livox', 'ouster')     # judgement: IMUs in other sensors
+# judgement: IMUs in other sensors
+OTHER_DEVICE_WORDS = ('zed', 'camera', 'lidar', 'livox', 'ouster')
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
@@ -28,8 +29,8 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
-            pair := _pair(topics, [t for t in candidates(topics, 'odometer', config, chosen)
-                                   if t not in still])):
+            pair := _left_right_pair(topics, [
+                t for t in candidates(topics, 'odometer', config, chosen) if t not in still])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         chosen['odometer'], chosen['odometer_right'] = pair
     for slot in wanted(config):
@@ -39,48 +40,51 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     return chosen, config
 
 
-def _pair(topics: dict[str, TopicInfo], free: list[str]) -> tuple[str, str] | None:
+def _left_right_pair(topics: dict[str, TopicInfo], unused: list[str]) -> tuple[str, str] | None:
     """Return the topics of the left and the right wheel if two differ in this word only."""
-    pairs = [(left, right) for left in free if 'left' in left
-             and (right := left.replace('left', 'right')) in free
+    pairs = [(left, right) for left in unused if 'left' in left
+             and (right := left.replace('left', 'right')) in unused
              and topics[left].msgtype == topics[right].msgtype]
     return pairs[0] if len(pairs) == 1 else None
 
 
 def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str, ...]:
     """Return a sort key: moving topics, counters, usual names, more messages first."""
-    usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
+    usual_name = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
     name = info.name.lower()
-    worded = int('rtk' in name if slot == 'fix' else not any(w in name for w in OF_ANOTHER))
+    name_score = int('rtk' in name if slot == 'fix'
+                     else not any(w in name for w in OTHER_DEVICE_WORDS))
     if 'odometer' in slot:
-        worded = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
+        name_score = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
     return (info.name in still, kinds[0] if 'odometer' in slot else 0,
-            not info.name.endswith(usual), -worded, -info.count, info.name)
+            not info.name.endswith(usual_name), -name_score, -info.count, info.name)
 
 
 # reasons for a topic, by the first element of the ranks that differs
-WHY = ('it grows with the distance between the fixes',
-       'counts are preferred to joint angles, and angles to speeds', 'it has the usual name',
-       'its name fits', 'it has the most messages', 'it is the first by name')
+RANK_REASONS = ('it grows with the distance between the fixes',
+                'counts are preferred to joint angles, and angles to speeds',
+                'it has the usual name', 'its name fits', 'it has the most messages',
+                'it is the first by name')
 
 
-def others(topics: dict[str, TopicInfo], slot: str, config: Config,
-           mapping: dict[str, str], still: Collection[str]) -> list[str]:
+def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
+                     mapping: dict[str, str], still: Collection[str]) -> list[str]:
     """Return the other candidates for a slot, the most likely first."""
-    taken = {s: t for s, t in mapping.items() if s != slot}
-    return sorted(set(candidates(topics, slot, config, taken)) - {mapping[slot]},
+    used_topics = {s: t for s, t in mapping.items() if s != slot}
+    return sorted(set(candidates(topics, slot, config, used_topics)) - {mapping[slot]},
                   key=lambda name: _rank(slot, topics[name], still))
 
 
-def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
-               still: Collection[str]) -> str:
+def reason_for_choice(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
+                      still: Collection[str]) -> str:
     """Return the reason for suggesting ``topic`` for a slot instead of ``other``."""
     pairs = zip(_rank(slot, topics[topic], still), _rank(slot, topics[other], still), strict=True)
-    return next(why for why, (own, its) in zip(WHY, pairs, strict=True) if own != its)
+    return next(reason for reason, (own_rank, other_rank) in zip(RANK_REASONS, pairs, strict=True)
+                if own_rank != other_rank)
 
 
-def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
+def replay_refusal(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
     """Return the error of replay if it cannot choose the topics without options; '' if none."""
     try:
         choose_topics(topics, config, overrides)
@@ -89,8 +93,8 @@ def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str,
     return ''
 
 
-def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
-            mapping: dict[str, str], extra: list[str]) -> str:
+def replay_command(path: str, topics: dict[str, TopicInfo], config: Config,
+                   overrides: dict[str, str], mapping: dict[str, str], extra: list[str]) -> str:
     """Return the suggested replay command; '' if an input is missing."""
     needed = {'odometer', 'fix'} | ({'imu'} if config.odometer.needs_imu else set())
     if not needed <= mapping.keys():

@@ -36,8 +36,8 @@ def rate_of(count: int, seconds: float) -> float | None:
     return rate if 0 < rate < RATE_LIMIT_HZ else None
 
 
-def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
-           headerless: bool) -> dict[str, Any]:
+def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
+                 headerless: bool) -> dict[str, Any]:
     """
     Return rate, gaps and irregular stamps of a topic.
 
@@ -49,20 +49,20 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
     step = np.diff(stamp) * 1e-9
     rising = step[step > 0]
-    usual = median(rising) if len(rising) else 0.0
+    median_step = median(rising) if len(rising) else 0.0
     gap = 5.0    # in median intervals: longer is a gap
     least_gap = 0.1    # s, shorter is jitter
-    gaps = np.flatnonzero(step > max(gap * usual, least_gap))
+    gaps = np.flatnonzero(step > max(gap * median_step, least_gap))
     order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
-    lag: Floats = np.multiply(received - stamp, 1e-9)
+    delay: Floats = np.multiply(received - stamp, 1e-9)
     # mean between the gaps: bursts and gaps are no rate
     running = float(rising.sum() - step[gaps].sum())
     return {
         'rate_hz': rate_of(len(rising) - len(gaps), running),
         'headerless': headerless,
-        'header_to_bag': None if headerless or not len(lag) else median(lag),
-        'header_to_bag_spread': None if headerless or not len(lag) else float(
-            np.subtract(*np.percentile(lag, [97.5, 2.5])) / 4),
+        'header_to_bag': None if headerless or not len(delay) else median(delay),
+        'header_to_bag_spread': None if headerless or not len(delay) else float(
+            np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4),
         'arrival_jitter': arrival_jitter(
             np.maximum.accumulate(stamp - start_ns) * 1e-9) if headerless else None,
         'zero_stamps': int((~stamped).sum()), 'repeated_stamps': int((step == 0).sum()),
@@ -71,7 +71,7 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
                  for k in np.sort(order)]}
 
 
-def imu(samples: ImuSamples) -> dict[str, Any]:
+def imu_facts(samples: ImuSamples) -> dict[str, Any]:
     """Return gravity, units and orientation of an IMU topic."""
     samples = without_invalid_orientations(samples)
     f_i = samples.f_i[~is_impossible('f_i', samples.f_i)]
@@ -80,8 +80,8 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
     fast = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
-    there = ~np.isnan(samples.yaw_variance)
-    turned = there & (across(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
+    has_orientation = ~np.isnan(samples.yaw_variance)
+    turned = has_orientation & (across(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
     variance = samples.yaw_variance[turned]
     known = variance[variance > 0]
     return {
@@ -94,11 +94,11 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
         'not_finite': len(samples.stamp_ns) - min(len(f_i), len(w_i)),
         # an identity that never changes is a default, not an attitude
         'orientation': bool(turned.mean() > 0.5) if len(turned) else False,
-        'orientation_refused': float((~there).mean()) if len(there) else 0.0,
+        'orientation_refused': float((~has_orientation).mean()) if len(has_orientation) else 0.0,
         'yaw_sigma': float(np.sqrt(np.median(known))) if len(known) else None}
 
 
-def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
+def odometer_facts(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return quantity, unit and range of an odometer topic."""
     finite = samples.value[~is_impossible('value', samples.value)]
     order = np.sort(finite)
@@ -108,7 +108,7 @@ def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
             'not_finite': len(samples.value) - len(finite)}
 
 
-def fixes(samples: FixSamples) -> dict[str, Any]:
+def fix_facts(samples: FixSamples) -> dict[str, Any]:
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~is_impossible('covariance_n', covariance)
@@ -227,9 +227,9 @@ def straight_stretches(inputs: Inputs, placed: Placed,
     t, p = inputs.t_fix[pick], placed.fixes_n[pick, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
-    far = chord >= shortest
+    is_long = chord >= shortest
     # the rough scale cuts corners; the straightest sections determine it best
-    ratio = chord[far] / np.maximum(travel[far], 1e-12)
+    ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
     path_length = travel * max(placed.rough, min(best, 1.2 * placed.rough))
     # chord over path length: a section at least this straight suits the two-point method

@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadData
 from odocal_ros.offline import replay
-from odocal_ros.offline.cli import say
+from odocal_ros.offline.cli import print_text
 
 if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
@@ -51,25 +51,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Inspect a bag, replay it and open the report; return the exit code of the replay."""
     output = replay.output_folder(args.output, args.bag, args.force)
-    found, choices = _look(args)
+    found, choices = _inspect_with_choices(args)
     if not found['command']:
         from odocal_ros.offline.inspection_text import text
         missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
         # the error below states the missing topics
         codes = {f'NO_{slot.upper()}' for slot in missing}
-        say(text(found | {'open': '', 'findings': [
+        print_text(text(found | {'open': '', 'findings': [
             finding for finding in found['findings'] if finding['code'] not in codes]}))
         labels = ', '.join(INPUTS[slot].label for slot in missing)
         raise BadData(f'{args.bag}: no topic was found for: {labels}; '
                       + '; '.join(MISSING[slot] for slot in missing))
-    options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
-    say('\n'.join(_overview(found, choices, options, args.settings)))
+    options = [*_suggested_options(found['command'], bool(args.leg)), *_user_options(args)]
+    print_text('\n'.join(_overview(found, choices, options, args.settings)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
     code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
-    _open(output / 'report.html', args.no_browser)
+    _open_report(output / 'report.html', args.no_browser)
     from odocal_ros.safe_io.text_formats import for_shell
-    say(f'\nnext time:\n  {for_shell(["odocal", "replay", args.bag, *options, "--force"])}')
+    print_text(f'\nnext time:\n  {for_shell(["odocal", "replay", args.bag, *options, "--force"])}')
     return code
 
 
@@ -79,22 +79,22 @@ class _Choice:
 
     slot: str
     topic: str
-    others: list[str]
-    why: str
+    other_candidates: list[str]
+    reason: str
 
 
-def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
+def _inspect_with_choices(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
     """Return the result of inspect with the selected topics, and the choices."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.settings.config import Config, with_settings
-    config = with_settings(Config(), replay.asked_config(args))
-    topics = replay.asked_topics(args)
+    config = with_settings(Config(), replay.config_from_arguments(args))
+    topics = replay.topics_from_arguments(args)
     with open_bag(Path(args.bag)) as bag:
         found = inspect(bag, args.bag, config, topics)
         choices = _choices(bag, config, topics, found)
         if choices and sys.stdin and sys.stdin.isatty() and sys.stdout.isatty():
-            choices = [_asked(bag, choice) for choice in choices]
+            choices = [_choice_of_user(bag, choice) for choice in choices]
             found = inspect(bag, args.bag, config, topics | {
                 choice.slot: choice.topic for choice in choices})
         return found, choices
@@ -104,27 +104,27 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
              inspected: dict[str, Any]) -> list[_Choice]:
     """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.library.topics import candidates
-    from odocal_ros.offline.suggest import likely_mapping, others, why_before
+    from odocal_ros.offline.suggest import likely_mapping, other_candidates, reason_for_choice
     mapping, still = inspected['mapping'], inspected['still']
     _, config = likely_mapping(bag.topics, config, topics, still)
     found = []
     for slot in mapping.keys() - topics.keys():
-        rest = others(bag.topics, slot, config, mapping, still)
+        rest = other_candidates(bag.topics, slot, config, mapping, still)
         if rest and mapping[slot] in candidates(bag.topics, slot, config, {}):
-            why = why_before(bag.topics, slot, mapping[slot], rest[0], still)
-            found.append(_Choice(slot, mapping[slot], rest, why))
+            reason = reason_for_choice(bag.topics, slot, mapping[slot], rest[0], still)
+            found.append(_Choice(slot, mapping[slot], rest, reason))
     return sorted(found, key=lambda choice: list(INPUTS).index(choice.slot))
 
 
-def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
+def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:
     """Return the choice of the user at the terminal; an empty line selects the first."""
-    names = [choice.topic, *choice.others]
-    say(f'{len(names)} candidate topics for the {INPUTS[choice.slot].label}:')
+    names = [choice.topic, *choice.other_candidates]
+    print_text(f'{len(names)} candidate topics for the {INPUTS[choice.slot].label}:')
     for number, name in enumerate(names, 1):
         info = bag.topics[name]
-        say(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
+        print_text(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
     while True:
-        say(f'which one? [1: {choice.why}] ', end='')
+        print_text(f'which one? [1: {choice.reason}] ', end='')
         sys.stdout.flush()
         line = sys.stdin.readline()
         if not line:
@@ -135,17 +135,17 @@ def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
         if answer.isdecimal() and 1 < int(answer) <= len(names):
             names.insert(0, names.pop(int(answer) - 1))
             return _Choice(choice.slot, names[0], names[1:], 'you selected it')
-        say(f'enter a number from 1 to {len(names)}')
+        print_text(f'enter a number from 1 to {len(names)}')
 
 
-def _suggested(command: str, without_legs: bool) -> list[str]:
+def _suggested_options(replay_command: str, without_legs: bool) -> list[str]:
     """Return the replay options that inspect suggests, each followed by its value."""
-    words = shlex.split(command)[3:]
+    words = shlex.split(replay_command)[3:]
     pairs = zip(words[::2], words[1::2], strict=True)
     return [word for pair in pairs if not (without_legs and pair[0] == '--leg') for word in pair]
 
 
-def _own_options(args: argparse.Namespace) -> list[str]:
+def _user_options(args: argparse.Namespace) -> list[str]:
     """Return the options given by the user that are not part of the suggestion."""
     words = []
     for option, given in (('--config', [args.config]), ('--set', args.settings),
@@ -160,8 +160,9 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
               own_settings: Collection[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.output.figures import wrapped
-    because = {one.slot: f', because {one.why}; other candidates: {", ".join(one.others)} '
-               f'({topic_option(one.slot)})' for one in choices}
+    because = {choice.slot: f', because {choice.reason}; other candidates: '
+               f'{", ".join(choice.other_candidates)} ({topic_option(choice.slot)})'
+               for choice in choices}
     lines = ['topics']
     for slot, topic in found['mapping'].items():
         lines += wrapped(f'{INPUTS[slot].label}: {topic}{because.get(slot, "")}')
@@ -195,7 +196,7 @@ def _mounting_reason(mounting: dict[str, Any]) -> str:
             f'(1 sigma: {whole_degrees(mounting["forward_sigma"])} deg)')
 
 
-def _open(report: Path, never: bool) -> None:
+def _open_report(report: Path, never: bool) -> None:
     import webbrowser
     if never or not report.exists():
         return
@@ -203,4 +204,4 @@ def _open(report: Path, never: bool) -> None:
     display = sys.platform != 'linux' or any(
         os.environ.get(name) for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'))
     if not (display and webbrowser.open(report.resolve().as_uri())):
-        say(f'no browser can be started; open {report.resolve()}')
+        print_text(f'no browser can be started; open {report.resolve()}')

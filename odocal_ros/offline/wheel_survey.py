@@ -68,14 +68,15 @@ class Values:
         s = _travelled(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
         turns = 4 * np.pi    # rad: an angle of a larger range turns without limit
-        alike = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
-        rolls = (span > (turns if self.msgtype == JOINTS else 0)) & (span > alike * span.max())
+        least_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
+        rolls = (span > (turns if self.msgtype == JOINTS
+                         else 0)) & (span > least_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
         matches = [path.match(received_ns, x) for x in s.T] if path else []
         if any(match.follows for match in matches):
             rolls = np.array([match.follows for match in matches])
         scales = [m.scale if m.follows else None for m in matches] or [None] * len(keys)
-        found = sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
+        found = find_sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
         return [{'key': key, 'field': field, 'unit': unit, 'distance': float(w), 'span': float(d),
                  'rolls': bool(r), 'side': side, 'scale': scale} for key, w, d, r, side, scale in
@@ -93,15 +94,15 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
     return value
 
 
-def sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | None) -> list[str]:
+def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | None) -> list[str]:
     """Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther."""
     k = len(rolls)
-    none = [''] * k
+    sides_found = [''] * k
     cell = 0.5    # s, cells in which the gyro determines the sides
     # with damaged stamps a recording may seem to last for years
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
-        return none
+        return sides_found
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
     turn = np.diff(np.interp(grid, imu[0], turned))
     turn = turn - np.median(turn)
@@ -110,16 +111,17 @@ def sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | None)
     with np.errstate(invalid='ignore', divide='ignore'):
         step = step / scale
     others = step[rolls].mean(axis=0)
-    clear = 0.5    # limit of the correlation with the gyro for a side
+    correlation_limit = 0.5    # limit of the correlation with the gyro for a side
     for j in np.flatnonzero(rolls):
-        more = step[j] - others
-        power = float(np.sqrt((more @ more) * (turn @ turn)))
-        correlation = float(more @ turn) / power if power else 0.0
-        none[j] = 'right' if correlation > clear else 'left' if correlation < -clear else ''
-    return none
+        excess = step[j] - others
+        power = float(np.sqrt((excess @ excess) * (turn @ turn)))
+        correlation = float(excess @ turn) / power if power else 0.0
+        if abs(correlation) > correlation_limit:
+            sides_found[j] = 'right' if correlation > 0 else 'left'
+    return sides_found
 
 
-def alone(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]:
+def single_wheel_setting(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]:
     """Return the setting for one wheel, if the values chosen by name do not grow with distance."""
     grows = [f for f in facts if f['scale']]
     if not grows or chosen and {f['key'] for f in grows}.issuperset(chosen):
@@ -127,7 +129,7 @@ def alone(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]
     return (f'odometer.field={grows[0]["field"]}[{grows[0]["key"]}]',)
 
 
-def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
+def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
     """Return the settings for the wheels found in the data, as many on either side; or none."""
     left, right = ([f['key'] for f in facts if f['side'] == side] for side in SIDES)
     if len(left) != len(right) or not left:
@@ -140,7 +142,7 @@ def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
         SIDES, (left, right), strict=True))
 
 
-def in_words(facts: list[dict[str, Any]]) -> list[str]:
+def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
     """Return the motion of each value, for people, one line each."""
     def one(f: dict[str, Any]) -> str:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''

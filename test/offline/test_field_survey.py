@@ -19,7 +19,7 @@ from odocal_ros.bagio.encode import counter, fix, imu, velocity
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import inspection_text
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.odometer_search import Fields, only_near_best
+from odocal_ros.offline.odometer_search import drop_weak_fields, Fields
 
 pytestmark = pytest.mark.slow
 MOTOR = 'float32 rpm\nfloat64 angle\n'
@@ -253,7 +253,7 @@ def test_a_field_that_explains_much_less_than_the_best_is_removed():
     """Engine speed explains up to 0.93 of the distances; another topic has the true speed."""
     fields = [{'found': [{'path': 'speed', 'explained': 0.999}]},
               {'found': [{'path': 'rpm', 'explained': 0.93}, {'path': 'v', 'explained': 0.99}]}]
-    only_near_best(fields)
+    drop_weak_fields(fields)
     assert [[one['path'] for one in facts['found']] for facts in fields] == [['speed'], ['v']]
 
 

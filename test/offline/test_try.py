@@ -151,8 +151,8 @@ def test_the_rate_of_equal_stamps_is_unknown(tmp_path, monkeypatch, capsys):
 
 def test_a_leg_of_the_user_replaces_the_suggested_ones():
     command = "odocal replay bag --leg 1:2 --set 'imu.mounting_rpy=[0, 0, 1]' --leg 5:9"
-    assert try_bag._suggested(command, True) == ['--set', 'imu.mounting_rpy=[0, 0, 1]']
-    assert try_bag._suggested(command, False) == shlex.split(command)[3:]
+    assert try_bag._suggested_options(command, True) == ['--set', 'imu.mounting_rpy=[0, 0, 1]']
+    assert try_bag._suggested_options(command, False) == shlex.split(command)[3:]
 
 
 @pytest.mark.parametrize('name', ['comma2k19_rav4', 'husky_parking_lot'])

@@ -6,7 +6,7 @@
 import argparse
 
 from odocal_reproductions.command import add_outputs, picture_of
-from odocal_ros.offline.cli import say
+from odocal_ros.offline.cli import print_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,10 +24,10 @@ def run(args: argparse.Namespace) -> int:
         draw(tables, picture)
     if args.json:
         import json
-        say(json.dumps(tables.as_dict(), indent=2, allow_nan=False))
+        print_text(json.dumps(tables.as_dict(), indent=2, allow_nan=False))
     else:
         from odocal_reproductions.paper.text import text_of
-        say(text_of(tables), end='')
+        print_text(text_of(tables), end='')
         if picture is not None:
-            say(f'\n{picture}: the track and the growth of each error')
+            print_text(f'\n{picture}: the track and the growth of each error')
     return 0

@@ -8,7 +8,7 @@ import math
 from typing import Any, TYPE_CHECKING
 
 from odocal_reproductions.command import add_outputs, picture_of
-from odocal_ros.offline.cli import say
+from odocal_ros.offline.cli import print_text
 
 if TYPE_CHECKING:
     from odocal_ros.calib.wheel_search.planar import PlanarLeg
@@ -36,12 +36,12 @@ def run(args: argparse.Namespace) -> int:
         draw(table, picture)
     if args.json:
         import json
-        say(json.dumps({'fix_noise': args.fix_noise, 'seed': args.seed} | table.as_dict(),
-                       indent=2, allow_nan=False))
+        print_text(json.dumps({'fix_noise': args.fix_noise, 'seed': args.seed} | table.as_dict(),
+                              indent=2, allow_nan=False))
     else:
-        say(text_of(table, args.fix_noise, FOUND), end='')
+        print_text(text_of(table, args.fix_noise, FOUND), end='')
         if picture is not None:
-            say(f'\n{picture}: the distances of all combinations and of each line')
+            print_text(f'\n{picture}: the distances of all combinations and of each line')
     return 0
 
 
