@@ -200,8 +200,9 @@ class Motion:
         # the wheel does not count a bounce on the springs, which changes the inclination to the
         # body and that to the horizontal; sway changes the first only, a crest the second
         climbed = self.travelled[:, 2] * per_metre
-        bounced = (travelled - slowly(travelled)) * (climbed - slowly(climbed))
-        return np.sqrt((1 + of_body**2 + bounced.clip(-0.5, 0.5)) / (1 + travelled**2))
+        bounced = np.clip(
+            (travelled - slowly(travelled)) * (climbed - slowly(climbed)), -0.5, 0.5)
+        return np.sqrt((1 + of_body**2 + bounced) / (1 + travelled**2))
 
     def _by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""
