@@ -19,7 +19,7 @@ from harness import parsed
 
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
-from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_forecast import forecast_leg
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.running_estimate import UPDATE_CPU_SHARE, UPDATE_PERIOD_NS
@@ -40,11 +40,11 @@ def look(leg, config, state, before_ns, now_ns):
         rows = leg.rows(slot)
         thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
     try:
-        seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config,
-                           smoother=smoother)
+        seen = forecast_leg(thinned.leg(leg.start_ns), thinned.fix_rate(), config,
+                            smoother=smoother)
     except OdocalError:
         seen = None
-    return seen, time.thread_time() - begin, smoother.once_s
+    return seen, time.thread_time() - begin, smoother.cold_start_cpu_s
 
 
 def show(leg, config, seconds):

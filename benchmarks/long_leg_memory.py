@@ -69,7 +69,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder
     from odocal_ros.data.samples import take
-    from odocal_ros.forecast.foresight import forecast_of
+    from odocal_ros.forecast.leg_forecast import forecast_leg
     from odocal_ros.forecast.leg_so_far import SmootherSoFar
     from odocal_ros.forecast.thinned_leg import ThinnedLeg
     import odocal_ros.live.node  # noqa: F401 all that a node holds
@@ -108,7 +108,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
         gone = (newest - begin[0]) * 1e-9
         if looks and gone > (len(done) + 1) * hours * 3600 / looks * 0.999:
             done.append(gone)
-            forecast_of(thinned.leg(begin[0]), thinned.fix_rate(), config, lambda: True, smoother)
+            forecast_leg(thinned.leg(begin[0]), thinned.fix_rate(), config, lambda: True, smoother)
             release_memory()
             print(f'node, {gone / 3600:.1f} h recorded, estimate running: {peak_mib():.0f} MiB '
                   f'(goal {NODE_GOAL})', flush=True)

@@ -19,7 +19,7 @@ import time
 from harness import parsed
 import numpy as np
 
-from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_conjugate,

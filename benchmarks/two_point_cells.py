@@ -71,7 +71,7 @@ class Cell:
         """Return one drive's leg, all errors drawn from a seed."""
         from odocal_ros.data.leg import LegRecorder
         from odocal_ros.data.samples import OdometerSamples
-        from odocal_ros.nav.earth import radii
+        from odocal_ros.nav.geodesy import radii
         from odocal_ros.sim import sensors
         from odocal_ros.sim.noise import stream
         options = dataclasses.replace(self.options, seed=seed)

@@ -10,7 +10,7 @@ import inspect
 import numpy as np
 
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.forecast.planned_drive import drive_from_rates
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
@@ -128,9 +128,9 @@ def shifted(leg, **marks):
 def planned(motion, options):
     """Return the drive of a simulated motion as one that is planned."""
     t = np.arange(0.0, motion.duration + 1e-9, 0.1)
-    return from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
-                      latitude=options.latitude, longitude=options.longitude,
-                      height=options.height)
+    return drive_from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
+                            latitude=options.latitude, longitude=options.longitude,
+                            height=options.height)
 
 
 def two_point(leg, config, **more):

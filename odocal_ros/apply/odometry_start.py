@@ -13,7 +13,7 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import C_nL, level_frame
-from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 from odocal_ros.settings.node_configs import ApplyConfig

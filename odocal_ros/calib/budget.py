@@ -26,7 +26,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row, by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.earth import A
+from odocal_ros.nav.geodesy import A
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
 # m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: 6.4 % of

@@ -7,10 +7,10 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
-from odocal_ros.nav.statistics import NORMAL_MEDIAN
+from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST

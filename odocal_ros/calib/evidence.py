@@ -25,7 +25,7 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import yaw_from_quat
-from odocal_ros.nav.statistics import gaps_in_rhythm, gaps_longer
+from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
 from odocal_ros.screening.clocks import without_clock_steps
 from odocal_ros.screening.fix_screen import sigma_limit
 from odocal_ros.screening.inputs import Inputs

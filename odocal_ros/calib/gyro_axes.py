@@ -19,10 +19,9 @@ from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.track_check import ONE_MOTION_RATIO
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
-from odocal_ros.nav.integral import integral_at, twice_integral_at
-from odocal_ros.nav.local_frame import GNSS_MOVES
+from odocal_ros.nav.geodesy import GNSS_MOVES
 from odocal_ros.nav.rotations import arctan2
-from odocal_ros.nav.statistics import gaps_longer
+from odocal_ros.nav.time_series import gaps_longer, integral_at, twice_integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.gravity_fit import gravity_fit
 from odocal_ros.screening.imu_orientation import ImuOrientation

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
+from odocal_ros.nav.time_series import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 Path = Callable[[Floats], Floats]     # t (n,) s to an antenna's path, (n, 3) m, or t () to (3,)

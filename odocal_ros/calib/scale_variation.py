@@ -18,7 +18,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS, TYRE_SPREAD
 

@@ -26,11 +26,10 @@ from odocal_ros.calib.result import Source
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.earth import gravity
-from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import arctan2
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.time_series import integral_at, robust_sigma
 from odocal_ros.reasons import Code, Reason
 
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement

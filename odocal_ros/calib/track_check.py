@@ -20,7 +20,7 @@ from odocal_ros.calib.marks import MarkFix, Path, window_means
 from odocal_ros.calib.result import PerDistance, TrackCheck
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.rotations import arctan2, wrap
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS, OUTLIER_SIGMAS, REMARK_SIGMAS
 

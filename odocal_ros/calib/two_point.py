@@ -25,7 +25,7 @@ from odocal_ros.calib.value_limits import format_relative
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
-from odocal_ros.nav.projection import geodesic_chord, plane_chord, plane_for
+from odocal_ros.nav.geodesy import geodesic_chord, plane_chord, plane_for
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config

@@ -40,7 +40,7 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.wheel_faults import WheelPair, wheels_on_grid
 

@@ -24,7 +24,7 @@ from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import Intervals, preintegrate
 from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.nav.alignment import level_frame
-from odocal_ros.nav.earth import gravity
+from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.rotations import exp_so3, skew, wrap
 
 # s each side, for the mean of a speed: some rows of an odometer. Judgement

@@ -62,13 +62,13 @@ class GrowingFit:
     """
     The fit of one leg while it grows.
 
-    cpu_s : returns the CPU time used so far, s.   ``once_s`` : CPU time of the last fit if it was
-    a cold start; these become rarer as a window grows.
+    cpu_s : returns the CPU time used so far, s.   ``cold_start_cpu_s`` : CPU time of the last fit
+    if it was a cold start; these become rarer as a window grows.
     """
 
     def __init__(self, cpu_s: Callable[[], float]) -> None:
         self._cpu_s = cpu_s
-        self.once_s = 0.0
+        self.cold_start_cpu_s = 0.0
         self._last: WarmStart | None = None
         self._per_effective: dict[str, float] = {}
         self._cold_at = 0.0      # s, length of the window at its last cold start
@@ -78,7 +78,7 @@ class GrowingFit:
 
     def forget(self) -> None:
         """Make the next fit a cold start."""
-        self._last, self.once_s = None, 0.0
+        self._last, self.cold_start_cpu_s = None, 0.0
 
     def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> Running:
         """
@@ -88,7 +88,7 @@ class GrowingFit:
         between passes; its exceptions are passed on.   Raises BadData without a fit and without a
         finished window; the next fit is then a cold start.
         """
-        self.once_s = 0.0
+        self.cold_start_cpu_s = 0.0
         if self._next is not None and view.t_stop - self._next[1] > NEXT_WINDOW:
             self._past, self._next, self._last = self._next, None, None
         if self._past is not None:
@@ -130,7 +130,7 @@ class GrowingFit:
         if begun is None:
             begin, self._cold_at = self._cpu_s(), duration
             best = best_fit(problem, config, trace)
-            self.once_s = self._cpu_s() - begin if last is not None else 0.0
+            self.cold_start_cpu_s = self._cpu_s() - begin if last is not None else 0.0
             return best
         # the levels are kept until the state of the new section is estimated as well
         near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,

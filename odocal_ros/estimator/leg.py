@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import arctan2, transpose
 from odocal_ros.screening.inputs import Inputs

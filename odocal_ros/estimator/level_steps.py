@@ -22,7 +22,7 @@ from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE_SPR
 from odocal_ros.estimator.factors.slow_error import TIME_SPREAD
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.nav.statistics import NORMAL_MEDIAN
+from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 # minimum number of spans in a leg: statistical, their variance is then good to 35 %, with two axes
 FEWEST_SPANS = 8

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.nav.statistics import NORMAL_MEDIAN
+from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
 FAR = 4.0            # statistical: sigmas of a vehicle from its model: by chance one in 16,000

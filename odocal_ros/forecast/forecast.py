@@ -12,11 +12,11 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
 PERCENT_FROM = 0.01       # judgement: relative sigma from which it is printed in per cent
-FARTHEST_M = 2e4          # judgement: limit of a useful forecast of the remaining distance
+FARTHEST_LIMIT_M = 2e4          # judgement: limit of a useful forecast of the remaining distance
 # definition: shown if more driving does not help
-UNREACHABLE = f'the limit is not reached within another {FARTHEST_M / 1000:.0f} km'
+UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
-REST_FORESEEN_S = 10.0
+PREDICTED_REST_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
@@ -27,18 +27,18 @@ class Abandoned(Exception):
 
 
 @dataclass(frozen=True)
-class Prospect:
+class ParameterForecast:
     """The forecast of one parameter."""
 
     sigma: float | None     # predicted, relative or rad; None: not determined so far
-    asked: float            # required sigma
-    metres: float | None    # remaining distance to the limit; 0: reached, None: unreachable
+    limit: float            # required sigma
+    remaining_m: float | None    # remaining distance to the limit; 0: reached, None: unreachable
     sources: tuple[tuple[str, float], ...] = ()     # (name, sigma) of the largest errors, in order
     why: str = ''           # reason why more driving does not reach the limit
-    now: str = ''           # the value so far, as text, if it is determined before the end
-    lack: str = ''          # required manoeuvres, besides distance
+    value_text: str = ''    # the value so far, as text, if it is determined before the end
+    manoeuvre: str = ''     # required manoeuvres, besides distance
 
-    def words(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
+    def as_text(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
         """
         Return the forecast as text, sigmas times ``factor`` in ``unit``.
 
@@ -46,24 +46,24 @@ class Prospect:
         """
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor = '%', 100.0
-        asked = three_digits(float(f'{self.asked * factor:.2g}'))
+        limit = three_digits(float(f'{self.limit * factor:.2g}'))
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'
-        if self.now and sigma is not None:
-            known = f'{name} {self.now} ± {sigma} {unit}'
-        if self.lack:
-            return f'{known} so far (limit {asked})' if self.now else (
+        if self.value_text and sigma is not None:
+            known = f'{name} {self.value_text} ± {sigma} {unit}'
+        if self.manoeuvre:
+            return f'{known} so far (limit {limit})' if self.value_text else (
                 f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
-        if self.metres is None:
+        if self.remaining_m is None:
             return f'{known}: {self.why}'
-        if self.metres == 0.0:
-            return f'OK: {known} (limit {asked})'
-        left = self.metres - since
+        if self.remaining_m == 0.0:
+            return f'OK: {known} (limit {limit})'
+        left = self.remaining_m - since
         more = (f'drive {_rounded_up(left)} m more' if left > 0 else 'drive on') + (
-            f' to reach the limit of {asked} {unit}')
+            f' to reach the limit of {limit} {unit}')
         if sigma is None:
             return f'{name} is not determined yet; {more}'
-        return f'{known} so far; {more}' if self.now else (
+        return f'{known} so far; {more}' if self.value_text else (
             f'{name} uncertainty so far: {sigma} {unit}; {more}')
 
 
@@ -79,8 +79,8 @@ class WheelsForecast:
 class Forecast:
     """The forecast of a leg that ends at the current position."""
 
-    scale: Prospect
-    yaw: Prospect
+    scale: ParameterForecast
+    yaw: ParameterForecast
     pitch: float | None = None                # rad, sigma
     wheels: WheelsForecast | None = None      # None with one counter, and before the first one
     methods: dict[str, MethodResult] = field(default_factory=dict)    # those without end points
@@ -95,29 +95,29 @@ class Forecast:
         return {'scale': self.scale.sigma, 'yaw': self.yaw.sigma, 'pitch': self.pitch,
                 'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
 
-    def words(self, distance_m: float = 0.0) -> str:
+    def as_text(self, distance_m: float = 0.0) -> str:
         """
         Return it as a sentence: reached limits, remaining distances, unreachable limits.
 
         distance_m : path length of the leg by now, m.
         """
         since = max(0.0, distance_m - self.distance_m)
-        return '; '.join([self.scale.words('scale', 'ppm', 1e6, since),
-                          self.yaw.words('yaw', 'deg', math.degrees(1), since)])
+        return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, since),
+                          self.yaw.as_text('yaw', 'deg', math.degrees(1), since)])
 
     @property
     def complete(self) -> bool:
         """Return True if more driving cannot reach any limit."""
-        return not (self.scale.metres or self.yaw.metres or self.lacks)
+        return not (self.scale.remaining_m or self.yaw.remaining_m or self.manoeuvres)
 
     @property
-    def lacks(self) -> list[str]:
+    def manoeuvres(self) -> list[str]:
         """Return the required manoeuvres, besides distance."""
-        return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
+        return list(dict.fromkeys(p.manoeuvre for p in (self.scale, self.yaw) if p.manoeuvre))
 
     def ended(self) -> 'Forecast':
         """Return the running estimate only, for a leg that has ended."""
-        scale, yaw = (Prospect(None, one.asked, None) for one in (self.scale, self.yaw))
+        scale, yaw = (ParameterForecast(None, one.limit, None) for one in (self.scale, self.yaw))
         return Forecast(scale, yaw, estimates=self.estimates, until_ns=self.until_ns)
 
     def age_s(self, stamp_ns: int) -> float:
@@ -126,7 +126,7 @@ class Forecast:
         return age if age >= 0 else math.nan       # implausible stamps, or the IMU has stopped
 
 
-def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
+def combine_sections(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
     """Return the forecast of two sections of a leg, each quantity from the better one."""
     if earlier is None or newest is None:
         return newest or earlier
@@ -134,34 +134,35 @@ def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None
                         key=lambda e: math.inf if e.value is None or e.sigma is None else e.sigma)
               for name in {**earlier.estimates, **newest.estimates}}
     pitch = min((f.pitch for f in (newest, earlier) if f.pitch is not None), default=None)
-    return replace(newest, scale=_better(earlier.scale, newest.scale),
-                   yaw=_better(earlier.yaw, newest.yaw), pitch=pitch, estimates=values,
+    return replace(newest, scale=_combine_parameter(earlier.scale, newest.scale),
+                   yaw=_combine_parameter(earlier.yaw, newest.yaw), pitch=pitch, estimates=values,
                    wheels=newest.wheels or earlier.wheels)
 
 
-def _better(earlier: Prospect, newest: Prospect) -> Prospect:
+def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) -> ParameterForecast:
     if earlier.sigma is None or (newest.sigma is not None and newest.sigma <= earlier.sigma):
         return newest
-    if earlier.metres == 0.0 and not earlier.lack:
+    if earlier.remaining_m == 0.0 and not earlier.manoeuvre:
         return earlier
-    return replace(earlier, metres=newest.metres, why=newest.why, lack=newest.lack)
+    return replace(earlier, remaining_m=newest.remaining_m, why=newest.why,
+                   manoeuvre=newest.manoeuvre)
 
 
-def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
+def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
     """Return the keys of ``~/status``; age_s : of the newest sample of the forecast."""
-    keys = _running(forecast, age_s)
+    keys = _running_keys(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
-        of = Prospect(None, 0.0, None) if forecast is None else getattr(forecast, name)
+        of = ParameterForecast(None, 0.0, None) if forecast is None else getattr(forecast, name)
         keys |= {
             f'predicted_{name}_sigma_{unit}': '' if of.sigma is None else of.sigma * factor,
-            f'metres_to_go_{name}': '' if of.metres is None else of.metres,
+            f'metres_to_go_{name}': '' if of.remaining_m is None else of.remaining_m,
             f'largest_error_source_{name}': of.sources[0][0] if of.sources else '',
             f'predicted_{name}_sources_{unit}': ', '.join(
                 f'{source} {three_digits(sigma * factor)}' for source, sigma in of.sources)}
     return keys
 
 
-def _running(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
+def _running_keys(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
     """Return the keys of the running estimate, NaN if it is not determined."""
     found = {} if forecast is None else forecast.estimates
     estimates = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
@@ -185,7 +186,7 @@ def three_digits(value: float) -> str:
     return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'
 
 
-def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
+def main_sources(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
     """Return (name, sigma) of the main error sources of a parameter, the largest first."""
     row = method.parameters.index(parameter)
     sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}

@@ -30,7 +30,7 @@ from odocal_ros.estimator import (
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.integral import running_integral
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.imu_orientation import (
@@ -95,7 +95,7 @@ def _with_cells(leg: Leg, config: Config) -> Config:
     return with_settings(config, {'leg.max_gap': limit_s})
 
 
-def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
+def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
     """
     Return a leg as a drive: speed by the odometer, direction by the gyro, first course by fixes.
 
@@ -104,7 +104,7 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs IMU, odometer and fixes between the marks; check the bag '
                       'with odocal inspect')
-    placed = _placed(inputs, config)
+    placed = _place_or_raise(inputs, config)
     origin, scale = placed.origin, placed.rough
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
@@ -121,7 +121,7 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
                         np.zeros_like(t), origin.latitude, origin.longitude, origin.height)
 
 
-def _placed(inputs: Inputs, config: Config) -> Placed:
+def _place_or_raise(inputs: Inputs, config: Config) -> Placed:
     """Return the fix positions and the metres per count; raise BadData without them."""
     placed = place(inputs, config)
     if not placed.rough:
@@ -155,7 +155,7 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
     return float(np.angle(np.sum((fixed - fixed.mean()) * np.conj(at - at.mean()))))
 
 
-def figures(inputs: Inputs, config: Config) -> dict[str, float]:
+def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:
     """Return accuracy and rate of the fixes, and the size of one count, as in ``Sigmas``."""
     inside = (inputs.t_fix >= 0) & (inputs.t_fix <= inputs.t_stop)
     if inside.sum() < 2:
@@ -164,7 +164,7 @@ def figures(inputs: Inputs, config: Config) -> dict[str, float]:
     return {'fix': float(np.sqrt((middle[0] + middle[1]) / 2)),
             'fix_up': float(np.sqrt(middle[2])),
             'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside]))),
-            'quantum': inputs.travel.quantum * _placed(inputs, config).rough}
+            'quantum': inputs.travel.quantum * _place_or_raise(inputs, config).rough}
 
 
 class SmootherSoFar:
@@ -175,21 +175,22 @@ class SmootherSoFar:
         self._origin: Origin | None = None
 
     @property
-    def once_s(self) -> float:
+    def cold_start_cpu_s(self) -> float:
         """Return the CPU time of the last fit if it was a cold start, s; these become rarer."""
-        return self._growing.once_s
+        return self._growing.cold_start_cpu_s
 
-    def look(self, leg: Leg, config: Config, wanted: Callable[[], bool] = lambda: True) -> Running:
+    def update(self, leg: Leg, config: Config,
+               is_needed: Callable[[], bool] = lambda: True) -> Running:
         """
         Return the running estimate.
 
         leg : the data so far, including those of the last call.   config : at the leg's start.
-        wanted : called between passes; Abandoned is raised if it returns False.
+        is_needed : called between passes; Abandoned is raised if it returns False.
 
         Raises OdocalError: too few data, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
-            if not wanted():
+            if not is_needed():
                 raise Abandoned
 
         try:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import runs
 from odocal_ros.errors import BadUsage
-from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.time_series import running_integral
 
 REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive is at rest
 SPOT_TURN = 0.05       # rad/s, judgement: a robot that turns on the spot is not at rest
@@ -85,25 +85,26 @@ class PlannedDrive:
         spans = self.t[runs((np.abs(self.speed) <= REST_SPEED) & ~turning) - [0, 1]]
         return [(float(a), float(b)) for a, b in spans if b - a >= shortest]
 
-    def lengthened(self, metres: float) -> 'PlannedDrive':
+    def lengthen(self, metres: float) -> 'PlannedDrive':
         """Return the drive extended straight ahead by ``metres`` at its fastest moment."""
         k = int(np.argmax(np.where(self.t >= 0, np.abs(self.speed), -1.0)))
-        return self._held(k, metres / abs(self.speed[k]))
+        return self._hold_row(k, metres / abs(self.speed[k]))
 
-    def standing_longer(self, seconds: float) -> 'PlannedDrive':
+    def lengthen_rests(self, seconds: float) -> 'PlannedDrive':
         """Return the drive with ``seconds`` more rest before the start and at the stop mark."""
-        return self._held(len(self.t) - 1, seconds, at_rest=True)._held(0, seconds, at_rest=True)
+        return self._hold_row(len(self.t) - 1, seconds, at_rest=True)._hold_row(0, seconds,
+                                                                                at_rest=True)
 
-    def turned_around(self) -> 'PlannedDrive':
+    def turn_around(self) -> 'PlannedDrive':
         return replace(self, yaw=self.yaw + np.pi)
 
-    def until(self, t_stop: float, rest: float) -> 'PlannedDrive':
+    def cut_at(self, t_stop: float, rest: float) -> 'PlannedDrive':
         """Return the drive up to a time and a stop of ``rest`` s there."""
         keep = self.t <= t_stop
         cut = replace(self, **{n: getattr(self, n)[keep] for n in ('t', 'speed', 'yaw', 'slope')})
-        return cut._held(len(cut.t) - 1, rest, at_rest=True)
+        return cut._hold_row(len(cut.t) - 1, rest, at_rest=True)
 
-    def _held(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
+    def _hold_row(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
         """Return the drive with row k held for ``seconds``; a rest at row 0 is added before it."""
         hold = np.arange(DRIVE_STEP, seconds + DRIVE_STEP, max(DRIVE_STEP, seconds / 1000))
         hold = hold * (seconds / hold[-1])
@@ -118,8 +119,8 @@ class PlannedDrive:
         return replace(self, t=t, **rows)
 
 
-def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.pi / 4,
-               **more: Any) -> PlannedDrive:
+def drive_from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.pi / 4,
+                     **more: Any) -> PlannedDrive:
     """
     Return a drive from speed and turn rate, with marks at its first motion and its end.
 
@@ -129,41 +130,42 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
     yaw = np.pi / 2 - heading + running_integral(t, yaw_rate)
-    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)), **more)
+    return with_marks(t, speed, yaw, more.pop('slope', np.zeros_like(t)), **more)
 
 
-def marked(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) -> PlannedDrive:
+def with_marks(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) -> PlannedDrive:
     """Return the drive with its start mark where it first moves, its stop mark at its end."""
     moving = np.flatnonzero(np.abs(speed) > REST_SPEED)
     first = max(int(moving[0]) - 1, 0) if len(moving) else 0
     return PlannedDrive(np.asarray(t) - t[first], speed, yaw, slope, **more)
 
 
-def stop_and_start(drive: PlannedDrive) -> PlannedDrive:
+def add_stop_and_start(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with one more stop: braking, 5 s of standing, acceleration."""
-    k = _amid(drive)
+    k = _middle_row(drive)
     v = drive.speed[k]
     ramp = abs(v) / BRAKING
     stop_time = 5.0    # s of a stop
-    t = _grid(2 * ramp + stop_time, ramp, ramp + stop_time)
-    return inserted(drive, k, t, np.interp(t, [0.0, ramp, ramp + stop_time, 2 * ramp + stop_time],
-                                           [v, 0.0, 0.0, v]), np.zeros_like(t))
+    t = _time_grid(2 * ramp + stop_time, ramp, ramp + stop_time)
+    return insert_section(drive, k, t,
+                          np.interp(t, [0.0, ramp, ramp + stop_time, 2 * ramp + stop_time],
+                                    [v, 0.0, 0.0, v]), np.zeros_like(t))
 
 
-def left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
+def add_left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
-    k = _amid(drive)
+    k = _middle_row(drive)
     v = drive.speed[k]
     turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2, limit to the side
     turn = max(turn_time, QUARTER * abs(v) / sideways_force)
     turns_apart = 5.0    # s straight between the two turns
     whole = 2 * turn + turns_apart
-    t = _grid(whole, turn, turn + turns_apart)
-    return inserted(drive, k, t, np.full_like(t, v), np.interp(
+    t = _time_grid(whole, turn, turn + turns_apart)
+    return insert_section(drive, k, t, np.full_like(t, v), np.interp(
         t, [0.0, turn, turn + turns_apart, whole], [0.0, QUARTER, QUARTER, 0.0]))
 
 
-def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
+def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     """Return the drive with minutes of stop and go, with turns, before its last standstill."""
     moving = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])
     k = min(moving + 1, len(drive.t) - 1)
@@ -171,20 +173,20 @@ def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     t, speed, turned = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     brake = abs(v) / BRAKING
     if brake > DRIVE_STEP:          # it ends in motion
-        own = _grid(brake)
+        own = _time_grid(brake)
         t, speed, turned = [own], [v * (1 - own / brake)], [np.zeros_like(own)]
     town_turn = 22.0, 30.0    # s, begin and end in the minute
     for minute in range(minutes):
-        own = _grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
+        own = _time_grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
         angle = QUARTER * TOWN_SIDES[minute % len(TOWN_SIDES)]
         t.append(own + brake + minute * TOWN_T[-1])
         speed.append(np.interp(own, TOWN_T, TOWN_SPEED))
         turned.append(yaw + np.interp(own, town_turn, [0.0, angle]))
         yaw += angle
-    return inserted(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
+    return insert_section(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
 
 
-def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
+def insert_section(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
     """
     Return the drive with a section inserted after row k; the rest is delayed and rotated.
 
@@ -199,7 +201,7 @@ def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> 
                             drive.yaw[k + 1:] + turned[-1]]))
 
 
-def _amid(drive: PlannedDrive) -> int:
+def _middle_row(drive: PlannedDrive) -> int:
     """Return the row nearest to the middle of the path among those near the top speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
     near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
@@ -208,7 +210,7 @@ def _amid(drive: PlannedDrive) -> int:
     return int(fast[np.argmin(np.abs(path_length[fast] - path_length[-1] / 2))])
 
 
-def _grid(end: float, *knots: float) -> Floats:
+def _time_grid(end: float, *knots: float) -> Floats:
     """Return times above 0 up to the end, at most DRIVE_STEP apart, with the knots among them."""
     t = np.linspace(0.0, end, max(2, int(np.ceil(end / DRIVE_STEP)) + 1))
     t = np.union1d(t, [x for x in knots if 0 < x < end])

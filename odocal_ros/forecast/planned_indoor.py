@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Forecast of a run of a small robot: the information of its estimator at the true states.
+Forecast of a run of a small robot: its motion, and the information of its estimator at the truth.
 
-The planar estimator for wheels without an IMU, skid steering and robots that move sideways; the
+The motion is a pattern with rests on a level floor. The estimator is the planar one, or the
 smoother for two wheels with an IMU. Scale 1, angles 0: sigmas do not depend on them.
 """
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -17,17 +18,120 @@ from odocal_ros.calib.planar.result import result_of
 from odocal_ros.calib.planar.run import of_sides, rows_of, Run, Wheels
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.errors import BadUsage
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.forecast import planned_methods
-from odocal_ros.forecast.ideal_samples import ideal
-from odocal_ros.forecast.indoor_motion import MOTION_STEP, RobotMotion
-from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.forecast.planned_drive import drive_from_rates
+from odocal_ros.forecast.planned_methods import ideal_samples
 from odocal_ros.forecast.predict import Sigmas
-from odocal_ros.forecast.smoother_forecast import relative
-from odocal_ros.nav.earth import rate_without_north
+from odocal_ros.forecast.smoother_forecast import relative_sigma
+from odocal_ros.nav.geodesy import rate_without_north
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.planar_run import known_of
 from odocal_ros.settings import config as settings
+
+MOTION_STEP = 0.1                     # s, definition: time step of a motion
+FULL_TURN = 2 * math.pi        # definition, rad
+# judgement: of a small robot: m/s^2, rad/s, rad/s^2; s at rest after a move, and at either end
+ACCELERATION, TURN_RATE, TURN_ACCELERATION = 0.5, 0.8, 2.0
+REST, END_REST = 3.0, 5.0
+PATTERNS = 'straight', 'square', 'figure_eight', 'spot'
+Move = tuple[float, float, float]      # m forward, m to the left, rad to the left, at once
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMotion:
+    """Motion of the centre of the wheels."""
+
+    t: Floats           # (n + 1,) s
+    speed: Floats       # (n + 1,) m/s forward
+    side: Floats        # (n + 1,) m/s to the left
+    rate: Floats        # (n + 1,) rad/s
+    rests: Floats       # (r, 2) s, begin and end of the rests after moves
+
+    @property
+    def increments(self) -> Floats:
+        """Return m forward, m to the left and rad in each interval: (n, 3)."""
+        return np.diff([running_integral(self.t, x) for x in (
+            self.speed, self.side, self.rate)], axis=1).T
+
+    @property
+    def moving(self) -> Bools:
+        """Return True where it moves: (n + 1,)."""
+        moving: Bools = (self.speed != 0) | (self.side != 0) | (self.rate != 0)
+        return moving
+
+    @property
+    def distance(self) -> float:
+        """Return the path length, m."""
+        return float(np.hypot(*self.increments[:, :2].T).sum())
+
+
+def pattern_motion(name: str, size: float, rounds: int, drive: str,
+                   speed: float = 0.5) -> RobotMotion:
+    """
+    Return the motion of a pattern.
+
+    name : of PATTERNS.   size : m, length of a straight.   rounds : how often it is driven.
+    drive : as odometer.drive; a robot of HOLONOMIC also moves sideways by half of each straight.
+    speed : m/s.
+
+    Raises BadUsage: a value is out of range.
+    """
+    for flag, value in (('--size', size), ('--speed', speed), ('--rounds', rounds)):
+        if not (math.isfinite(value) and value > 0):
+            raise BadUsage(f'{flag} {value:g}: required: a number above 0')
+    side = 1.0
+    moves = []
+    for move in _pattern_moves(name, size) * rounds:
+        moves.append(move)
+        if drive in settings.HOLONOMIC and not move[2]:
+            moves.append((0.0, side * size / 2, 0.0))
+            side = -side
+    most = 36_000.0 / len(moves)      # s, judgement: ten hours in all, as of other planned drives
+    if size / speed > most:
+        raise BadUsage(f'--size {size:g} at --speed {speed:g}: more than ten hours')
+    return _drive_moves(moves, speed)
+
+
+def _drive_moves(moves: list[Move], speed: float) -> RobotMotion:
+    first, still = round(END_REST / MOTION_STEP), np.zeros((round(REST / MOTION_STEP), 3))
+    velocity, rests = [np.zeros((first, 3))], [(first - len(still), first)]
+    for forward, left, turn in moves:
+        length = math.hypot(forward, left)
+        shape = _speed_profile(length, speed, ACCELERATION) if length else _speed_profile(
+            abs(turn), TURN_RATE, TURN_ACCELERATION)
+        begin = sum(map(len, velocity)) + len(shape)
+        velocity += [shape[:, None] * [forward, left, turn], still]
+        rests.append((begin, begin + len(still)))
+    velocity.append(np.zeros((round((END_REST - REST) / MOTION_STEP) + 1, 3)))
+    rows = np.concatenate(velocity)
+    t: Floats = MOTION_STEP * np.arange(len(rows), dtype=float)
+    return RobotMotion(t, rows[:, 0], rows[:, 1], rows[:, 2], MOTION_STEP * np.array(rests))
+
+
+def _speed_profile(length: float, top: float, acceleration: float) -> Floats:
+    """Return the speed profile of a move as share of its length, 1/s: (n,)."""
+    top = min(top, math.sqrt(length * acceleration))
+    ramp, whole = top / acceleration, length / top + top / acceleration
+    t = MOTION_STEP * np.arange(1, max(2, math.ceil(whole / MOTION_STEP)) + 1)
+    shape = np.clip(np.minimum(t / ramp, (t[-1] + MOTION_STEP - t) / ramp), 0, 1)
+    out: Floats = shape / (shape.sum() * MOTION_STEP)
+    return out
+
+
+def _pattern_moves(name: str, size: float) -> list[Move]:
+    """Return the moves of one round of a pattern, of straights of ``size`` m."""
+    if name == 'square':
+        return [move for side in (1, -1) for _ in range(4)
+                for move in ((size, 0, 0), (0, 0, side * math.pi / 2))]
+    if name == 'figure_eight':
+        radius = size / 4
+        return [(FULL_TURN * radius, 0, side * FULL_TURN) for side in (1, -1)]
+    turn = math.pi if name == 'straight' else FULL_TURN + math.pi
+    return [(size, 0, 0), (0, 0, turn), (size, 0, 0), (0, 0, -turn)]
+
 
 # m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
@@ -51,7 +155,7 @@ class Robot:
     at_rests: bool = False          # positions in the rests only
 
 
-def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
+def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
     """Return the run of a motion without errors, true states (n + 1, 5) and constants (w,)."""
     d = motion.increments
     wheels, more = _wheels(d, robot)
@@ -60,7 +164,7 @@ def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
     z = np.append(0.0, np.cumsum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2)))
     state = np.column_stack([z.real, z.imag, heading, 0 * heading, 0 * heading])
-    node = _measured(motion, robot)
+    node = _position_nodes(motion, robot)
     gyro = d[:, 2] if robot.imu else np.empty(0)
     run = Run(motion.t, wheels, node, state[node, :2], np.full(len(node), robot.white), gyro)
     return run, state, np.array([*own, *[0.0] * (3 + 2 * robot.imu)])
@@ -82,20 +186,19 @@ def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
     return of(apart), [arc] * (robot.drive == settings.SKID)
 
 
-def _measured(motion: RobotMotion, robot: Robot) -> Ints:
+def _position_nodes(motion: RobotMotion, robot: Robot) -> Ints:
     """Return the nodes with a position."""
     every = max(1, round(1 / (min(robot.rate, FASTEST_NODES) * MOTION_STEP)))
     node = np.arange(0, len(motion.t), every)
     if robot.at_rests:
-        t = motion.t[node]
-        middle = motion.rests.mean(axis=1)
-        node = node[(np.abs(t[:, None] - middle) <= 0.5).any(axis=1)]
+        from_middle = np.abs(motion.t[node][:, None] - motion.rests.mean(axis=1))
+        node = node[(from_middle <= 0.5).any(axis=1)]
     return node
 
 
 def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the planar estimator: covariance of its fit at the truth."""
-    run, state, constants = planar_run(motion, robot)
+    run, state, constants = ideal_planar_run(motion, robot)
     known = replace(known_of(run, config), drift_length=robot.drift_length)
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
@@ -131,11 +234,11 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     sigmas = Sigmas(config=config, fix=robot.white, fix_up=robot.white, fix_rate=robot.rate,
                     sway=float(robot.slip * np.sqrt(planned_methods.SWAY_RATE)),
                     slip=float(robot.slip / np.sqrt(robot.wheels)))
-    drive = from_rates(motion.t, motion.speed, motion.rate)
-    made = ideal(drive, sigmas, planned_methods.spacing_for(drive))
+    drive = drive_from_rates(motion.t, motion.speed, motion.rate)
+    made = ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
     leg = made.leg
     turned = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
-    used = _at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)
+    used = _fixes_at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)
     leg = replace(
         leg, t_fix=leg.t_fix[used], fixes_n=leg.fixes_n[used],
         covariance_n=leg.covariance_n[used],
@@ -147,9 +250,9 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     problem = problem_of(leg, config, made.imu)
     white = 1 / made.fixes_in_one
     slow = 2 / max(correlated, 1.0) * robot.drift**2 * drifts
-    levels = planned_methods.planned_levels(problem, sigmas, made.fixes_in_one).but(
+    levels = planned_methods.planned_noise_levels(problem, sigmas, made.fixes_in_one).but(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
-    fit = planned_methods.fit_at(problem, made, levels)
+    fit = planned_methods.fit_at_truth(problem, made, levels)
     return _with_slip(make_result(leg, problem, fit, config), motion, robot)
 
 
@@ -173,7 +276,7 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
         'ratio_sigma': float(ratio)})
 
 
-def _at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
+def _fixes_at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
     """Return the fix nearest to the middle of each rest, one for each mark."""
     middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
     out: Ints = np.abs(t_fix[:, None] - middle).argmin(axis=0)
@@ -192,7 +295,7 @@ def ratio_sigma(method: MethodResult) -> float | None:
         return float(method.details['ratio_sigma'])
     left, right = (method.estimates.get(f'scale_factor_{side}') for side in settings.SIDES)
     rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
-    a, b = (relative(one) if one else None for one in (left, right))
+    a, b = (relative_sigma(one) if one else None for one in (left, right))
     if a is None or b is None or rho is None:
         return None
     return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))

@@ -33,7 +33,7 @@ from odocal_ros.nav.alignment import (
     MOTION_LEVEL,
 )
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
-from odocal_ros.nav.earth import earth_rate_n, gravity
+from odocal_ros.nav.geodesy import earth_rate_n, gravity
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
 from odocal_ros.pipeline.align import choose_standstill
@@ -124,7 +124,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     distance, said = check_drive(track, drive.duration, 1.0, config.leg)
     keep = track.t >= alignment.t - 1e-9
     track = Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
-    start, end = (_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
+    start, end = (_expected_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
     chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
                   np.zeros(3), _velocity_change(track, (start, end)), alignment)
@@ -137,12 +137,13 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
         reasons += check_limits(method.estimates, 1.0, config)
     return Prediction(method, reasons + method.reasons, alignment, distance,
                       float(np.linalg.norm((end.position_n - start.position_n)[:2])),
-                      drive.duration, (_rest(0.0, spans), _rest(drive.duration, spans)),
+                      drive.duration,
+                      (_rest_duration(0.0, spans), _rest_duration(drive.duration, spans)),
                       tuple(r for r in said if r.code is not Code.LEG_NOT_STRAIGHT))
 
 
-def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,
-                 farthest: float = 1e5) -> float | None:
+def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,
+                            farthest: float = 1e5) -> float | None:
     """
     Return the straight distance, m, that brings a sigma down to its limit.
 
@@ -150,7 +151,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
     heading.
     """
     def enough(metres: float) -> bool:
-        longer = drive.lengthened(metres) if metres else drive
+        longer = drive.lengthen(metres) if metres else drive
         sigma = predict(longer, sigmas).sigma(parameter)
         return sigma is not None and sigma <= asked
 
@@ -168,14 +169,14 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
     return high
 
 
-def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
+def _rest_duration(t: float, spans: Sequence[tuple[float, float]]) -> float:
     """Return the duration of the standstill at a mark, s."""
     begin, end = standing_at(t, spans) or (0.0, 0.0)
     return end - begin
 
 
-def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
-          spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
+def _expected_mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
+                   spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
     """Return the expected reference position at a mark, surveyed or from the fixes at it."""
     span = standing_at(t, spans)
     forward = np.array([1.0, 0.0, 0.0])

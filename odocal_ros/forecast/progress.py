@@ -10,8 +10,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, Samples
-from odocal_ros.forecast.ability import Received, stated_variance
-from odocal_ros.nav.earth import radii
+from odocal_ros.forecast.quantities import Received, stated_variance
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.screening.clocks import clock_remedy, stamp_offsets
 from odocal_ros.screening.leg_kind import has_accelerometer
 from odocal_ros.screening.odometer_rows import StepReader
@@ -75,19 +75,20 @@ class Clocks:
         return result
 
 
-def clocks_differ(clocks: list[tuple[str, float]]) -> str:
+def clock_difference_text(clocks: list[tuple[str, float]]) -> str:
     """Return the sentence about clocks that differ from the IMU's."""
-    seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} '
+    seen = ', '.join(
+        f'{slot} stamps are {_format_difference(abs(s))} {"ahead of" if s > 0 else "behind"} '
                      'the IMU stamps' for slot, s in clocks)
     return f'CLOCKS_DIFFER: {seen}. {clock_remedy(max((s for _, s in clocks), key=abs))}'
 
 
-def _apart(seconds: float) -> str:
+def _format_difference(seconds: float) -> str:
     days = seconds / (DAY_NS * 1e-9)
     return f'{seconds:.3g} s' if days < 2 else f'{days:.0f} days'
 
 
-def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+def scale_so_far(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
     """Return m per unit of the odometer, by the best value so far; 0 if unknown."""
     if np.isfinite(found) and found > 0:
         return float(found)
@@ -188,7 +189,7 @@ class Progress:
         self.clocks.feed(slot, block)
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
-            self._scale = known_scale(config, form, found_scale)
+            self._scale = scale_so_far(config, form, found_scale)
             self._travel = self._travel or Travel(form)
             self._travel.feed(block, self._scale)
         elif slot == 'fix':

@@ -1,18 +1,154 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Quantities within their limits: yes, no or unknown, while a leg is recorded and after it."""
+"""
+Quantities of a leg: which are observable with the settings, and which are within their limits.
 
-from collections.abc import Set
+The former is by the code that processes recorded drives. The latter is yes, no or unknown, while a
+leg is recorded and after it.
+"""
+
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 import math
 
-from odocal_ros.calib.choice import ABOUT, PLANAR
+import numpy as np
+
+from odocal_ros.calib.choice import ABOUT, deciding, PLANAR
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.forecast.forecast import Forecast
+from odocal_ros.forecast.planned_drive import drive_from_rates
+from odocal_ros.forecast.predict import plan_alignment
+from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
+from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.reasons import Verdict
-from odocal_ros.settings.config import Config
+from odocal_ros.screening.glitches import Oriented, without_invalid_orientations
+from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, OMNI, SKID, with_settings
 from odocal_ros.settings.levels import TRACK_WIDTH
+
+EXACT_HEADING = 1e-6      # rad; judgement: sigma of a heading whose configured sigma is 0
+COURSE_FIX_SIGMA = 1.5    # m; physical: sigma of a fix of a single receiver
+SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
+           'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
+# values of the planar estimator
+PLANAR_QUANTITIES = {
+    DIFFERENTIAL: ('the scale', 'left and right wheel', 'the track width (in turns)'),
+    SKID: ('the scale', 'left and right wheel', 'the track width (on the spot)',
+           'the track width arc (on arcs)'),
+    MECANUM: ('the scale', 'the rotation lever (in turns)',
+              'the lateral scale factor (in sideways motion)'),
+    OMNI: ('the scale', 'the rotation lever (in turns)',
+           'the factor of each wheel (in sideways motion)')}
+METHOD_WITHOUT_HEADING = 'smoother'   # the method that needs no external heading
+
+
+@dataclass(frozen=True)
+class Received:
+    """Samples received before the start mark."""
+
+    variances: dict[str, float]     # of the yaw by its source, rad^2; inf if none is sent
+    rested_s: float = 0.0           # length of the current or last standstill
+    latitude: float = 0.7           # rad
+    height: bool = True             # the fixes have a height
+    two_wheels: bool = False
+    has_accelerometer: bool = True
+    imu: bool = True                # an IMU is present
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Observable quantities, unobservable ones with the cause, and a limitation of all values."""
+
+    can: tuple[str, ...]
+    cannot: tuple[str, ...]
+    weak: str = ''
+
+    def as_text(self) -> str:
+        *first, last = self.can
+        values = f'{", ".join(first)} and {last}' if first else last
+        text = f'observable: {values}'
+        if self.cannot:
+            text += f'; not observable: {"; ".join(self.cannot)}'
+        return text + (f'; {self.weak}' if self.weak else '')
+
+
+def find_observable(config: Config, received: Received) -> Observability:
+    """Return the values that a leg can estimate with these settings, and those it cannot."""
+    drive = config.odometer.drive
+    if not received.imu or drive != DIFFERENTIAL:
+        return Observability(PLANAR_QUANTITIES[drive], (
+            'yaw and pitch of the IMU' if received.imu else 'yaw and pitch (no IMU)',))
+    methods = [name for name in METHODS if name in deciding(config.method)
+               and (received.has_accelerometer or name != METHOD_WITHOUT_HEADING)]
+    values = [(True, 'the scale'), _yaw_quantity(config, received, methods),
+              (True, 'the pitch') if received.height else
+              (False, 'the pitch (fixes without height)')]
+    if not received.has_accelerometer:
+        values[-1] = False, 'the pitch (IMU without acceleration)'
+    if received.two_wheels:
+        values += _wheel_quantities(config)
+    weak = '' if received.rested_s >= config.leg.standstill else (
+        'level and gyro bias are estimated from the drive, because it starts without a standstill')
+    return Observability(tuple(text for can, text in values if can),
+                         tuple(text for can, text in values if not can), weak)
+
+
+def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) -> tuple[bool, str]:
+    if METHOD_WITHOUT_HEADING in methods:
+        return True, 'the yaw (from stops, starts and turns)'
+    alignment = _expected_alignment(config, received)
+    if not alignment.heading_separable:
+        return False, ('the yaw (the only heading is the course over ground, which includes it: '
+                       'set alignment.heading_source)')
+    source, sigma = SOURCES[alignment.heading_source], math.degrees(alignment.heading_sigma)
+    asked = math.degrees(config.verdict.max_yaw_sigma)
+    if sigma >= asked:
+        return False, (f'the yaw to {asked:.2g} deg ({source} has an uncertainty of {sigma:.2g} '
+                       'deg)')
+    return True, f'the yaw (from {source}, {sigma:.2g} deg)'
+
+
+def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
+    if METHOD_WITHOUT_HEADING not in deciding(config.method):
+        return [(False, f'left and right wheel separately (method {config.method} uses their '
+                 'mean)')]
+    width = config.odometer.track_width
+    return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
+
+
+def _expected_alignment(config: Config, received: Received) -> Alignment:
+    """Return the alignment of a straight drive from the current position."""
+    rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
+    t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
+    drive = drive_from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
+                             latitude=received.latitude)
+    return plan_alignment(drive, with_heading(config, received.variances), COURSE_FIX_SIGMA,
+                          drive.standstills(config.leg.standstill))[0]
+
+
+def stated_variance(sent: Oriented) -> float:
+    """Return the median yaw variance in orientation messages, rad^2; inf if none is sent."""
+    variance = without_invalid_orientations(sent).yaw_variance
+    stated = variance[~np.isnan(variance)]
+    return float(np.median(stated)) if len(stated) else math.inf
+
+
+def with_heading(config: Config, variances: dict[str, float]) -> Config:
+    """Return config with the heading source and sigma that the alignment will find."""
+    asked = config.alignment
+    source, sigma = asked.source, max(asked.heading_sigma, EXACT_HEADING)
+    if source == 'fixed' and math.isnan(asked.heading):
+        source = 'course'
+    for name, stated in variances.items():
+        if source not in ('auto', name):
+            continue
+        if stated <= HEADING_LIMIT**2:
+            source, sigma = name, math.sqrt(stated) if stated > 0 else sigma
+        elif source == name:
+            source = 'course'
+    return with_settings(config, {'alignment.heading_source': source,
+                                  'alignment.heading_sigma': sigma})
+
 
 YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
@@ -45,12 +181,12 @@ QUANTITIES = {
 }
 
 
-def nothing_known() -> dict[str, str]:
+def all_unknown() -> dict[str, str]:
     return dict.fromkeys(QUANTITIES, UNKNOWN)
 
 
-def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
-                lost: bool = False) -> dict[str, str]:
+def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
+                   lost: bool = False) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity of a leg that ends now.
 
@@ -58,24 +194,25 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
     ``lost``: the leg would be rejected: no value is within its limit.
     """
     if forecast is None:
-        return nothing_known() | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else \
-            nothing_known()
+        return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else \
+            all_unknown()
     known = {name: forecast.sigma(name) for name, quantity in QUANTITIES.items()
              if not (quantity.of_two_wheels and (not two_wheels or forecast.wheels is None)
                      or quantity.of_imu and PLANAR in forecast.methods)}
-    return _judged({name: None if lost else sigma for name, sigma in known.items()}, config)
+    return _check_sigmas({name: None if lost else sigma for name, sigma in known.items()}, config)
 
 
-def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
+def check_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str,
+                                                                                          str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
     doubted = {ABOUT[r.code] for r in calibration.reasons
                if r.code in ABOUT and r.code.severity is not Verdict.ACCEPTED}
-    return of_estimates(calibration.estimates, config, two_wheels,
-                        calibration.verdict is not Verdict.REJECTED, doubted)
+    return check_estimates(calibration.estimates, config, two_wheels,
+                           calibration.verdict is not Verdict.REJECTED, doubted)
 
 
-def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
-                 doubted: Set[str] = frozenset()) -> dict[str, str]:
+def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
+                    doubted: Set[str] = frozenset()) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity: within its limit.
 
@@ -92,18 +229,18 @@ def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: boo
         if quantity.of_two_wheels and not two_wheels and not any(
                 e is not None and e.value is not None for e in found):
             continue
-        known[name] = max(_share(e, quantity.relative) for e in found)
+        known[name] = max(_relative_sigma(e, quantity.relative) for e in found)
         if not valid or doubted & set(quantity.estimates):
             bad.add(name)
-    return _judged(known, config) | dict.fromkeys(bad, NO)
+    return _check_sigmas(known, config) | dict.fromkeys(bad, NO)
 
 
-def as_keys(ok: dict[str, str]) -> dict[str, str]:
+def status_keys(ok: dict[str, str]) -> dict[str, str]:
     """Return the keys of ``~/status``."""
     return {f'{name}_ok': value for name, value in ok.items()}
 
 
-def words(ok: dict[str, str]) -> str:
+def quantities_text(ok: dict[str, str]) -> str:
     """Return the quantities as text, empty if all are unknown."""
     parts = []
     for value, text in ((YES, 'OK'), (NO, 'not OK')):
@@ -113,9 +250,9 @@ def words(ok: dict[str, str]) -> str:
     return '; '.join(parts)
 
 
-def _judged(sigmas: dict[str, float | None], config: Config) -> dict[str, str]:
+def _check_sigmas(sigmas: dict[str, float | None], config: Config) -> dict[str, str]:
     """Return yes or no for known sigmas; a configured track width may stay unknown."""
-    ok = nothing_known()
+    ok = all_unknown()
     for name, sigma in sigmas.items():
         if sigma is not None and sigma <= QUANTITIES[name].limit(config):
             ok[name] = YES
@@ -124,11 +261,10 @@ def _judged(sigmas: dict[str, float | None], config: Config) -> dict[str, str]:
     return ok
 
 
-def _share(estimate: Estimate | None, relative: bool) -> float:
+def _relative_sigma(estimate: Estimate | None, relative: bool) -> float:
     """Return the sigma of an estimate, relative to its value or not; infinite without one."""
     if estimate is None or estimate.value is None or estimate.sigma is None:
         return math.inf
     if relative:
         return estimate.sigma / abs(estimate.value) if estimate.value else math.inf
     return estimate.sigma
-

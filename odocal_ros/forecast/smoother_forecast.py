@@ -17,10 +17,10 @@ from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import Running
 from odocal_ros.forecast.forecast import (
     Abandoned,
-    FARTHEST_M,
+    FARTHEST_LIMIT_M,
     Forecast,
-    Prospect,
-    sources_of,
+    main_sources,
+    ParameterForecast,
     UNREACHABLE,
     WheelsForecast,
 )
@@ -32,38 +32,38 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config
 
-ONLY = ('smoother',)
+ONLY_SMOOTHER = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
 # physical: m/s^2 of an ordinary stop and start, and the minimum speed for it, m/s
-STOP_FORCE, STOP_SPEED = 1.5, 5.0
+STOP_ACCELERATION, STOP_SPEED = 1.5, 5.0
 # physical: path length is proportional to sigma to the power of minus this, for white and for
 # time-correlated errors of the fixes
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
-OPEN_YET = NOT_YET | {Code.ODOMETER_STILL}     # codes that disappear with more driving
+TEMPORARY_CODES = NOT_YET | {Code.ODOMETER_STILL}     # codes that disappear with more driving
 DRIVE_ON = 'drive straights, and turn on the spot in both directions'
 
 
-def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
-         wanted: Callable[[], bool]) -> Running | None:
+def update_running(leg: Leg, config: Config, smoother: SmootherSoFar | None,
+                   is_needed: Callable[[], bool]) -> Running | None:
     """Return the running estimate, None without; raise OdocalError if no other method is used."""
     if smoother is None or 'smoother' not in deciding(config.method):
         return None
     try:
-        return smoother.look(leg, config, wanted)
+        return smoother.update(leg, config, is_needed)
     except OdocalError:
-        if deciding(config.method) == ONLY:
+        if deciding(config.method) == ONLY_SMOOTHER:
             raise
         return None
 
 
-def gives_all(running: Running | None) -> bool:
+def has_all_values(running: Running | None) -> bool:
     """Return True if scale, yaw and pitch of the result will come from the smoother."""
     return running is not None and running.method.verdict is not Verdict.REJECTED and all(
         running.method.estimates[name].value is not None for name in PARAMETERS)
 
 
-def without_force(forecast: Forecast) -> Forecast:
+def without_accelerometer_values(forecast: Forecast) -> Forecast:
     """Return a forecast without the values that need an accelerometer."""
     yaw = forecast.yaw
     if yaw.sigma is None and not yaw.why:
@@ -71,7 +71,7 @@ def without_force(forecast: Forecast) -> Forecast:
     return replace(forecast, yaw=yaw, pitch=None)
 
 
-def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
+def add_running_estimate(forecast: Forecast, running: Running, config: Config) -> Forecast:
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
     faults = [r for r in method.reasons
@@ -84,39 +84,40 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
     by = {name: e.method for name, e in given.items() if e.value is not None}
     scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
     if by.get(SCALE) == 'smoother' or scale.sigma is None:
-        scale = _scale(running, scale.asked)
+        scale = _forecast_scale(running, scale.limit)
     known = np.isfinite(running.sigmas)      # no angle without an accelerometer
     if known[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
-        yaw = _yaw(running, yaw.asked)
+        yaw = _forecast_yaw(running, yaw.limit)
     if known[2] and (by.get(PITCH) == 'smoother' or pitch is None):
         pitch = float(running.sigmas[2])
-    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=wheels_of(method))
+    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=forecast_wheels(method))
 
 
-def wheels_of(method: MethodResult) -> WheelsForecast | None:
+def forecast_wheels(method: MethodResult) -> WheelsForecast | None:
     """Return the running estimate of two wheels, None for one counter."""
     if 'track_width' not in method.estimates:
         return None
-    left, right, width = (relative(method.estimates[name]) for name in (
+    left, right, width = (relative_sigma(method.estimates[name]) for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     return WheelsForecast(None if left is None or right is None else max(left, right), width)
 
 
-def relative(e: Estimate) -> float | None:
+def relative_sigma(e: Estimate) -> float | None:
     """Return the sigma divided by the value, None without them."""
     return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
-def _scale(running: Running, asked: float) -> Prospect:
+def _forecast_scale(running: Running, limit: float) -> ParameterForecast:
     e = running.method.estimates[SCALE]
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
     power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
-    metres = _metres(running, sigma / asked, power)
-    now = '' if e.value is None or e.sigma is None else digits(e.value, e.sigma)
+    metres = _remaining_distance(running, sigma / limit, power)
+    now = '' if e.value is None or e.sigma is None else format_value(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
-    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE), UNREACHABLE, now)
+    return ParameterForecast(sigma, limit, metres, main_sources(running.method, SCALE),
+                             UNREACHABLE, now)
 
 
 def _slow_share(running: Running) -> float:
@@ -127,63 +128,65 @@ def _slow_share(running: Running) -> float:
     return by.get('slow_fix_errors', 0.0) / total if total else 0.0
 
 
-def _yaw(running: Running, asked: float) -> Prospect:
+def _forecast_yaw(running: Running, limit: float) -> ParameterForecast:
     """Return the forecast of the yaw, which accelerations along or across determine."""
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
-    ratio, lack = sigma / asked, ''
+    ratio, lack = sigma / limit, ''
     if ratio > 1:
-        one = 2 * STOP_FORCE * max(running.speed, STOP_SPEED)
+        one = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
         stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
         often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
         lack = f'for the yaw: stop and start {often}, or make as many turns'
-    now = '' if e.value is None or e.sigma is None else digits(
+    now = '' if e.value is None or e.sigma is None else format_value(
         math.degrees(e.value), math.degrees(e.sigma))
-    return Prospect(sigma, asked, _metres(running, ratio, 2.0),
-                    sources_of(running.method, YAW), '', now, lack)
+    return ParameterForecast(sigma, limit, _remaining_distance(running, ratio, 2.0),
+                             main_sources(running.method, YAW), '', now, lack)
 
 
-def _metres(running: Running, ratio: float, power: float) -> float | None:
+def _remaining_distance(running: Running, ratio: float, power: float) -> float | None:
     """Return the further distance that improves a sigma by a ratio, driven as so far, m."""
     metres = running.distance * (max(ratio, 1.0)**power - 1)
-    return metres if metres <= FARTHEST_M else None
+    return metres if metres <= FARTHEST_LIMIT_M else None
 
 
-def digits(value: float, sigma: float) -> str:
+def format_value(value: float, sigma: float) -> str:
     """Return a value to a tenth of its sigma, with at most eight digits."""
     size = max(abs(value), sigma)
     places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
     return f'{value:.{min(max(places, 1), 8)}g}'
 
 
-def planar_forecast(leg: Leg, config: Config, wanted: Callable[[], bool]) -> Forecast:
-    """Return the forecast of a leg of the planar estimator that ends here, as ``forecast_of``."""
+def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> Forecast:
+    """Return the forecast of a leg of the planar estimator that ends here, as ``forecast_leg``."""
     def passed(_: Stage) -> None:
-        if not wanted():
+        if not is_needed():
             raise Abandoned
     result = planar_leg(leg, settings_by_frame(leg.fix, config), (), passed)
-    if not wanted():
+    if not is_needed():
         raise Abandoned
     method = result.methods[PLANAR]
     if result.track_n is None:
         raise BadData(method.reasons[0].text)
     faults = tuple(r for r in (*result.reasons, *method.reasons)
-                   if r.code.severity is Verdict.REJECTED and r.code not in {*ABOUT, *OPEN_YET})
+                   if r.code.severity is Verdict.REJECTED
+                   and r.code not in {*ABOUT, *TEMPORARY_CODES})
     estimates, _ = choose(result.methods, config.method)
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),
-        Prospect(None, config.verdict.max_yaw_sigma, None, why='not estimated on this robot'),
-        wheels=wheels_of(method), methods={PLANAR: method}, estimates=estimates,
+        ParameterForecast(None, config.verdict.max_yaw_sigma, None,
+                          why='not estimated on this robot'),
+        wheels=forecast_wheels(method), methods={PLANAR: method}, estimates=estimates,
         until_ns=leg.stop_ns, faults=faults)
 
 
-def _planar_scale(result: LegResult, asked: float) -> Prospect:
+def _planar_scale(result: LegResult, limit: float) -> ParameterForecast:
     """Return the forecast of the scale, whose sigma falls with the root of the distance."""
     scale = result.methods[PLANAR].estimates['scale_factor']
-    sigma = relative(scale)
+    sigma = relative_sigma(scale)
     if sigma is None or scale.value is None or scale.sigma is None:
-        return Prospect(None, asked, None, lack=DRIVE_ON)
-    metres = result.distance * max((sigma / asked)**2 - 1, 0.0) if asked else math.inf
-    return Prospect(
-        sigma, asked, metres if metres <= FARTHEST_M else None,
-        why=UNREACHABLE, now=digits(scale.value, scale.sigma))
+        return ParameterForecast(None, limit, None, manoeuvre=DRIVE_ON)
+    metres = result.distance * max((sigma / limit)**2 - 1, 0.0) if limit else math.inf
+    return ParameterForecast(
+        sigma, limit, metres if metres <= FARTHEST_LIMIT_M else None,
+        why=UNREACHABLE, value_text=format_value(scale.value, scale.sigma))

@@ -16,7 +16,7 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast import planned_drive
 from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
-from odocal_ros.forecast.planned_methods import Plan, plan_methods, spacing_for
+from odocal_ros.forecast.planned_methods import keyframe_spacing, Plan, plan_methods
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
@@ -47,7 +47,7 @@ class Change:
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     # the same keyframe spacing: a wider one alone makes a sigma larger
-    spacing = spacing_for(drive)
+    spacing = keyframe_spacing(drive)
     found = []
     for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
                                             *_better_sensors(drive, sigmas, before)):
@@ -59,16 +59,17 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
                   before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield (text, drive, sigmas) of drives that are longer or have more manoeuvres."""
-    yield (f'{length(drive.distance)} more, straight ahead', drive.lengthened(drive.distance),
+    yield (f'{length(drive.distance)} more, straight ahead', drive.lengthen(drive.distance),
            sigmas)
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
-    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest), sigmas)
-    yield 'one more stop and start', planned_drive.stop_and_start(drive), sigmas
-    yield 'one more left turn and right turn', planned_drive.left_and_right_turns(drive), sigmas
+    yield (f'standing {time_span(rest)} longer at both marks', drive.lengthen_rests(rest), sigmas)
+    yield 'one more stop and start', planned_drive.add_stop_and_start(drive), sigmas
+    yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(
+        drive), sigmas
     town_minutes = 5
     yield (f'{town_minutes} min more, stop and go with turns',
-           planned_drive.town_driving(drive, town_minutes), sigmas)
+           planned_drive.add_town_driving(drive, town_minutes), sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
         yield (f'end mark at the farthest point ({length(farthest.distance)})', farthest, sigmas)
@@ -103,14 +104,14 @@ def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     rest = max((b - a for a, b in drive.standstills(sigmas.config.leg.standstill)
                 if a <= drive.t[inside][k] <= b), default=30.0)
     moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= drive.t[inside][k]))
-    return drive.until(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
+    return drive.cut_at(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
 
 
 def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     """Return two legs combined, the second in reverse direction: each value by its method."""
     if before.sigma(SCALE) is None:
         return []
-    other = {'two_point': predict(drive.turned_around(), sigmas).method}
+    other = {'two_point': predict(drive.turn_around(), sigmas).method}
     left: dict[str, float | None] = {}
     for parameter in (SCALE, YAW):
         left[parameter] = None

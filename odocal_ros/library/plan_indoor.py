@@ -11,8 +11,15 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
-from odocal_ros.forecast.indoor_motion import MOTION_STEP, pattern, PATTERNS, RobotMotion
-from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma, Robot
+from odocal_ros.forecast.planned_indoor import (
+    MOTION_STEP,
+    pattern_motion,
+    PATTERNS,
+    predict_robot,
+    ratio_sigma,
+    Robot,
+    RobotMotion,
+)
 from odocal_ros.library.asked import config_of, Settings
 from odocal_ros.settings.config import DRIVES, HOLONOMIC, SKID
 from odocal_ros.sim.options import SimOptions
@@ -85,7 +92,7 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
         sigma = settings.reference.points_sigma if points_sigma is None else points_sigma
         robot = replace(robot, white=sigma, drift=sigma, drift_length=MARKS_LENGTH, rate=10.0,
                         at_rests=True)
-    motions = {name: pattern(name, size, rounds, drive, speed)
+    motions = {name: pattern_motion(name, size, rounds, drive, speed)
                for name in (PATTERNS if run == 'all' else (run,))}
     return [PlannedRun(name, motion, robot, predict_robot(motion, robot, settings))
             for name, motion in motions.items()]

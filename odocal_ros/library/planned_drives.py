@@ -12,7 +12,12 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
-from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
+from odocal_ros.forecast.planned_drive import (
+    drive_from_rates,
+    DRIVE_STEP,
+    PlannedDrive,
+    with_marks,
+)
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.safe_io.limits import read_bytes
@@ -58,8 +63,8 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     for k in range(turns):
         begin = standstill + ramp + (k + 1) * cruise / (turns + 1) - turn_time / 2
         rate[(t >= begin) & (t < begin + turn_time)] = (-1)**k * math.pi / 2 / turn_time
-    return from_rates(t, np.interp(t, knots, [0.0, top, top, 0.0]), rate,
-                      latitude=math.radians(45.0))
+    return drive_from_rates(t, np.interp(t, knots, [0.0, top, top, 0.0]), rate,
+                            latitude=math.radians(45.0))
 
 
 def from_scenario(name: str, duration: float | None) -> PlannedDrive:
@@ -71,9 +76,9 @@ def from_scenario(name: str, duration: float | None) -> PlannedDrive:
     t = np.union1d(np.arange(0.0, motion.duration, max(DRIVE_STEP, motion.duration / 50_000)),
                    np.append(motion.speed.breaks, motion.duration))
     t = t[np.diff(t, prepend=-1.0) > 1e-6]
-    return from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
-                      latitude=options.latitude, longitude=options.longitude,
-                      height=options.height)
+    return drive_from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
+                            latitude=options.latitude, longitude=options.longitude,
+                            height=options.height)
 
 
 def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
@@ -175,9 +180,9 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     gpx_smooth = 4.0
     wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
     slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer
-    return marked(grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
-                  _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), slopes * wide),
-                  latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
+    return with_marks(grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
+                      _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), slopes * wide),
+                      latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
 
 
 def _smooth(x: Floats, wide: int) -> Floats:
@@ -191,7 +196,7 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
              journal: 'JournalNotes | None') -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.forecast.leg_so_far import figures, profile_of
+    from odocal_ros.forecast.leg_so_far import drive_profile, fix_and_count_accuracy
     from odocal_ros.library.legs import find_legs, marked_legs
     from odocal_ros.library.read_bag import readers_of, recorded
     from odocal_ros.screening.screen import screen
@@ -200,4 +205,4 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
         recorder = recorded(bag, chosen, readers)
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     inputs, _ = screen(recorder.close(start_ns, stop_ns, config.leg.preroll), config)
-    return profile_of(inputs, config), figures(inputs, config)
+    return drive_profile(inputs, config), fix_and_count_accuracy(inputs, config)

@@ -9,8 +9,8 @@ from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import quantities
-from odocal_ros.forecast.forecast import REST_FORESEEN_S
-from odocal_ros.forecast.progress import clocks_differ
+from odocal_ros.forecast.forecast import PREDICTED_REST_S
+from odocal_ros.forecast.progress import clock_difference_text
 from odocal_ros.live.session import Restored, SessionView, State
 from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.reasons import cautions, Reason, Verdict
@@ -106,15 +106,15 @@ def hint(now: SessionView) -> str:
     if now.missing:
         return now.missing[0]
     if now.clocks:
-        return clocks_differ(now.clocks)
+        return clock_difference_text(now.clocks)
     if state is State.RECORDING:
         actions, facts = _recording_hint(now)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
         if now.config.leg.automatic and now.imu:
             return 'start driving: a leg starts automatically'
-        if now.still_s < REST_FORESEEN_S:
-            return (f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg '
+        if now.still_s < PREDICTED_REST_S:
+            return (f'stand still {PREDICTED_REST_S:.0f} s before ~/start_leg '
                     f'({now.still_s:.0f} s so far)')
         return 'call ~/start_leg'
     return advice_after_result(now)
@@ -133,13 +133,13 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
     """Return the quantities that meet their limits: of the current leg, else of the result."""
     session = now.session
     if session.state is State.RECORDING:
-        return quantities.of_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
+        return quantities.check_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
     if session.state is not State.COMPUTING and session.calibration is not None:
-        return quantities.of_calibration(session.calibration, now.config, now.two_wheels)
+        return quantities.check_calibration(session.calibration, now.config, now.two_wheels)
     if session.state is not State.COMPUTING and session.restored is not None:
-        return quantities.of_estimates(session.restored.estimates, now.config,
+        return quantities.check_estimates(session.restored.estimates, now.config,
                                        now.two_wheels, session.restored.valid)
-    return quantities.nothing_known()
+    return quantities.all_unknown()
 
 
 def metres_to_go(now: SessionView) -> float:
@@ -152,7 +152,7 @@ def metres_to_go(now: SessionView) -> float:
 def seconds_to_stand(now: SessionView) -> float:
     """Return the seconds of standstill still required, before the start or at the end of a leg."""
     if now.session.state is State.RECORDING or not now.session.busy:
-        return max(0.0, REST_FORESEEN_S - now.still_s)
+        return max(0.0, PREDICTED_REST_S - now.still_s)
     return 0.0
 
 
@@ -168,7 +168,7 @@ def manoeuvres(now: SessionView) -> list[str]:
         required.append('call ~/mark at rest on each point')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):
         required += _wheel_manoeuvres(now)
-    return required + (now.forecast.lacks if now.forecast else [])
+    return required + (now.forecast.manoeuvres if now.forecast else [])
 
 
 def _wheel_manoeuvres(now: SessionView) -> list[str]:
@@ -196,7 +196,7 @@ def _recording_hint(now: SessionView) -> tuple[list[str], list[str]]:
         return [', '.join(required), end], facts
     if now.forecast is None:
         return [*required, _end_text(now)], facts
-    facts.append(now.forecast.words(now.distance_m))
+    facts.append(now.forecast.as_text(now.distance_m))
     if now.forecast_age_s > FORECAST_OLD_S:
         facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
     is_last_step = now.forecast.complete or now.session.is_automatic
@@ -217,7 +217,7 @@ def _end_text(now: SessionView) -> str:
         return ('the leg ends automatically at a standstill, or within '
                 f'{max(1, round(remaining))} min')
     if now.still_s < now.session.config.leg.standstill:
-        return f'stand still {REST_FORESEEN_S:.0f} s at the end point, then call ~/stop_leg'
+        return f'stand still {PREDICTED_REST_S:.0f} s at the end point, then call ~/stop_leg'
     remaining = seconds_to_stand(now)
     return (f'stand still {remaining:.0f} s more, then ' if remaining >= 1
             else '') + 'call ~/stop_leg'

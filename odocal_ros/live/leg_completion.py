@@ -13,10 +13,9 @@ from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.forecast.ability import Ability, ability
 from odocal_ros.forecast.leg_so_far import SILENT_TIME
-from odocal_ros.forecast.progress import clocks_differ
-from odocal_ros.forecast.quantities import words
+from odocal_ros.forecast.progress import clock_difference_text
+from odocal_ros.forecast.quantities import find_observable, Observability, quantities_text
 from odocal_ros.live import answers, worker
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
@@ -52,8 +51,8 @@ class LegCompletion:
         self._running_estimate = RunningEstimate(self._worker, self._log)
         self._node_name = node.get_fully_qualified_name()
         self._computing = worker.Computing(self._worker, self._fail, self.show_status,
-                                    node.context.ok)
-        self._ability: Ability | None = None  # of the leg last started
+                                           node.context.ok)
+        self._ability: Observability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for a retry
         # of the open leg: its last running estimate
@@ -180,7 +179,7 @@ class LegCompletion:
         """Return the explanation why no leg can start, empty if one can."""
         missing = self._recording.inputs.missing(self._config())
         clocks = self._recording.progress.clocks.differing(self._config())
-        return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
+        return '; '.join(missing) or (clock_difference_text(clocks) if clocks else '')
 
     def _begin_leg(self, mark_ns: int, is_automatic: bool = False) -> str:
         """Open a leg at a mark and return the text for log and answer."""
@@ -193,11 +192,11 @@ class LegCompletion:
         if not is_automatic:
             self._recording.progress.begin_leg()
         self._running_estimate.begin(self._recording.snapshot(), mark_ns, session.config)
-        self._ability = ability(session.config, self._recording.received_before(
+        self._ability = find_observable(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
         text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; '
-                f'{answers.hint(self.view())}. With these settings, {self._ability.words()}')
+                f'{answers.hint(self.view())}. With these settings, {self._ability.as_text()}')
         self._log.info(text)
         return text
 
@@ -262,7 +261,7 @@ class LegCompletion:
         self._publishing.show_paths(paths)
         now = self.view()
         success, text = answers.result_answer(calibration, parts, self.session.leg_id,
-                                              words(answers.quantities_ok(now)),
+                                              quantities_text(answers.quantities_ok(now)),
                                               answers.advice_after_result(now))
         self._log.info(text)
         self._computing.answer(success, text)

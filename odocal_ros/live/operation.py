@@ -10,7 +10,7 @@ from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import Samples
-from odocal_ros.forecast.quantities import words
+from odocal_ros.forecast.quantities import quantities_text
 from odocal_ros.live import answers, worker
 from odocal_ros.live.filing import LATEST, output_root
 from odocal_ros.live.leg_completion import LegCompletion
@@ -183,7 +183,7 @@ class Operation(AutomaticLegs):
         session, now = self.session, self.view()
         if now.lost:
             raise Refused(now.lost)
-        good = words(answers.quantities_ok(now))
+        good = quantities_text(answers.quantities_ok(now))
         if session.calibration is not None:
             success, text = answers.result_answer(session.calibration, good=good,
                                                   advice=answers.advice_after_result(now))

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64, String
 from odocal_ros.bagio.segments import STATUS_NAME
 from odocal_ros.calib.result import Calibration, wheel_factors
 from odocal_ros.forecast import quantities
-from odocal_ros.forecast.forecast import as_keys
+from odocal_ros.forecast.forecast import status_keys
 from odocal_ros.live import answers, params
 from odocal_ros.live.answers import hint_action_first
 from odocal_ros.live.console import losses_text
@@ -79,7 +79,8 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'automatic': _automatic(now), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
-    } | _computing(now) | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
+    } | _computing(now) | quantities.status_keys(ok) | status_keys(now.forecast,
+                                                                   now.forecast_age_s)
     return DiagnosticStatus(
         level=level(now), name=STATUS_NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
@@ -139,7 +140,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
     }[now.state]
     if now.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {now.restored}'
-    good = '' if session.state is State.RECORDING else quantities.words(ok)
+    good = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]

@@ -15,8 +15,8 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import FixSamples, LOCAL, OdometerForm, Samples, take
 from odocal_ros.errors import BadUsage
-from odocal_ros.forecast.ability import Received
 from odocal_ros.forecast.progress import Progress
+from odocal_ros.forecast.quantities import Received
 from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.messages.message_fields import types_of
 from odocal_ros.settings.config import Config

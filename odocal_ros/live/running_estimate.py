@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
 from odocal_ros.forecast import leg_so_far
-from odocal_ros.forecast.forecast import Abandoned, better, Forecast
-from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.forecast import Abandoned, combine_sections, Forecast
+from odocal_ros.forecast.leg_forecast import forecast_leg
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import error_line
@@ -87,7 +87,7 @@ class RunningEstimate:
 
     @property
     def forecast(self) -> Forecast | None:
-        return better(self._earlier, self._current)
+        return combine_sections(self._earlier, self._current)
 
     def _start_section(self, start_ns: int, form: OdometerForm) -> None:
         """Start a new section at a stamp."""
@@ -163,13 +163,13 @@ def _compute_update(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_block
             forecast = planar_forecast(leg, config, lambda: not stop_event.is_set())
         else:
             faults = leg_so_far.faults_in_cells(leg, config)
-            forecast = forecast_of(leg, thinned.fix_rate(), config,
+            forecast = forecast_leg(leg, thinned.fix_rate(), config,
                                    lambda: not stop_event.is_set(), smoother)
     except Exception as error:  # an error of the running estimate does not end the leg
         update_error = error
     finally:
         leg_so_far.screened_in_cells.cache_clear()      # no later update uses this leg
-    cpu_time_s = time.thread_time() - begin - smoother.once_s
+    cpu_time_s = time.thread_time() - begin - smoother.cold_start_cpu_s
     return UpdateResult(forecast, faults, cpu_time_s, update_error)
 
 

@@ -11,8 +11,8 @@ from typing import Any
 from odocal_ros.calib.border import Carried
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import OdocalError
-from odocal_ros.forecast.ability import Ability
 from odocal_ros.forecast.forecast import Forecast
+from odocal_ros.forecast.quantities import Observability
 from odocal_ros.output.summary import values_in_words
 from odocal_ros.pipeline.floor_marks import FloorMark, next_point
 from odocal_ros.pipeline.prepared_leg import Stage
@@ -243,7 +243,7 @@ class SessionView:
     max_speed: float = 0.0
     still_s: float = 0.0
     two_wheels: bool = False                     # left and right wheel are known
-    ability: Ability | None = None               # of the recorded leg
+    ability: Observability | None = None               # of the recorded leg
     forecast: Forecast | None = None               # of the recorded or computed leg
     faults: tuple[Reason, ...] = ()              # of the recorded leg, most severe first
     forecast_age_s: float = nan                   # since its newest sample

@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 from std_msgs.msg import String
 
-from odocal_ros.forecast.forecast import REST_FORESEEN_S, three_digits
+from odocal_ros.forecast.forecast import PREDICTED_REST_S, three_digits
 from odocal_ros.live.messages import LATCHED
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.safe_io.text_formats import brief_line
@@ -52,7 +52,7 @@ def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     bars = {}
     if driven + missing_m > 0:      # a leg
         bars['path'] = driven / (driven + missing_m), f'{missing_m:.0f} m to go'
-    bars['standstill'] = 1 - standstill_s / REST_FORESEEN_S, f'{standstill_s:.0f} s to go'
+    bars['standstill'] = 1 - standstill_s / PREDICTED_REST_S, f'{standstill_s:.0f} s to go'
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         required = number(status, f'required_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]

@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.pieces import across
 from odocal_ros.errors import BadData
-from odocal_ros.nav.local_frame import local_fixes
+from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config, OdometerConfig
 from odocal_ros.settings.levels import RAD_PER_DEG
 

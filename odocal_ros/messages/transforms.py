@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.decode import Deserialize, Reader
 from odocal_ros.messages.message_fields import Pairs, SensorPlan, TRANSFORMS
 from odocal_ros.nav.frame_chain import FrameChain
-from odocal_ros.nav.local_frame import local_fixes
+from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config
 
 STATIC = '_static'      # suffix of the topic of static transforms

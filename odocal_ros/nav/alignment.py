@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import gravity, OMEGA
+from odocal_ros.nav.geodesy import gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose, wrap
 from odocal_ros.settings.nominal import Grade
 

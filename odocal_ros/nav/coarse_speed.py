@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.nav.statistics import MISSING_INTERVALS
+from odocal_ros.nav.time_series import MISSING_INTERVALS
 
 LEAST_CROSSING = 0.02      # judgement: of a cell, minimum sigma of a crossing
 LEAST_CELLS = 3.0          # judgement: cells that the values must span

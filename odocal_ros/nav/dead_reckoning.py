@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
-from odocal_ros.nav import earth
-from odocal_ros.nav.local_frame import GNSS_MOVES
+from odocal_ros.nav import geodesy
+from odocal_ros.nav.geodesy import GNSS_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.time_series import robust_sigma
 
 SHORT_SECTION = 2.0     # m, judgement: correlated fix errors change by less in that path
 # judgement: least ratio of scales by short and long sections if the path folds back; noise of an
@@ -41,24 +41,24 @@ class Origin:
     latitude: float
     longitude: float
     height: float
-    local: earth.PartlyKnownRate | None = None
+    local: geodesy.PartlyKnownRate | None = None
 
     @property
     def earth_rate_n(self) -> Floats:
         """Return the known part of the Earth's turn rate in n, rad/s: (3,)."""
-        return np.array(self.local.rate_n) if self.local else earth.earth_rate_n(self.latitude)
+        return np.array(self.local.rate_n) if self.local else geodesy.earth_rate_n(self.latitude)
 
     def to_n(self, geodetic: Floats) -> Floats:
         """Return positions in n, m, from (..., 3) latitude, longitude (rad), height (m)."""
-        r_e = earth.ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
-        own_e = earth.ecef_from_geodetic(self.latitude, self.longitude, self.height)
-        return (r_e - own_e) @ earth.C_en(self.latitude, self.longitude)
+        r_e = geodesy.ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
+        own_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        return (r_e - own_e) @ geodesy.C_en(self.latitude, self.longitude)
 
     def to_geodetic(self, position_n: Floats) -> Floats:
         """Return (..., 3) latitude, longitude (rad), height (m) from positions in n, m."""
-        own_e = earth.ecef_from_geodetic(self.latitude, self.longitude, self.height)
-        r_e = own_e + position_n @ earth.C_en(self.latitude, self.longitude).T
-        return np.stack(earth.geodetic_from_ecef(r_e), -1)
+        own_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        r_e = own_e + position_n @ geodesy.C_en(self.latitude, self.longitude).T
+        return np.stack(geodesy.geodetic_from_ecef(r_e), -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import across, by_step, runs
-from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.time_series import integral_at
 
 REST_GRID = 0.1       # s, judgement: grid of the detector
 REST_WINDOW = 0.5     # s, judgement: each side

@@ -25,7 +25,7 @@ from odocal_ros.nav.alignment import (
     REST_EDGE,
 )
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
-from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_at,
@@ -75,7 +75,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
 
 
 def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
-                   epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
+                       epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
     """
     Return an alignment whose gyro bias walk is at least that observed at later standstills.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.data.samples import FixSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.nav.local_frame import local_fixes
+from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config
 
 # s before and after a mark, and positions in between. Judgement: a fit needs ten positions

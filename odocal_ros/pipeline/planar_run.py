@@ -16,7 +16,7 @@ from odocal_ros.calib.result import failed, LegResult, MethodResult, raised_if_w
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.time_series import integral_at
 from odocal_ros.pipeline.methods import leg_result
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason

@@ -35,8 +35,8 @@ from odocal_ros.nav.dead_reckoning import (
     section_ratio,
     Track,
 )
-from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.strapdown import attitude
+from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, Placed

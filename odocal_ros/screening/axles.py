@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.odometer import mean_travel, Travel
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import (
     broken_wheel_reasons,

@@ -15,9 +15,8 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.data.samples import FixSamples, LOCAL
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import ecef_from_geodetic, radii
-from odocal_ros.nav.integral import running_integral
-from odocal_ros.nav.statistics import MISSING_INTERVALS
+from odocal_ros.nav.geodesy import ecef_from_geodetic, radii
+from odocal_ros.nav.time_series import MISSING_INTERVALS, running_integral
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import GnssConfig
 from odocal_ros.settings.levels import REMARK_SIGMAS

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import medians
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
-from odocal_ros.nav.earth import rate_without_north
-from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.fix_screen import median_origin

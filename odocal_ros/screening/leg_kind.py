@@ -22,8 +22,7 @@ from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import chunks, thinned
-from odocal_ros.nav.earth import OMEGA
-from odocal_ros.nav.local_frame import LARGEST_FRAME
+from odocal_ros.nav.geodesy import LARGEST_FRAME, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel, without_rollover
-from odocal_ros.nav.statistics import MISSING_INTERVALS
+from odocal_ros.nav.time_series import MISSING_INTERVALS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import is_impossible, speed_glitches
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import runs
-from odocal_ros.nav.integral import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.time_series import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import G

@@ -11,7 +11,7 @@ coordinates, at a standstill or along the other axis, have the same error.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.earth import radii
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FIX_NOISE_LIMIT
 

@@ -15,8 +15,8 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import by_step, chunks
 from odocal_ros.data.samples import Samples, take
-from odocal_ros.nav.local_frame import LARGEST_FRAME
-from odocal_ros.nav.statistics import gaps_in_rhythm
+from odocal_ros.nav.geodesy import LARGEST_FRAME
+from odocal_ros.nav.time_series import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import glitches
 from odocal_ros.screening.leg_kind import is_local

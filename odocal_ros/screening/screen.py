@@ -18,8 +18,8 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row, median
 from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySamples
-from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import usable_axles
 from odocal_ros.screening.clocks import (

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import medians, runs
-from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.statistics import GAP_INTERVALS, robust_sigma
+from odocal_ros.nav.time_series import GAP_INTERVALS, integral_at, robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import ROLLS
 from odocal_ros.settings.config import SIDES

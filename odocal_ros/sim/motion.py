@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav import earth
+from odocal_ros.nav import geodesy
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Hills, Profile
 
@@ -145,7 +145,7 @@ def _running(first: float, steps: Floats) -> Floats:
 def _walk_about(latitude: Floats, height: Floats, east: Floats,
                 north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps about a middle latitude."""
-    meridian, normal = earth.radii(latitude)
+    meridian, normal = geodesy.radii(latitude)
     return north / (meridian + height), east / ((normal + height) * np.cos(latitude))
 
 
@@ -187,11 +187,11 @@ def inertial_v(state: State,
     a_v = np.concatenate([state.acceleration[:, None], state.sway_acceleration], axis=1)
     a_v = a_v + np.cross(w_nv, _velocity_v(state))
 
-    w_ie_n = earth.earth_rate_n(state.latitude)
-    transport = earth.transport_rate_n(state.latitude, state.height, v_n)
+    w_ie_n = geodesy.earth_rate_n(state.latitude)
+    transport = geodesy.transport_rate_n(state.latitude, state.height, v_n)
     w_in = _into(C_nv, w_ie_n + transport)
     w_v = w_in + w_nv
-    gamma = earth.gravity(state.latitude, state.height)
+    gamma = geodesy.gravity(state.latitude, state.height)
     coriolis = np.cross(2 * w_ie_n + transport, v_n)
     coriolis[:, 2] += gamma
     f_v = a_v + _into(C_nv, coriolis)
@@ -200,7 +200,7 @@ def inertial_v(state: State,
     if arm.any():
         a_n = np.einsum('nij,nj->ni', C_nv, a_v)
         dw_v = dw_nv - np.cross(w_nv, w_in) + _into(
-            C_nv, earth.transport_rate_n(state.latitude, state.height, a_n))
+            C_nv, geodesy.transport_rate_n(state.latitude, state.height, a_n))
         w_e = _into(C_nv, w_ie_n)
         # the Earth's own centrifugal part is in gravity already
         f_v = f_v + (np.cross(dw_v, arm) + np.cross(w_v, np.cross(w_v, arm))
@@ -216,19 +216,19 @@ def _into(C_nv: Floats, a_n: Floats) -> Floats:
 
 def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
     """Return gravity at d_n (m) from the vehicle minus that at the vehicle, in its ENU."""
-    meridian, normal = earth.radii(state.latitude)
+    meridian, normal = geodesy.radii(state.latitude)
     tilt_e, tilt_n = d_n[:, 0] / (normal + state.height), d_n[:, 1] / (meridian + state.height)
-    there = earth.gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
+    there = geodesy.gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
     return np.stack([-there * tilt_e, -there * tilt_n, gamma - there], -1)
 
 
 def point(state: State, lever_arm_v: tuple[float, float, float],
           tilt: Floats | None = None) -> tuple[Floats, Floats, Floats]:
     """Return latitude, longitude (rad), height (m) of a point of the body, which is tilted."""
-    C = earth.C_en(state.latitude, state.longitude) @ attitude(state)
+    C = geodesy.C_en(state.latitude, state.longitude) @ attitude(state)
     C = C if tilt is None else C @ tilt
-    r_e = earth.ecef_from_geodetic(state.latitude, state.longitude, state.height)
-    return earth.geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
+    r_e = geodesy.ecef_from_geodetic(state.latitude, state.longitude, state.height)
+    return geodesy.geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
 
 
 def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float],
@@ -254,6 +254,6 @@ def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]
 def turn_rate(state: State) -> Floats:
     """Return the turn rate about the vehicle's up axis relative to the ground, rad/s: (n,)."""
     east = state.speed * np.cos(state.slope) * np.cos(state.yaw)
-    level_turn = east * np.tan(state.latitude) / (earth.radii(state.latitude)[1] + state.height)
+    level_turn = east * np.tan(state.latitude) / (geodesy.radii(state.latitude)[1] + state.height)
     turn: Floats = state.yaw_rate * np.cos(state.slope) + level_turn
     return turn

@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import VelocitySamples
-from odocal_ros.nav.earth import radii
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT

@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.local_frame import local_fixes
+from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_rpy, yaw_from_heading
 from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors

@@ -17,7 +17,7 @@ import numpy as np
 from odocal_ros.data import samples
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav import rotations
-from odocal_ros.nav.earth import radii
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
 from odocal_ros.sim import body, real_sensors, wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State

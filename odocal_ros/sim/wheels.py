@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.nav.integral import running_integral
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.settings.config import MECANUM, OMNI, SIDES, SKID
 from odocal_ros.sim.motion import contact_speed, State, turn_rate
 from odocal_ros.sim.noise import stream

@@ -12,7 +12,7 @@ import pytest
 from odocal_reproductions.paper.error_forms import chord_error, plane_error, SpeedProfile
 from odocal_reproductions.paper.error_model import PAPER_RADIUS, propagate
 from odocal_reproductions.paper.path import planned_path
-from odocal_ros.nav.projection import Plane
+from odocal_ros.nav.geodesy import Plane
 from odocal_ros.nav.rotations import wrap
 
 DRIFT = np.deg2rad(0.01) / 3600     # 0.01 deg/h

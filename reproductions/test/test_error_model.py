@@ -21,7 +21,7 @@ from odocal_reproductions.paper.error_model import (
 )
 from odocal_reproductions.paper.path import Path, planned_path
 from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b, Origin
-from odocal_ros.nav.earth import C_en, earth_rate_n, OMEGA, radii
+from odocal_ros.nav.geodesy import C_en, earth_rate_n, OMEGA, radii
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude

@@ -11,7 +11,7 @@ from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
-from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.inputs import place

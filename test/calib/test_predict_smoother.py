@@ -15,12 +15,12 @@ from odocal_ros.estimator import bound, prepare, smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
-from odocal_ros.forecast.ideal_samples import ideal
-from odocal_ros.forecast.planned_drive import from_rates, TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.forecast.planned_drive import drive_from_rates, TOWN_SIDES, TOWN_SPEED, TOWN_T
 from odocal_ros.forecast.planned_methods import (
-    planned_levels,
+    ideal_samples,
+    keyframe_spacing,
+    planned_noise_levels,
     predict_smoother,
-    spacing_for,
     WIDEST_SPACING,
 )
 from odocal_ros.forecast.predict import Sigmas
@@ -55,7 +55,7 @@ def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(opti
     drive, config, leg = made(**ROAD, **options)
     sigmas = figures(drive, config, tau)
     problem = problem_of(leg, config)
-    true = bound(leg, config, truth(drive, config, leg), planned_levels(problem, sigmas))
+    true = bound(leg, config, truth(drive, config, leg), planned_noise_levels(problem, sigmas))
     sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
     # elsewhere: 5 % of what rests tell
@@ -82,18 +82,19 @@ def stop_and_go():
     minute = (t // 60).astype(int)
     turning = (t % 60 >= 22.0) & (t % 60 < 30.0)
     speed = np.interp(t % 60, TOWN_T, TOWN_SPEED)
-    return from_rates(t, speed, np.where(turning, np.array(TOWN_SIDES)[minute % 4], 0.0)
-                      * np.pi / 16)
+    return drive_from_rates(t, speed, np.where(turning, np.array(TOWN_SIDES)[minute % 4], 0.0)
+                            * np.pi / 16)
 
 
 def straight():
     t = np.arange(0.0, 720.05, 0.1)
-    return from_rates(t, np.interp(t, [60, 85, 635, 660], [0, 12, 12, 0]), np.zeros_like(t))
+    return drive_from_rates(t, np.interp(t, [60, 85, 635, 660], [0, 12, 12, 0]), np.zeros_like(t))
 
 
 def paper():
     t = np.arange(0.0, 900.05, 0.1)
-    return from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]), np.zeros_like(t))
+    return drive_from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]),
+                            np.zeros_like(t))
 
 
 @pytest.mark.parametrize(('drive', 'grade', 'white', 'pulses'), [
@@ -123,7 +124,7 @@ def town_sigmas():
 def test_fixes_are_thinned_without_loss(town_sigmas, monkeypatch):
     # heights drift by the stated sigma, which differs here
     monkeypatch.setattr(prepare, 'HEIGHT_TIME', np.inf)
-    drive = stop_and_go().until(180.0, 10.0)
+    drive = stop_and_go().cut_at(180.0, 10.0)
     often = predict_smoother(drive, replace(town_sigmas, fix=2.0, fix_rate=16.0))
     rare = predict_smoother(drive, replace(town_sigmas, fix=0.5, fix_up=1.0, fix_rate=1.0))
     np.testing.assert_allclose(sigmas_of(often), sigmas_of(rare), rtol=1e-6)
@@ -137,21 +138,21 @@ def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     # twice that of the yaw, which how a turn sets in tells from axes of the IMU that are off
     assert (coarse >= fine).all()
     assert (coarse < 1.2 * fine).all()
-    assert spacing_for(drive) == 1.0
-    assert spacing_for(replace(drive, t=drive.t * 3)) == pytest.approx(3.0, rel=0.01)
-    assert spacing_for(replace(drive, t=drive.t * 10)) == WIDEST_SPACING
+    assert keyframe_spacing(drive) == 1.0
+    assert keyframe_spacing(replace(drive, t=drive.t * 3)) == pytest.approx(3.0, rel=0.01)
+    assert keyframe_spacing(replace(drive, t=drive.t * 10)) == WIDEST_SPACING
     day = replace(drive, t=drive.t * 60)
-    assert day.duration / spacing_for(day) == pytest.approx(1440.0)
+    assert day.duration / keyframe_spacing(day) == pytest.approx(1440.0)
 
 
 def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
-    drive = stop_and_go().until(180.0, 10.0)
+    drive = stop_and_go().cut_at(180.0, 10.0)
     drive = replace(drive, slope=0.03 * np.sin(drive.travel / 100.0))
     config = with_settings(town_sigmas.config, {
         'imu.lever_arm': (1.0, 0.4, 0.8), 'odometer.lever_arm': (-0.5, 0.7, -0.2),
         'gnss.lever_arm': (0.3, -0.6, 1.5)})
     sigmas = replace(town_sigmas, config=config, fix=0.02)
-    one = ideal(drive, sigmas, 1.0)
+    one = ideal_samples(drive, sigmas, 1.0)
     problem = problem_of(one.leg, config, one.imu)
     parts = Equations(problem, one.state).parts
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
@@ -165,7 +166,7 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
 
 
 def test_a_heading_that_is_given_helps_as_far_as_it_is_known(town_sigmas):
-    drive = straight().until(300.0, 30.0)
+    drive = straight().cut_at(300.0, 30.0)
 
     def yaw(source, sigma):
         config = with_settings(town_sigmas.config, {
@@ -187,12 +188,12 @@ def test_a_heading_that_is_given_helps_as_far_as_it_is_known(town_sigmas):
 
 def test_what_the_smoother_would_refuse_is_refused(town_sigmas):
     t = np.arange(0.0, 120.0, 0.1)
-    even = from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
+    even = drive_from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
     method = predict_smoother(even, town_sigmas)
     assert method.estimates['yaw_mounting_angle'].sigma is None
     reason = next(r for r in method.reasons if r.code is Code.YAW_NOT_DETERMINED)
     assert 'stops, starts and turns' in reason.remedy
-    short = from_rates(t[:150], np.full(150, 15.0), np.zeros(150))
+    short = drive_from_rates(t[:150], np.full(150, 15.0), np.zeros(150))
     method = predict_smoother(short, town_sigmas)
     assert method.estimates['scale_factor'].sigma is None
     assert [r.code for r in method.reasons] == [Code.SCALE_NOT_DETERMINED]

@@ -19,7 +19,7 @@ from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE, SI
 from odocal_ros.estimator.factors.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.nav.coarse_speed import CoarseSpeed
-from odocal_ros.nav.earth import rate_without_north
+from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow

@@ -189,7 +189,7 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
         c[ACCEL.start + 1] = -wrong
         fit = SimpleNamespace(settled=True, state=SimpleNamespace(constants=c))
         monkeypatch.setattr(smoother, 'best_fit', lambda *_, fit=fit: fit)
-        monkeypatch.setattr(smoother, 'outcome', lambda *_: None)
+        monkeypatch.setattr(smoother, 'make_result', lambda *_: None)
         method = smooth(leg, config)
         assert (method is not None) == refused
     assert method.estimates['scale_factor'].value is None

@@ -18,7 +18,7 @@ from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
 from odocal_ros.estimator.result import mismatch
 from odocal_ros.estimator.result.estimates import join_names
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.earth import gravity
+from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code

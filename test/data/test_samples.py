@@ -18,7 +18,7 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS, thinned
 from odocal_ros.data.samples import ImuSamples, take
 from odocal_ros.errors import BadData
-from odocal_ros.nav.integral import integral_at, integrals_at, twice_integral_at
+from odocal_ros.nav.time_series import integral_at, integrals_at, twice_integral_at
 
 pytestmark = pytest.mark.core
 ROW = 104      # bytes of an IMU row

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from drives import thinned
 import numpy as np
 
-from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_forecast import forecast_leg
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -20,7 +20,7 @@ def foreseen(drive, config, t_stop, begin_s=float('-inf'), **more):
     """Return what is foreseen after seconds of a drive; begin_s: of its recording."""
     leg = drive.leg()
     cells = thinned(leg, t_stop, begin_s)
-    return forecast_of(cells.leg(leg.start_ns), cells.fix_rate(), config, **more)
+    return forecast_leg(cells.leg(leg.start_ns), cells.fix_rate(), config, **more)
 
 
 def drive_of(**options):
@@ -34,6 +34,7 @@ def looked(drive, config, looks=LOOKS):
     for before, now in zip((-np.inf, *looks), looks, strict=False):
         cells = thinned(whole, now, before, cells)
         leg = cells.leg(whole.start_ns)
-        running = so_far.look(leg, config)
-        found.append(SimpleNamespace(running=running, once_s=so_far.once_s, leg=leg))
+        running = so_far.update(leg, config)
+        found.append(SimpleNamespace(running=running, cold_start_cpu_s=so_far.cold_start_cpu_s,
+                                     leg=leg))
     return found

@@ -13,9 +13,9 @@ import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import OdocalError
-from odocal_ros.forecast import foresight
-from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect, UNREACHABLE
-from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
+from odocal_ros.forecast import leg_forecast
+from odocal_ros.forecast.forecast import Forecast, ParameterForecast, status_keys, UNREACHABLE
+from odocal_ros.forecast.leg_forecast import Abandoned, forecast_leg, RecordedDrive
 from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.live.answers import hint
 from odocal_ros.live.session import Session, SessionView
@@ -26,10 +26,10 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SECOND = 10**9
-GOOD = Prospect(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
-MORE = Prospect(1820e-6, 1e-3, 231.0)
-YAW = Prospect(0.005, 0.0087, 0.0)
-NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
+GOOD = ParameterForecast(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
+MORE = ParameterForecast(1820e-6, 1e-3, 231.0)
+YAW = ParameterForecast(0.005, 0.0087, 0.0)
+NO_YAW = ParameterForecast(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
 
 
 def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
@@ -49,24 +49,24 @@ def test_the_metres_foreseen_are_those_it_takes(drive, config):
     first = foreseen(drive, config, t_now)
     asked = first.scale.sigma / 1.6
     strict = with_settings(config, {'verdict.max_scale_sigma': asked})
-    metres = foreseen(drive, strict, t_now).scale.metres
+    metres = foreseen(drive, strict, t_now).scale.remaining_m
     speed = drive.truth.distance / 240.0            # driven in about the middle 240 s
     later = [foreseen(drive, strict, t_now + share * metres / speed) for share in (0.5, 1.5)]
-    assert later[0].scale.metres > 0 < metres
+    assert later[0].scale.remaining_m > 0 < metres
     assert later[0].scale.sigma > asked
-    assert (later[1].scale.metres, later[1].scale.sigma <= asked) == (0.0, True)
-    assert later[0].scale.metres < 0.8 * metres
+    assert (later[1].scale.remaining_m, later[1].scale.sigma <= asked) == (0.0, True)
+    assert later[0].scale.remaining_m < 0.8 * metres
 
 
 def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, config):
     asked = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
     yaw = foreseen(drive, asked, 150.0).yaw
-    assert yaw.metres is None
-    assert yaw.words('yaw', 'deg', math.degrees(1)) == (
+    assert yaw.remaining_m is None
+    assert yaw.as_text('yaw', 'deg', math.degrees(1)) == (
         'yaw: limited by the heading uncertainty (0.17 deg)')
     course = with_settings(config, {'alignment.heading_source': 'course'})
     yaw = foreseen(drive, course, 150.0).yaw
-    assert (yaw.sigma, yaw.metres) == (None, None)
+    assert (yaw.sigma, yaw.remaining_m) == (None, None)
     assert 'not separable from the course over ground' in yaw.why
 
 
@@ -75,14 +75,14 @@ def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     cells = thinned(drive.leg(), 110.0, 98.0)
     config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
     leg = cells.leg(drive.leg().start_ns + 100 * SECOND)
-    found = forecast_of(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
+    found = forecast_leg(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert found.methods == {}
-    assert 'yaw is not determined yet' in found.words()
-    assert found.lacks == ['drive on with stops, starts and turns']
+    assert 'yaw is not determined yet' in found.as_text()
+    assert found.manoeuvres == ['drive on with stops, starts and turns']
     assert not found.complete
     still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
-    never = forecast_of(still, cells.fix_rate(), config, smoother=SmootherSoFar())
-    assert 'yaw: not separable from the course over ground' in never.words()
+    never = forecast_leg(still, cells.fix_rate(), config, smoother=SmootherSoFar())
+    assert 'yaw: not separable from the course over ground' in never.as_text()
 
 
 def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
@@ -93,7 +93,7 @@ def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     n = len(leg.imu.stamp_ns)
     oriented = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
                                         q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
-    forecast = forecast_of(oriented, cells.fix_rate(), auto)
+    forecast = forecast_leg(oriented, cells.fix_rate(), auto)
     assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
 
 
@@ -110,8 +110,8 @@ def test_a_drive_goes_on_from_here_at_its_own_speed():
     t = np.arange(0.0, 61.0)
     speed = np.where((t < 10) | (t > 50), 0.0, 8.0)
     bend = np.where(t > 30, np.pi / 2, 0.0)
-    drive = DriveSoFar(t, speed, bend, np.zeros(61))
-    more = drive.lengthened(400.0)
+    drive = RecordedDrive(t, speed, bend, np.zeros(61))
+    more = drive.lengthen(400.0)
     assert more.distance - drive.distance == pytest.approx(400.0)
     assert more.duration - drive.duration == pytest.approx(50.0)
     assert more.standstills(2.0)[-1] == pytest.approx((101.0, 110.0))
@@ -126,12 +126,12 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
         seen.append(planned)
         return predict(planned, sigmas)
 
-    predict = foresight.predict
-    monkeypatch.setattr(foresight, 'predict', counted)
-    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100)
+    predict = leg_forecast.predict
+    monkeypatch.setattr(leg_forecast, 'predict', counted)
+    monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100)
     sparse = foreseen(drive, config, 270.0)
     assert len(seen[0].t) <= 100 + 2 * 100      # a rest of 10 s is put on in steps of 0.1 s
-    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100_000)
+    monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100_000)
     dense = foreseen(drive, config, 270.0)
     assert len(seen[-1].t) > 10 * len(seen[0].t)
     assert seen[0].standstills(2.0) == seen[-1].standstills(2.0)
@@ -142,12 +142,12 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
 def test_a_look_gives_up_at_its_next_step_once_the_leg_is_over(drive, config):
     strict, asked = with_settings(config, {'verdict.max_scale_sigma': 1e-9}), []
 
-    def wanted():
+    def is_needed():
         asked.append(True)
         return len(asked) < 3
 
     with pytest.raises(Abandoned):
-        foreseen(drive, strict, 150.0, wanted=wanted)
+        foreseen(drive, strict, 150.0, is_needed=is_needed)
     assert len(asked) == 3
 
 
@@ -211,9 +211,10 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
 
 
 def test_a_coarse_scale_is_said_in_per_cent():
-    assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
+    assert ParameterForecast(0.138, 1e-3, 2108.0, value_text='1.02').as_text('scale', 'ppm',
+                                                                             1e6) == (
         'scale 1.02 ± 13.8 % so far; drive 2200 m more to reach the limit of 0.1 %')
-    assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
+    assert ParameterForecast(0.0099, 1e-3, 0.0).as_text('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 
 
@@ -235,7 +236,7 @@ def said(forecast, **more):
      '0.5); call ~/stop_leg'),
     (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
      'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
-    (Forecast(replace(MORE, metres=None, why=UNREACHABLE), YAW), 10.0,
+    (Forecast(replace(MORE, remaining_m=None, why=UNREACHABLE), YAW), 10.0,
      'scale 1820 ppm: the limit is not reached within another 20 km; OK: yaw 0.286 deg (limit '
      '0.5); call ~/stop_leg'),
     (Forecast(replace(MORE, sigma=None), NO_YAW, distance_m=300.0), 0.0,
@@ -258,7 +259,7 @@ def test_the_distance_decreases_between_updates():
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
-    keys = as_keys(Forecast(GOOD, NO_YAW))
+    keys = status_keys(Forecast(GOOD, NO_YAW))
     running = {key: keys.pop(key) for key in list(keys) if key.startswith('estimate_')}
     assert running.pop('estimate_method') == ''
     assert len(running) == 7
@@ -269,10 +270,10 @@ def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
         'predicted_scale_sources_ppm': 'fix_end 300, fix_start 250',
         'predicted_yaw_sigma_deg': '', 'metres_to_go_yaw': '', 'largest_error_source_yaw': '',
         'predicted_yaw_sources_deg': ''}
-    none = as_keys(None)
+    none = status_keys(None)
     assert set(none) == set(keys) | set(running) | {'estimate_method'}
     assert {none[key] for key in keys} == {''}
-    found = as_keys(Forecast(GOOD, YAW, estimates={
+    found = status_keys(Forecast(GOOD, YAW, estimates={
         'scale_factor': Estimate(0.02, 1e-5, 'm/pulse', 'smoother'),
         'yaw_mounting_angle': Estimate(0.01, 1e-3, 'rad', 'two_point'),
         'pitch_mounting_angle': Estimate(None, None, 'rad', 'smoother')}), 7.5)

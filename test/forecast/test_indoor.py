@@ -11,8 +11,13 @@ import pytest
 
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.forecast.forecast import Abandoned
-from odocal_ros.forecast.indoor_motion import pattern, PATTERNS
-from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma, Robot
+from odocal_ros.forecast.planned_indoor import (
+    pattern_motion,
+    PATTERNS,
+    predict_robot,
+    ratio_sigma,
+    Robot,
+)
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, robot_of
 from odocal_ros.pipeline.calibrate import calibrate
@@ -27,7 +32,7 @@ CONFIG = with_settings(Config(), {'odometer.left': 'topic', 'odometer.right': 't
 @pytest.mark.parametrize('name', PATTERNS)
 def test_a_pattern_ends_where_its_moves_end(name, drive):
     """Out and back: both turn directions are equal, a round ends at the heading of its start."""
-    d = pattern(name, 3.0, 1, drive).increments
+    d = pattern_motion(name, 3.0, 1, drive).increments
     assert abs(d[:, 2].sum()) < 1e-9
     forward = {'straight': 6.0, 'square': 24.0, 'figure_eight': 3 * math.pi, 'spot': 6.0}[name]
     assert d[:, 0].sum() == pytest.approx(forward, rel=1e-9)
@@ -36,7 +41,7 @@ def test_a_pattern_ends_where_its_moves_end(name, drive):
 
 def test_the_scale_of_exact_positions_is_limited_by_the_slip():
     """Of two wheels: slip sqrt(T / 2) over the path, T s in motion straight ahead."""
-    motion = pattern('straight', 4.0, 3, 'differential')
+    motion = pattern_motion('straight', 4.0, 3, 'differential')
     robot = Robot(drive='differential', imu=False, width=0.3, slip=SLIP, white=1e-5)
     found = predict_robot(motion, robot, Config())
     moving = (motion.speed > 0).sum() * 0.1
@@ -90,8 +95,8 @@ def leg():
                                fix_rate=10.0, slip_walk=5e-4, seed=3)).leg()
 
 
-def forecast(leg, seconds, wanted=lambda: True):
-    return planar_forecast(thinned(leg, seconds).leg(leg.start_ns), CONFIG, wanted)
+def forecast(leg, seconds, is_needed=lambda: True):
+    return planar_forecast(thinned(leg, seconds).leg(leg.start_ns), CONFIG, is_needed)
 
 
 def test_the_last_update_is_near_the_result(leg):
@@ -101,10 +106,10 @@ def test_the_last_update_is_near_the_result(leg):
         now, then = found.estimates[name], result.methods['planar'].estimates[name]
         assert abs(now.value - then.value) < then.sigma
         assert now.sigma == pytest.approx(then.sigma, rel=0.15)
-    assert found.scale.metres == 0.0
+    assert found.scale.remaining_m == 0.0
     assert found.complete
     assert not found.faults
-    assert 'yaw: not estimated on this robot' in found.words()
+    assert 'yaw: not estimated on this robot' in found.as_text()
 
 
 def test_the_distance_to_go_is_by_the_root_of_the_path(leg):
@@ -113,7 +118,7 @@ def test_the_distance_to_go_is_by_the_root_of_the_path(leg):
     scale = result.methods['planar'].estimates['scale_factor']
     strict = with_settings(CONFIG, {'verdict.max_scale_sigma': scale.sigma / scale.value / 3})
     found = planar_forecast(leg, strict, lambda: True)
-    assert found.scale.metres == pytest.approx(8 * result.distance, rel=1e-6)
+    assert found.scale.remaining_m == pytest.approx(8 * result.distance, rel=1e-6)
 
 
 def test_before_the_first_motion_there_is_none(leg):

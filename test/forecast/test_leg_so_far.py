@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.ability import ability
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.forecast.progress import Progress, Travel
+from odocal_ros.forecast.quantities import find_observable
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
@@ -68,7 +68,7 @@ def test_late_rows_are_put_back_so_far_as_in_the_result(made):
     sent_ns = late.odometer.stamp_ns
     for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
         cells.feed('odometer', take(late.odometer, (sent_ns >= begin)
-                                   & (sent_ns < begin + 5 * 10**9)))
+                                    & (sent_ns < begin + 5 * 10**9)))
     cells.feed('imu', leg.imu)
     cells = cells.leg(leg.start_ns).odometer
     count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
@@ -122,6 +122,6 @@ def test_with_an_imu_without_accelerometer_only_the_scale_is_observable():
     for force in (9.81, 0.0):
         progress.feed('imu', ImuSamples(stamps, stamps, rates, rates + force, np.zeros((3, 4)),
                                         np.full(3, np.nan)), Config(), None, 0.0)
-        words = ability(Config(), progress.received_before(600.0)).words()
+        words = find_observable(Config(), progress.received_before(600.0)).as_text()
         assert ('observable: the scale; not observable: the yaw' in words) == (not force), words
         assert ('the pitch (IMU without acceleration)' in words) == (not force)

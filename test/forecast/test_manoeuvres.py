@@ -13,13 +13,14 @@ pytestmark = pytest.mark.core
 
 def straight(rest=30.0):
     t = np.arange(0.0, 120.0 + 2 * rest + 0.05, 0.1)
-    return planned_drive.from_rates(t, np.interp(t, [rest, rest + 15, rest + 105, rest + 120],
+    return planned_drive.drive_from_rates(t,
+                                          np.interp(t, [rest, rest + 15, rest + 105, rest + 120],
                                                     [0.0, 15.0, 15.0, 0.0]), np.zeros_like(t))
 
 
 def test_a_stop_on_the_way_adds_its_braking_and_its_rest():
     drive = straight()
-    changed = planned_drive.stop_and_start(drive)
+    changed = planned_drive.add_stop_and_start(drive)
     assert changed.duration - drive.duration == pytest.approx(10.0 + 5.0 + 10.0)    # 15 / 1.5
     assert changed.distance - drive.distance == pytest.approx(15.0**2 / 1.5, rel=1e-3)
     rests = changed.standstills(2.0)
@@ -31,7 +32,7 @@ def test_a_stop_on_the_way_adds_its_braking_and_its_rest():
 
 def test_turns_both_ways_lead_back_to_the_direction_they_began_with():
     drive = straight()
-    changed = planned_drive.left_and_right_turns(drive)
+    changed = planned_drive.add_left_and_right_turns(drive)
     assert changed.yaw[-1] == pytest.approx(drive.yaw[-1])
     assert np.ptp(changed.yaw) == pytest.approx(np.pi / 2)
     assert changed.yaw.max() > drive.yaw[0] + 1.5           # first to the left
@@ -46,8 +47,8 @@ def test_turns_both_ways_lead_back_to_the_direction_they_began_with():
 def test_town_driving_comes_before_the_last_rest(rest):
     drive = straight(rest)
     if not rest:
-        drive = drive.until(100.0, 0.0001)      # ends in motion, but for the last row
-    changed = planned_drive.town_driving(drive, 5)
+        drive = drive.cut_at(100.0, 0.0001)      # ends in motion, but for the last row
+    changed = planned_drive.add_town_driving(drive, 5)
     # 10 s up, 25 s at 12 m/s, 10 s down, each minute
     town = 5 * 12.0 * 35.0
     assert changed.distance - drive.distance == pytest.approx(town, rel=1e-3)
@@ -61,8 +62,8 @@ def test_town_driving_comes_before_the_last_rest(rest):
 
 def test_town_driving_brakes_first_where_the_drive_ends_in_motion():
     t = np.arange(0.0, 60.0, 0.1)
-    drive = planned_drive.from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
-    changed = planned_drive.town_driving(drive, 1)
+    drive = planned_drive.drive_from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
+    changed = planned_drive.add_town_driving(drive, 1)
     assert changed.duration - drive.duration == pytest.approx(10.0 + 60.0)
     assert np.abs(np.diff(changed.speed) / np.diff(changed.t)).max() < 1.6
     assert changed.speed[-1] == 0.0
@@ -70,8 +71,8 @@ def test_town_driving_brakes_first_where_the_drive_ends_in_motion():
 
 def test_a_drive_that_only_backs_up_is_stopped_backing_up():
     t = np.arange(0.0, 60.0, 0.1)
-    drive = planned_drive.from_rates(t, np.full_like(t, -3.0), np.zeros_like(t))
-    changed = planned_drive.stop_and_start(drive)
+    drive = planned_drive.drive_from_rates(t, np.full_like(t, -3.0), np.zeros_like(t))
+    changed = planned_drive.add_stop_and_start(drive)
     assert changed.speed.max() == 0.0
     assert changed.speed.min() == -3.0
     assert changed.duration - drive.duration == pytest.approx(2 * 2.0 + 5.0)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage
-from odocal_ros.forecast.leg_so_far import profile_of
-from odocal_ros.forecast.planned_drive import from_rates, PlannedDrive
-from odocal_ros.forecast.predict import metres_to_go, predict, Sigmas
+from odocal_ros.forecast.leg_so_far import drive_profile
+from odocal_ros.forecast.planned_drive import drive_from_rates, PlannedDrive
+from odocal_ros.forecast.predict import find_remaining_distance, predict, Sigmas
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
@@ -37,7 +37,8 @@ def config(**changes):
 def paper_drive(rest=30.0):
     """Return the paper leg: 300 s still, 0.5 m/s2 for 40 s, 20 m/s for 520 s, down in 40 s."""
     t = np.arange(0.0, 900.0 + rest + 0.05, 0.1)
-    return from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]), np.zeros_like(t))
+    return drive_from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]),
+                            np.zeros_like(t))
 
 
 def row(prediction, source):
@@ -106,19 +107,19 @@ def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
 def test_metres_to_go_are_enough_and_no_more_than_needed():
     drive, sigmas = paper_drive(), Sigmas(config=config(correlation=60.0))
     asked = predict(drive, sigmas).sigma(SCALE) / 1.5
-    metres = metres_to_go(drive, sigmas, SCALE, asked)
-    assert predict(drive.lengthened(metres), sigmas).sigma(SCALE) <= asked
-    assert predict(drive.lengthened(0.97 * metres), sigmas).sigma(SCALE) > asked
+    metres = find_remaining_distance(drive, sigmas, SCALE, asked)
+    assert predict(drive.lengthen(metres), sigmas).sigma(SCALE) <= asked
+    assert predict(drive.lengthen(0.97 * metres), sigmas).sigma(SCALE) > asked
     # fixes alone make it: the sigma falls as the way grows
     assert metres == pytest.approx(0.5 * 11_200, rel=0.03)
-    assert metres_to_go(drive, sigmas, SCALE, 1.0) == 0.0
-    assert metres_to_go(drive, sigmas, YAW, 0.9 * HEADING) is None
+    assert find_remaining_distance(drive, sigmas, SCALE, 1.0) == 0.0
+    assert find_remaining_distance(drive, sigmas, YAW, 0.9 * HEADING) is None
 
 
 def test_what_is_said_of_a_drive_that_cannot_carry_the_method():
     t = np.arange(0.0, 200.1, 0.1)
     speed = np.interp(t, [20, 30, 170, 180], [0, 10, 10, 0])
-    around = from_rates(t, speed, np.where((t > 96) & (t < 104), math.pi / 8, 0.0))
+    around = drive_from_rates(t, speed, np.where((t > 96) & (t < 104), math.pi / 8, 0.0))
     result = predict(around, Sigmas(config=config()))
     assert Code.CHORD_TOO_SHORT in {r.code for r in result.reasons}
     assert result.sigma(SCALE) is None
@@ -126,7 +127,7 @@ def test_what_is_said_of_a_drive_that_cannot_carry_the_method():
     assert Code.YAW_NOT_SEPARABLE in {r.code for r in no_heading.reasons}
     assert no_heading.sigma(YAW) is None
     assert no_heading.sigma(SCALE) > 0
-    moving = from_rates(t, np.full_like(t, 10.0), np.zeros_like(t))
+    moving = drive_from_rates(t, np.full_like(t, 10.0), np.zeros_like(t))
     result = predict(moving, Sigmas(config=config()))
     assert Code.NO_STANDSTILL in {r.code for r in result.reasons}
     # start and end as fast: the latency cancels, the fixes are those of a second each side
@@ -146,31 +147,31 @@ def test_impossible_sigmas_are_refused(change, words):
 def test_impossible_drives_are_refused():
     t = np.arange(0.0, 100.0, 0.1)
     with pytest.raises(BadUsage, match='never moves'):
-        from_rates(t, np.zeros_like(t), np.zeros_like(t))
+        drive_from_rates(t, np.zeros_like(t), np.zeros_like(t))
     with pytest.raises(BadUsage, match='not finite'):
         PlannedDrive(t, np.full_like(t, np.nan), t, t)
     with pytest.raises(BadUsage, match='increasing times'):
         PlannedDrive(t[::-1], t, t, t)
     with pytest.raises(BadUsage, match='one speed, yaw and slope for each time'):
         PlannedDrive(t, t[1:], t, t)
-    short = from_rates(t[:11], np.full(11, 5.0), np.zeros(11))
+    short = drive_from_rates(t[:11], np.full(11, 5.0), np.zeros(11))
     with pytest.raises(BadUsage, match='less than one fix interval'):
         predict(short, Sigmas(config=config(), fix_rate=0.5))
 
 
 def test_changes_of_a_drive_change_what_they_say():
     drive = paper_drive()
-    longer = drive.lengthened(1000.0)
+    longer = drive.lengthen(1000.0)
     assert longer.distance == pytest.approx(12_200, rel=1e-9)
     assert longer.duration - drive.duration == pytest.approx(50.0)
-    rested = drive.standing_longer(60.0)
+    rested = drive.lengthen_rests(60.0)
     assert rested.distance == pytest.approx(drive.distance, rel=1e-9)
     before, after = (predict(d, Sigmas(config=config())).standing for d in (drive, rested))
     assert np.subtract(after, before) == pytest.approx([60.0, 60.0], abs=1e-6)
-    other = predict(drive.turned_around(), Sigmas(config=config()))
+    other = predict(drive.turn_around(), Sigmas(config=config()))
     assert other.sigma(SCALE) == pytest.approx(
         predict(drive, Sigmas(config=config())).sigma(SCALE), rel=1e-3)
-    half = drive.until(300.0, 20.0)
+    half = drive.cut_at(300.0, 20.0)
     assert half.distance == pytest.approx(20 * 300 - 400, rel=1e-2)
     assert predict(half, Sigmas(config=config())).standing[1] == pytest.approx(20.0, abs=0.2)
 
@@ -180,7 +181,7 @@ def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest()
     assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to take out
     leg = drive.leg()
     config = with_settings(Config(), {'imu.grade': 'consumer'})
-    profile = profile_of(screen(leg, config)[0], config)
+    profile = drive_profile(screen(leg, config)[0], config)
     t = (leg.start_ns - drive.options.start_ns) * 1e-9 + profile.t
     true = drive.motion.at(t).yaw
     turned, truly = profile.yaw - profile.yaw[0], true - true[0]

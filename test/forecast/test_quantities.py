@@ -13,9 +13,14 @@ pytest.importorskip('diagnostic_msgs', reason='no ROS here: pip install odocal_r
 
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.data.samples import HeadingSamples
-from odocal_ros.forecast import ability as ability_module, quantities
-from odocal_ros.forecast.ability import ability, Received, stated_variance
-from odocal_ros.forecast.forecast import better, Forecast, Prospect, WheelsForecast
+from odocal_ros.forecast import quantities
+from odocal_ros.forecast.forecast import (
+    combine_sections,
+    Forecast,
+    ParameterForecast,
+    WheelsForecast,
+)
+from odocal_ros.forecast.quantities import find_observable, Received, stated_variance
 from odocal_ros.live import answers
 from odocal_ros.live.answers import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
 from odocal_ros.live.publishing import level
@@ -25,8 +30,9 @@ from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
 CONFIG = Config()
-GOOD, BAD = Prospect(1e-4, 1e-3, 0.0), Prospect(2e-3, 1e-3, 300.0)
-YAW, NO_YAW = Prospect(0.005, 0.0087, 0.0), Prospect(None, 0.0087, None, (), 'not told')
+GOOD, BAD = ParameterForecast(1e-4, 1e-3, 0.0), ParameterForecast(2e-3, 1e-3, 300.0)
+YAW, NO_YAW = ParameterForecast(0.005, 0.0087, 0.0), ParameterForecast(None, 0.0087, None, (),
+                                                                       'not told')
 NONE = {'heading_topic': math.inf, 'imu_orientation': math.inf}
 
 
@@ -45,7 +51,8 @@ def result(values=None, *codes):
 
 def ok(judged, two_wheels=True, config=CONFIG):
     """Return yes, no or unknown of scale, yaw, pitch, left and right, track width."""
-    of = quantities.of_forecast if isinstance(judged, Forecast) else quantities.of_calibration
+    of = quantities.check_forecast if isinstance(judged,
+                                                 Forecast) else quantities.check_calibration
     return ' '.join(of(judged, config, two_wheels).values())
 
 
@@ -92,18 +99,18 @@ def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():
     begun = Forecast(BAD, NO_YAW, None, until_ns=2, estimates=estimates(scale_factor=None))
     done = Forecast(GOOD, NO_YAW, 0.002, until_ns=1, estimates=estimates(
         scale_factor=1e-4, yaw_mounting_angle=0.02))
-    told = better(done, begun)
+    told = combine_sections(done, begun)
     assert ok(told) == 'yes no yes unknown unknown'
-    assert told.scale.metres == 0.0            # enough is enough
+    assert told.scale.remaining_m == 0.0            # enough is enough
     assert {name: e.sigma for name, e in told.estimates.items()} == {
         'scale_factor': 1e-4, 'yaw_mounting_angle': 0.02}
     assert told.until_ns == 2
     # what is over goes no further: metres are those of the part that goes on
-    coarse = Forecast(Prospect(5e-3, 1e-3, 700.0), YAW, until_ns=3)
-    assert better(begun, coarse).scale == replace(BAD, metres=700.0)
-    assert better(begun, coarse).yaw == YAW
-    assert better(None, begun) is better(begun, None) is begun
-    assert better(None, None) is None
+    coarse = Forecast(ParameterForecast(5e-3, 1e-3, 700.0), YAW, until_ns=3)
+    assert combine_sections(begun, coarse).scale == replace(BAD, remaining_m=700.0)
+    assert combine_sections(begun, coarse).yaw == YAW
+    assert combine_sections(None, begun) is combine_sections(begun, None) is begun
+    assert combine_sections(None, None) is None
 
 
 def recording(**known):
@@ -154,7 +161,7 @@ def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
         session = Session()
         session.start(1, with_settings(CONFIG, settings))
         assert manoeuvres(SessionView(session, session.config, two_wheels=True,
-                                    max_speed=10.0)) == []
+                                      max_speed=10.0)) == []
 
 
 def test_a_leg_that_would_be_rejected_is_said_before_all_else():
@@ -209,18 +216,18 @@ def test_seconds_to_stand():
      'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
      'their mean)')])
 def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, said):
-    monkeypatch.setattr(ability_module, 'METHODS', ('two_point',))
+    monkeypatch.setattr(quantities, 'METHODS', ('two_point',))
     known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
-    text = ability(with_settings(CONFIG, settings), known).words()
+    text = find_observable(with_settings(CONFIG, settings), known).as_text()
     assert text.startswith(said) if said.endswith(', ') else text == said
 
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
-    monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'smoother'))
-    can = ability(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0)).can
+    monkeypatch.setattr(quantities, 'METHODS', ('two_point', 'smoother'))
+    can = find_observable(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0)).can
     assert 'the yaw (from stops, starts and turns)' in can
     only = with_settings(CONFIG, {'method': 'two_point'})
-    assert len(ability(only, Received(NONE, 30.0)).cannot) == 1
+    assert len(find_observable(only, Received(NONE, 30.0)).cannot) == 1
 
 
 def test_an_orientation_without_a_variance_or_a_unit_length_is_none():

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
-from odocal_ros.forecast.forecast import Forecast, Prospect
+from odocal_ros.forecast.forecast import Forecast, ParameterForecast
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.live import running_estimate
 from odocal_ros.live.running_estimate import RunningEstimate, UPDATE_PERIOD_NS, UpdateResult
@@ -81,7 +81,7 @@ def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypa
     def fail(*_):
         raise ValueError('a bug')
 
-    monkeypatch.setattr(running_estimate, 'forecast_of', fail)
+    monkeypatch.setattr(running_estimate, 'forecast_leg', fail)
     log = Log()
     estimate, now_ns = watched(drive, config, worker, log)
     estimate.update(now_ns)
@@ -108,7 +108,7 @@ def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
 
 
 def test_updates_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
-    updates, good = [], Prospect(430e-6, 1e-3, 0.0)
+    updates, good = [], ParameterForecast(430e-6, 1e-3, 0.0)
 
     def costly_update(*args):
         updates.append(1)

@@ -12,10 +12,10 @@ import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import OdocalError
-from odocal_ros.forecast.forecast import Forecast, Prospect
-from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.forecast import Forecast, ParameterForecast
+from odocal_ros.forecast.leg_forecast import forecast_leg
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
-from odocal_ros.forecast.smoother_forecast import look, with_running
+from odocal_ros.forecast.smoother_forecast import add_running_estimate, update_running
 from odocal_ros.live.answers import hint
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.reasons import Code
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 
 def forecast_at(seen, config, **settings):
-    return forecast_of(seen.leg, 5.0, with_settings(config, settings), smoother=SmootherSoFar())
+    return forecast_leg(seen.leg, 5.0, with_settings(config, settings), smoother=SmootherSoFar())
 
 
 def test_the_sigma_that_counts_is_of_the_method_that_will_give(exact, looks):
@@ -35,7 +35,7 @@ def test_the_sigma_that_counts_is_of_the_method_that_will_give(exact, looks):
     assert found.scale.sigma == pytest.approx(e['scale_factor'].sigma / e['scale_factor'].value)
     assert found.yaw.sigma == pytest.approx(e['yaw_mounting_angle'].sigma)
     assert found.pitch == pytest.approx(e['pitch_mounting_angle'].sigma)
-    assert (found.scale.metres, found.yaw.metres, found.complete) == (0.0, 0.0, True)
+    assert (found.scale.remaining_m, found.yaw.remaining_m, found.complete) == (0.0, 0.0, True)
     assert found.until_ns == looks[-1].leg.stop_ns
     ends = forecast_at(looks[-1], exact, method='two_point')
     assert ends.estimates == {}
@@ -44,14 +44,15 @@ def test_the_sigma_that_counts_is_of_the_method_that_will_give(exact, looks):
 
 def test_before_the_smoother_can_say_anything_the_end_points_are_foreseen(exact, looks):
     class Silent:
-        def look(self, *_):
+        def update(self, *_):
             raise OdocalError('too little')
 
     leg = looks[0].leg
-    assert look(leg, Config(), Silent(), lambda: True) is None
-    assert forecast_of(leg, 5.0, Config(), smoother=Silent()).scale.sources[0][0] == 'fix_end'
+    assert update_running(leg, Config(), Silent(), lambda: True) is None
+    assert forecast_leg(leg, 5.0, Config(), smoother=Silent()).scale.sources[0][0] == 'fix_end'
     with pytest.raises(OdocalError, match='too little'):
-        look(leg, with_settings(Config(), {'method': 'smoother'}), Silent(), lambda: True)
+        update_running(leg, with_settings(Config(), {'method': 'smoother'}), Silent(),
+                       lambda: True)
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto'])
@@ -59,7 +60,7 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(exact, looks, method)
     leg = looks[-1].leg
     backwards = replace(leg, odometer=replace(leg.odometer, value=-leg.odometer.value))
     asked = with_settings(exact, {'method': method})
-    found = forecast_of(backwards, 5.0, asked, smoother=SmootherSoFar())
+    found = forecast_leg(backwards, 5.0, asked, smoother=SmootherSoFar())
     fault = found.faults[0]
     assert (fault.code, fault.text[:41]) == (Code.ODOMETER_REVERSED,
                                              'odometer and IMU have opposite directions')
@@ -67,9 +68,9 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(exact, looks, method)
     session = Session()
     session.start(1, asked)
     told = hint(SessionView(session, asked, forecast=found, faults=found.faults, distance_m=900.0,
-                          max_speed=10.0))
+                            max_speed=10.0))
     assert 'the leg would be rejected: ODOMETER_REVERSED' in told
-    assert forecast_of(leg, 5.0, asked, smoother=SmootherSoFar()).faults == ()
+    assert forecast_leg(leg, 5.0, asked, smoother=SmootherSoFar()).faults == ()
 
 
 def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(town_drive, exact):
@@ -78,11 +79,11 @@ def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(town_drive, 
     assert late.distance > 1.6 * early.distance
     assert late.agility > 1.5 * early.agility
     # what was to be driven for the sigmas that came out, and what was driven
-    before = Forecast(*(Prospect(None, float(sigma), None) for sigma in late.sigmas[:2]))
-    found = with_running(before, early, exact)
+    before = Forecast(*(ParameterForecast(None, float(sigma), None) for sigma in late.sigmas[:2]))
+    found = add_running_estimate(before, early, exact)
     # a law of one power stands for what starts, stops and turns make of it
-    assert found.scale.metres == pytest.approx(late.distance - early.distance, rel=0.4)
-    assert 'stop and start' in found.yaw.lack
+    assert found.scale.remaining_m == pytest.approx(late.distance - early.distance, rel=0.4)
+    assert 'stop and start' in found.yaw.manoeuvre
     assert late.agility / early.agility == pytest.approx(
         (early.sigmas[1] / late.sigmas[1])**2, rel=0.5)
 
@@ -95,26 +96,29 @@ def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
         found['yaw_mounting_angle'] = Estimate(None, None, 'rad')
     running = replace(seen.running, method=replace(method, estimates=found), agility=agility,
                       sigmas=np.array([scale, yaw, 1e-3]), speed=10.0, distance=500.0)
-    before = Forecast(Prospect(0.1, 1e-3, 500.0), Prospect(None, 0.01, None, (), 'not told'))
-    return with_running(before, running, Config())
+    before = Forecast(ParameterForecast(0.1, 1e-3, 500.0),
+                      ParameterForecast(None, 0.01, None, (), 'not told'))
+    return add_running_estimate(before, running, Config())
 
 
 def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(looks):
     # agility 120 by a sigma twice the asked: three times as much more, 30 for each stop and start
     found = of_sigmas(looks[-1], yaw=0.02)
-    assert found.yaw.lack == 'for the yaw: stop and start 12 times, or make as many turns'
-    assert found.yaw.metres == pytest.approx(1500.0)
-    assert found.yaw.words('yaw', 'deg', math.degrees(1)).endswith(
+    assert found.yaw.manoeuvre == 'for the yaw: stop and start 12 times, or make as many turns'
+    assert found.yaw.remaining_m == pytest.approx(1500.0)
+    assert found.yaw.as_text('yaw', 'deg', math.degrees(1)).endswith(
         ' ± 1.15 deg so far (limit 0.57)')
     assert not found.complete
-    assert of_sigmas(looks[-1], yaw=0.0105).yaw.lack.startswith('for the yaw: stop and start 1 ')
-    assert of_sigmas(looks[-1], yaw=0.2).yaw.lack.startswith('for the yaw: stop and start often,')
-    assert of_sigmas(looks[-1], yaw=0.2).yaw.metres is None
+    assert of_sigmas(looks[-1],
+                     yaw=0.0105).yaw.manoeuvre.startswith('for the yaw: stop and start 1 ')
+    assert of_sigmas(looks[-1],
+                     yaw=0.2).yaw.manoeuvre.startswith('for the yaw: stop and start often,')
+    assert of_sigmas(looks[-1], yaw=0.2).yaw.remaining_m is None
     never = of_sigmas(looks[-1], yaw=0.05, agility=0.0, known=False)
-    assert never.yaw.words('yaw', 'deg', math.degrees(1)) == (
+    assert never.yaw.as_text('yaw', 'deg', math.degrees(1)) == (
         'yaw is not determined yet (2.86 deg)')
     good = of_sigmas(looks[-1], yaw=0.009)
-    assert (good.yaw.lack, good.yaw.metres, good.complete) == ('', 0.0, True)
+    assert (good.yaw.manoeuvre, good.yaw.remaining_m, good.complete) == ('', 0.0, True)
 
 
 def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):

@@ -52,7 +52,7 @@ def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(exact, l
     assert passes[0] > LOOK_PASSES
     # of 4, with driving, stops and turns in between; the others are cold starts
     assert passes.count(LOOK_PASSES) >= 2
-    anew = SmootherSoFar().look(looks[-1].leg, exact).method.estimates
+    anew = SmootherSoFar().update(looks[-1].leg, exact).method.estimates
     assert anew['scale_factor'].value != looks[-1].running.method.estimates['scale_factor'].value
     for off, ratio in apart(looks[-1].running.method.estimates, anew):
         # both stop within 0.1 sigma and levels within 10 % of where they would end
@@ -62,7 +62,8 @@ def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(exact, l
 
 def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(looks):
     # from the standstill 20 s before the mark on: 50 s, 80 s, 128 s, 192 s
-    assert [x.once_s > 0 for x in looks] == [False, False, True, False, True, False, True, False]
+    assert [x.cold_start_cpu_s > 0 for x in looks] == [False, False, True, False, True, False,
+                                                       True, False]
 
 
 def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, looks, monkeypatch):
@@ -70,7 +71,7 @@ def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, looks, monkeypatc
     monkeypatch.setattr(growing, 'NEXT_WINDOW', 100.0)
     thinned, so_far = looks[-1].leg, SmootherSoFar()
     for seen in looks:
-        windowed = so_far.look(seen.leg, exact)
+        windowed = so_far.update(seen.leg, exact)
     past, t_end = so_far._growing._past
     assert t_end == pytest.approx(60.0, abs=0.2)
     assert so_far._growing._last.state.t[0] == pytest.approx(t_end, abs=0.11)      # of a cell
@@ -84,8 +85,8 @@ def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, looks, monkeypatc
         assert 0.9 < ratio < 1.6
     assert np.abs(errors_in_sigmas(windowed, town_drive)).max() < 4
     # a window that cannot be fitted leaves the finished ones
-    monkeypatch.setattr(growing, 'outcome', lambda *_: np.linalg.inv(np.zeros((2, 2))))
-    assert so_far.look(thinned, exact) is past
+    monkeypatch.setattr(growing, 'make_result', lambda *_: np.linalg.inv(np.zeros((2, 2))))
+    assert so_far.update(thinned, exact) is past
 
 
 def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, looks, monkeypatch):
@@ -97,17 +98,17 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, looks
         warnings.simplefilter('error')       # a node has no place for warnings
         broken.setattr(growing, 'best_fit', wild)
         with pytest.raises(BadData, match='cannot solve the data so far: overflow'):
-            so_far.look(looks[-1].leg, exact)
-    assert so_far.look(looks[-1].leg, exact).method.estimates['scale_factor'].value is not None
+            so_far.update(looks[-1].leg, exact)
+    assert so_far.update(looks[-1].leg, exact).method.estimates['scale_factor'].value is not None
 
 
 def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, looks):
     so_far = SmootherSoFar()
-    so_far.look(looks[-3].leg, exact)      # 7 s are to be reckoned on, at speed
+    so_far.update(looks[-3].leg, exact)      # 7 s are to be reckoned on, at speed
     view = so_far._view(looks[-2].leg, exact)
     state = carried(so_far._growing._last, problem_of(view, exact, steps_of(view, 1.0))).state
     later = SmootherSoFar()
-    later.look(looks[-2].leg, exact)
+    later.update(looks[-2].leg, exact)
     last = later._growing._last.state
     assert np.linalg.norm(last.v_n[-1]) > 5.0
     # a way of 70 m to a part in a thousand; the place itself was good to 1.5 m / sqrt(fixes)
@@ -148,8 +149,8 @@ def test_the_size_of_an_imperfection_is_carried_on(exact):
         # as large as is usual
         drive = drive_of(accel_scale_error=3e-3, seed=seed, duration=130.0)
         first, later = looked(drive, graded, (40.0, 60.0))
-        assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
-        leg = SmootherSoFar().look(later.leg, graded)
+        assert (first.cold_start_cpu_s, later.cold_start_cpu_s) == (0.0, 0.0)
+        leg = SmootherSoFar().update(later.leg, graded)
         # two passes of a level that one fit settles: within a tenth of its own sigma of about 1
         assert size(later.running) == pytest.approx(size(leg), rel=0.1)
         (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
@@ -165,21 +166,21 @@ def test_the_size_of_an_imperfection_is_carried_on(exact):
 def test_a_look_gives_up_between_passes_and_the_next_begins_anew(exact, looks, allowed):
     so_far, asked = SmootherSoFar(), []
 
-    def wanted():
+    def is_needed():
         asked.append(True)
         return len(asked) <= allowed
 
     with pytest.raises(Abandoned):
-        so_far.look(looks[0].leg, exact, wanted)
+        so_far.update(looks[0].leg, exact, is_needed)
     assert len(asked) == allowed + 1
-    assert so_far.look(looks[0].leg, exact).sigmas.shape == (3,)
+    assert so_far.update(looks[0].leg, exact).sigmas.shape == (3,)
 
 
 def test_slow_errors_are_allowed_for_before_they_can_be_seen(exact, looks):
     whites = with_settings(exact, {'gnss.correlation_time': 0.0})
 
     def seen(leg, exact):
-        return SmootherSoFar().look(leg, exact)
+        return SmootherSoFar().update(leg, exact)
 
     drive = drive_of(fix_noise='correlated', seed=58)
     leg = looked(drive, exact, (30.0,))[0].leg       # and the standstill
@@ -195,7 +196,7 @@ def test_an_imu_that_faces_down_is_read_as_such(exact, looks):
     leg = looks[1].leg
     down = np.array([1.0, -1.0, -1.0])
     over = replace(leg, imu=replace(leg.imu, w_i=leg.imu.w_i * down, f_i=leg.imu.f_i * down))
-    both = [SmootherSoFar().look(one, exact).method.estimates for one in (leg, over)]
+    both = [SmootherSoFar().update(one, exact).method.estimates for one in (leg, over)]
     for off, ratio in apart(*both):
         assert (off, ratio) == (pytest.approx(0.0, abs=1e-3), pytest.approx(1.0, abs=1e-3))
 
@@ -209,8 +210,8 @@ def test_too_little_is_said_and_no_look_is_lost_by_it(exact, looks, changed, wor
     leg, so_far = looks[0].leg, SmootherSoFar()
     less = leg.with_rows(**{slot: take(leg.rows(slot), rows) for slot, rows in changed.items()})
     with pytest.raises(OdocalError, match=words):
-        so_far.look(less, exact)
-    assert so_far.look(leg, exact).distance > 50.0
+        so_far.update(less, exact)
+    assert so_far.update(leg, exact).distance > 50.0
 
 
 @pytest.mark.parametrize(('yaw', 'turn_rates', 'why'), [
@@ -221,4 +222,4 @@ def test_an_imu_that_no_leg_can_use_is_told_at_once(exact, yaw, turn_rates, why)
     leg = drive.leg()
     leg = replace(leg, imu=replace(leg.imu, w_i=turn_rates * leg.imu.w_i))
     with pytest.raises(OdocalError, match=why):
-        SmootherSoFar().look(leg, exact)
+        SmootherSoFar().update(leg, exact)

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
-from odocal_ros.nav.integral import running_integral
+from odocal_ros.nav.time_series import running_integral
 
 SECOND = 10**9
 

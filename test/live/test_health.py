@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.progress import Clocks, FixPath, known_scale, Progress, Travel
+from odocal_ros.forecast.progress import Clocks, FixPath, Progress, scale_so_far, Travel
 from odocal_ros.live.health import Health
 from odocal_ros.settings.config import Config, with_settings
 
@@ -253,13 +253,13 @@ def test_a_burst_between_two_looks_is_no_clock_that_differs():
 def test_scale_for_the_hint_comes_from_what_is_known_best():
     config = with_settings(Config(), {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
     angle, speed = OdometerForm('cumulative', 0, 'm/rad'), OdometerForm('rate', 0, '1')
-    assert known_scale(Config(), COUNTER) == 0.0
-    assert known_scale(config, COUNTER) == pytest.approx(2 * np.pi * 0.003)
-    assert known_scale(config, angle) == 0.3
-    assert known_scale(config, speed) == 1.0
+    assert scale_so_far(Config(), COUNTER) == 0.0
+    assert scale_so_far(config, COUNTER) == pytest.approx(2 * np.pi * 0.003)
+    assert scale_so_far(config, angle) == 0.3
+    assert scale_so_far(config, speed) == 1.0
     named = with_settings(config, {'odometer.nominal_scale': 0.019})
-    assert known_scale(named, COUNTER) == 0.019
-    assert known_scale(named, COUNTER, found=0.0188) == 0.0188
+    assert scale_so_far(named, COUNTER) == 0.019
+    assert scale_so_far(named, COUNTER, found=0.0188) == 0.0188
 
 
 def test_clocks_are_compared_between_rows_that_arrived_together():

@@ -21,7 +21,7 @@ from odocal_ros.library.calibrate_bag import calibrate_bag
 from odocal_ros.messages.decode import make_reader
 from odocal_ros.messages.message_fields import IMU
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.local_frame import FRAME_LONGITUDE, geodetic_of, LARGEST_FRAME
+from odocal_ros.nav.geodesy import FRAME_LONGITUDE, geodetic_of, LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import covariances, has_position

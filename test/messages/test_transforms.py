@@ -14,7 +14,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData
 from odocal_ros.messages.decode import make_reader
 from odocal_ros.messages.transforms import add_static_readers
-from odocal_ros.nav.local_frame import geodetic_of
+from odocal_ros.nav.geodesy import geodetic_of
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import earth_rate_n, gravity
+from odocal_ros.nav.geodesy import earth_rate_n, gravity
 from odocal_ros.nav.rotations import matrix_from_rpy, wrap
 from odocal_ros.settings.nominal import GRADES
 

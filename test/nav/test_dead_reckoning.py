@@ -18,7 +18,7 @@ from odocal_ros.nav.dead_reckoning import (
     section_ratio,
     Track,
 )
-from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,

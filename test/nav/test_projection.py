@@ -8,8 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.nav.earth import ecef_from_geodetic
-from odocal_ros.nav.projection import geodesic_chord, Plane, plane_chord, plane_for
+from odocal_ros.nav.geodesy import (
+    ecef_from_geodetic,
+    geodesic_chord,
+    Plane,
+    plane_chord,
+    plane_for,
+)
 from odocal_ros.settings.config import ProjectionConfig
 
 pytest.importorskip('pyproj')

@@ -10,7 +10,7 @@ from scipy.stats import norm, rayleigh
 
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import REST_TRAVEL, standstills
-from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN, robust_sigma
+from odocal_ros.nav.time_series import NORMAL_MEDIAN, RAYLEIGH_MEDIAN, robust_sigma
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import GRADES

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.nav import strapdown
-from odocal_ros.nav.earth import earth_rate_n, OMEGA
+from odocal_ros.nav.geodesy import earth_rate_n, OMEGA
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     matrix_from_rpy,

@@ -12,7 +12,7 @@ import shlex
 import numpy as np
 import pytest
 
-from odocal_ros.forecast.planned_drive import stop_and_start
+from odocal_ros.forecast.planned_drive import add_stop_and_start
 from odocal_ros.forecast.planned_methods import plan_methods, predict_smoother
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
@@ -123,7 +123,7 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     t = np.arange(0.0, motion.duration, 0.1)
     moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
     stop = t[moving[np.flatnonzero(np.diff(moving) > 100)[0]]]
-    there = planned_drives.from_scenario('out_and_back', None).until(
+    there = planned_drives.from_scenario('out_and_back', None).cut_at(
         stop - t[moving[0]] + 0.1, 30.0)
     expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
     # the stop is 30 s here and there, cut to a tenth of a second
@@ -149,7 +149,7 @@ def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys
     assert answer['methods']['two_point']['estimates']['yaw_mounting_angle']['sigma'] is None
     assert 'YAW_NOT_SEPARABLE' not in {r['code'] for r in answer['reasons']}
     changes = {c['text']: c for c in answer['changes']}
-    stop = predict_smoother(stop_and_start(drive), sigmas)
+    stop = predict_smoother(add_stop_and_start(drive), sigmas)
     assert changes['one more stop and start']['yaw_mounting_angle'] == pytest.approx(
         stop.estimates['yaw_mounting_angle'].sigma, rel=1e-12)
     # own errors are halved in variance, those shared by legs stay; of what is imperfect two legs

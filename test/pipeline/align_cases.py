@@ -9,7 +9,7 @@ from dataclasses import replace
 from drives import kept, shifted
 import numpy as np
 
-from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import (
     heading_from_yaw,
     matrix_from_rpy,

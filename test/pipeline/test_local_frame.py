@@ -16,8 +16,13 @@ from odocal_ros.estimator import prepare, smoother_leg
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
-from odocal_ros.nav.local_frame import local_fixes
+from odocal_ros.nav.geodesy import (
+    earth_rate_n,
+    local_fixes,
+    OMEGA,
+    PartlyKnownRate,
+    rate_without_north,
+)
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.output.plots import draw_track
 from odocal_ros.pipeline.calibrate import calibrate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import take
-from odocal_ros.nav.statistics import gaps_in_rhythm, gaps_longer
+from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
 from odocal_ros.pipeline.calibrate import calibrate, calibrate_parts, combine, parts_of
 from odocal_ros.reasons import Code, Verdict
 

@@ -17,8 +17,7 @@ from odocal_ros.data.leg import part_of
 from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.leg import drift_time, SmootherLeg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, rough_scale
-from odocal_ros.nav.earth import rate_without_north
-from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.prepared_leg import Stage

@@ -9,7 +9,7 @@ from drives import ANGLES, configured, drive, everything_said, off, spoilt, TOWN
 import numpy as np
 import pytest
 
-from odocal_ros.nav.earth import radii
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening.rounded_fixes import rounding_variance

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.earth import A, C_en, E2, ecef_from_geodetic, gravity, OMEGA
+from odocal_ros.nav.geodesy import A, C_en, E2, ecef_from_geodetic, gravity, OMEGA
 from odocal_ros.nav.rotations import exp_so3, skew
 from odocal_ros.sim import motion as true_motion
 from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
@@ -90,7 +90,7 @@ def integrate(motion, rate, arm):
     Second order in the step: mean rate as rotation vector, force turned by the mean attitude,
     trapezoid for the rest. Written apart from the package's own navigation.
     """
-    from odocal_ros.nav.earth import geodetic_from_ecef
+    from odocal_ros.nav.geodesy import geodetic_from_ecef
     n = int(motion.duration * rate) + 1
     h = 1 / rate
     state = motion.at(np.arange(n) * h)

@@ -30,7 +30,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, P, PHI, V
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import skew
-from odocal_ros.nav.statistics import gaps_in_rhythm
+from odocal_ros.nav.time_series import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import SWAY
 

@@ -44,7 +44,7 @@ from odocal_ros.estimator.state import (
     YAW,
 )
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import C_en, gravity
+from odocal_ros.nav.geodesy import C_en, gravity
 from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns

@@ -28,7 +28,7 @@ from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, CONSTANTS, SLOW, State, WITH_SLOW
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.statistics import NORMAL_MEDIAN
+from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 

@@ -21,7 +21,7 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import imperfect_sigmas
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.nav.earth import A
+from odocal_ros.nav.geodesy import A
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import FAULT_SIGMAS, FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS

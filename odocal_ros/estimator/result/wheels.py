@@ -37,8 +37,8 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.wheel_result import Wheel
-from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import rotvec
+from odocal_ros.nav.time_series import integral_at
 from odocal_ros.screening.axles import STEER_GRID, steering_path
 from odocal_ros.settings.levels import TRACK_WIDTH
 

@@ -21,7 +21,7 @@ from odocal_reproductions.paper.path import Path, planned_path
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.projection import plane_for
+from odocal_ros.nav.geodesy import plane_for
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from odocal_reproductions.paper.path import Path
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.earth import E2, OMEGA, radii
+from odocal_ros.nav.geodesy import E2, OMEGA, radii
 
 STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
 E, N, U, LAT, LON, H = range(6)    # definition: where the states stand

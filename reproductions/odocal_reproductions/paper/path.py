@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.earth import radii
+from odocal_ros.nav.geodesy import radii
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 

@@ -4,7 +4,7 @@
 """
 Forecast of a leg: its sigmas if it ended here, and the remaining distance to the limits.
 
-The vehicle is assumed to stop at its current position and to rest for REST_FORESEEN_S in total.
+The vehicle is assumed to stop at its current position and to rest for PREDICTED_REST_S in total.
 The forecast is shown to the operator, and is never part of a result.
 """
 
@@ -19,18 +19,18 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
 from odocal_ros.forecast import leg_so_far, smoother_forecast
-from odocal_ros.forecast.ability import stated_variance, with_heading
 from odocal_ros.forecast.forecast import (
     Abandoned,
-    FARTHEST_M,
+    FARTHEST_LIMIT_M,
     Forecast,
-    Prospect,
-    REST_FORESEEN_S,
-    sources_of,
+    main_sources,
+    ParameterForecast,
+    PREDICTED_REST_S,
     UNREACHABLE,
 )
-from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
-from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.forecast.planned_drive import insert_section, PlannedDrive, REST_SPEED
+from odocal_ros.forecast.predict import find_remaining_distance, predict, Prediction, Sigmas
+from odocal_ros.forecast.quantities import stated_variance, with_heading
 from odocal_ros.screening.leg_kind import missing_force_cause
 from odocal_ros.settings.config import Config
 
@@ -41,99 +41,100 @@ DRIVE_ON = 'drive on with stops, starts and turns'
 
 
 @dataclass(frozen=True, eq=False)
-class DriveSoFar(PlannedDrive):
+class RecordedDrive(PlannedDrive):
     """The recorded drive and its predicted rest; added manoeuvres continue from here."""
 
-    wanted: Callable[[], bool] = field(default=lambda: True)
+    is_needed: Callable[[], bool] = field(default=lambda: True)
 
-    def lengthened(self, metres: float) -> 'DriveSoFar':
+    def lengthen(self, metres: float) -> 'RecordedDrive':
         """Return the drive extended straight ahead by ``metres``, at its median speed."""
-        if not self.wanted():
+        if not self.is_needed():
             raise Abandoned
         moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
         point = int(moving[-1])
         usual = float(np.median(np.abs(self.speed[moving])))
         on = np.linspace(0.0, metres / usual, 50)[1:]
-        return inserted(self, point, on, np.full_like(on, usual), np.zeros_like(on))
+        return insert_section(self, point, on, np.full_like(on, usual), np.zeros_like(on))
 
 
-def forecast_of(leg: Leg, fix_rate: float, config: Config,
-                wanted: Callable[[], bool] = lambda: True,
-                smoother: leg_so_far.SmootherSoFar | None = None) -> Forecast:
+def forecast_leg(leg: Leg, fix_rate: float, config: Config,
+                 is_needed: Callable[[], bool] = lambda: True,
+                 smoother: leg_so_far.SmootherSoFar | None = None) -> Forecast:
     """
     Return the forecast of a leg that ends here, with the faults of its methods so far.
 
     leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : in
-    force at the leg's start.   wanted : called repeatedly; if False, Abandoned is raised.
+    force at the leg's start.   is_needed : called repeatedly; if False, Abandoned is raised.
     smoother : of this leg; each update starts from the previous one.
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
     unusable = missing_force_cause(leg.imu, config.imu.accel_scale)
-    running = smoother_forecast.look(leg, config, smoother, wanted)
-    only_smoother = deciding(config.method) == smoother_forecast.ONLY
-    if only_smoother or smoother_forecast.gives_all(running):     # the end points add nothing
-        forecast = Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
-                            Prospect(None, config.verdict.max_yaw_sigma, None))
+    running = smoother_forecast.update_running(leg, config, smoother, is_needed)
+    only_smoother = deciding(config.method) == smoother_forecast.ONLY_SMOOTHER
+    if only_smoother or smoother_forecast.has_all_values(running):     # the end points add nothing
+        forecast = Forecast(ParameterForecast(None, config.verdict.max_scale_sigma, None),
+                            ParameterForecast(None, config.verdict.max_yaw_sigma, None))
     else:
-        forecast = _by_ends(leg, fix_rate, config, wanted)
+        forecast = _forecast_by_end_points(leg, fix_rate, config, is_needed)
         if smoother is not None and 'smoother' in deciding(config.method):
-            forecast = replace(forecast, scale=_open_yet(forecast.scale))
+            forecast = replace(forecast, scale=_without_refusal(forecast.scale))
             if not unusable:
-                forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
+                forecast = replace(forecast, yaw=_without_refusal(forecast.yaw))
     if unusable:
-        forecast = smoother_forecast.without_force(forecast)
-    if not wanted():
+        forecast = smoother_forecast.without_accelerometer_values(forecast)
+    if not is_needed():
         raise Abandoned
     if running is not None:
-        forecast = smoother_forecast.with_running(forecast, running, config)
+        forecast = smoother_forecast.add_running_estimate(forecast, running, config)
     estimates, _ = choose(forecast.methods, config.method)
     return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
 
 
-def _by_ends(leg: Leg, fix_rate: float, config: Config, wanted: Callable[[], bool]) -> Forecast:
+def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
+                            is_needed: Callable[[], bool]) -> Forecast:
     """Return the two_point forecast of the leg with its end points."""
     inputs = leg_so_far.screened_in_cells(leg, config).inputs
-    driven = leg_so_far.profile_of(inputs, config)
-    sigmas = Sigmas(config=_heading_found(leg, config),
-                    **leg_so_far.figures(inputs, config) | {'fix_rate': fix_rate})
-    drive = _at_rest(_thinned(driven), wanted)
+    driven = leg_so_far.drive_profile(inputs, config)
+    sigmas = Sigmas(config=_with_expected_heading(leg, config),
+                    **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})
+    drive = _with_final_rest(_thin(driven), is_needed)
     now = predict(drive, sigmas)
 
-    def prospect(parameter: str, asked: float, why: str = '') -> Prospect:
+    def prospect(parameter: str, limit: float, why: str = '') -> ParameterForecast:
         sigma = now.sigma(parameter)
-        metres = 0.0 if sigma is not None and sigma <= asked else None
+        metres = 0.0 if sigma is not None and sigma <= limit else None
         if metres is None and not why:
-            metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST_M)
+            metres = find_remaining_distance(drive, sigmas, parameter, limit, FARTHEST_LIMIT_M)
             why = UNREACHABLE
-        return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
+        return ParameterForecast(sigma, limit, metres, main_sources(now.method, parameter), why)
 
     limits = config.verdict
     return Forecast(
         prospect(smoother_forecast.SCALE, limits.max_scale_sigma),
         prospect(smoother_forecast.YAW, limits.max_yaw_sigma,
-                 _yaw_limit(now, limits.max_yaw_sigma)),
+                 _yaw_limit_reason(now, limits.max_yaw_sigma)),
         now.method.estimates[smoother_forecast.PITCH].sigma)
 
 
-def _open_yet(by_ends: Prospect) -> Prospect:
+def _without_refusal(by_ends: ParameterForecast) -> ParameterForecast:
     """Return the two_point forecast without its refusals, which the smoother may still resolve."""
-    return by_ends if by_ends.metres is not None else replace(by_ends, lack=DRIVE_ON)
+    return by_ends if by_ends.remaining_m is not None else replace(by_ends, manoeuvre=DRIVE_ON)
 
 
-def _yaw_limit(now: Prediction, asked: float) -> str:
+def _yaw_limit_reason(now: Prediction, limit: float) -> str:
     """Return the explanation why no drive reaches the yaw limit, empty if one can."""
     alignment = now.alignment
     if not alignment.heading_separable:
         return ('not separable from the course over ground, the only heading; set '
                 'alignment.heading_source')
-    if alignment.heading_sigma >= asked:
+    if alignment.heading_sigma >= limit:
         return ('limited by the heading uncertainty '
                 f'({math.degrees(alignment.heading_sigma):.2g} deg)')
     return ''
 
 
-def _heading_found(leg: Leg, config: Config) -> Config:
+def _with_expected_heading(leg: Leg, config: Config) -> Config:
     """Return config with the heading source, and its sigma, that the alignment will find."""
     def before(stamp_ns: Ints) -> Ints:
         return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
@@ -144,7 +145,7 @@ def _heading_found(leg: Leg, config: Config) -> Config:
         'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
 
 
-def _thinned(drive: PlannedDrive) -> PlannedDrive:
+def _thin(drive: PlannedDrive) -> PlannedDrive:
     """Return a drive with at most about DRIVE_ROWS rows; its stops and starts are kept."""
     rest = np.abs(drive.speed) <= REST_SPEED
     change = np.flatnonzero(np.diff(rest))
@@ -156,10 +157,10 @@ def _thinned(drive: PlannedDrive) -> PlannedDrive:
                              for name in ('t', 'speed', 'yaw', 'slope')})
 
 
-def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
-    """Return the drive with a standstill of REST_FORESEEN_S seconds at its end."""
+def _with_final_rest(drive: PlannedDrive, is_needed: Callable[[], bool]) -> RecordedDrive:
+    """Return the drive with a standstill of PREDICTED_REST_S seconds at its end."""
     moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
-    if rested < REST_FORESEEN_S:
-        drive = drive.until(drive.duration, REST_FORESEEN_S - rested)
-    return DriveSoFar(**vars(drive), wanted=wanted)
+    if rested < PREDICTED_REST_S:
+        drive = drive.cut_at(drive.duration, PREDICTED_REST_S - rested)
+    return RecordedDrive(**vars(drive), is_needed=is_needed)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav import earth
+from odocal_ros.nav import geodesy
 from odocal_ros.nav.rotations import skew
 
 pytestmark = pytest.mark.core
@@ -31,18 +31,18 @@ def test_earth_fixed_coordinates_against_pyproj():
     lat, lon, h = grid()
     theirs = np.stack(to_ecef.transform(np.rad2deg(lon), np.rad2deg(lat), h), -1)
     # theirs goes by degrees: 180 deg have an ulp of 2.8e-14 deg, 3e-9 m on the ground
-    assert_allclose(earth.ecef_from_geodetic(lat, lon, h), theirs, rtol=0, atol=2 * METRES)
+    assert_allclose(geodesy.ecef_from_geodetic(lat, lon, h), theirs, rtol=0, atol=2 * METRES)
 
 
 def test_there_and_back_poles_and_date_line_included():
     lat, lon, h = grid()
-    r_e = earth.ecef_from_geodetic(lat, lon, h)
-    lat2, lon2, h2 = earth.geodetic_from_ecef(r_e)
-    assert_allclose(earth.ecef_from_geodetic(lat2, lon2, h2), r_e, rtol=0, atol=METRES)
+    r_e = geodesy.ecef_from_geodetic(lat, lon, h)
+    lat2, lon2, h2 = geodesy.geodetic_from_ecef(r_e)
+    assert_allclose(geodesy.ecef_from_geodetic(lat2, lon2, h2), r_e, rtol=0, atol=METRES)
     assert_allclose(h2, h, rtol=0, atol=METRES)
-    assert_allclose(lat2, lat, rtol=0, atol=METRES / earth.A)
-    b = earth.A * (1 - earth.F)
-    lat, lon, h = earth.geodetic_from_ecef(np.array([0.0, 0.0, -b - 7.0]))
+    assert_allclose(lat2, lat, rtol=0, atol=METRES / geodesy.A)
+    b = geodesy.A * (1 - geodesy.F)
+    lat, lon, h = geodesy.geodetic_from_ecef(np.array([0.0, 0.0, -b - 7.0]))
     assert lat == -np.pi / 2
     assert np.isfinite(lon)
     assert h == pytest.approx(7.0, abs=METRES)
@@ -50,10 +50,10 @@ def test_there_and_back_poles_and_date_line_included():
 
 def test_axes_of_enu():
     lat, lon, h, d = 0.7, -2.1, 300.0, 1e-6
-    C = earth.C_en(lat, lon)
+    C = geodesy.C_en(lat, lon)
     assert_allclose(C @ C.T, np.eye(3), atol=1e-15)
     assert np.linalg.det(C) == pytest.approx(1, abs=1e-15)
-    here = earth.ecef_from_geodetic
+    here = geodesy.ecef_from_geodetic
     # central differences of 1e-6 rad (6 m): 1e-9 m of round-off over 13 m
     for axis, step in ((0, (0, d, 0)), (1, (d, 0, 0)), (2, (0, 0, 10.0))):
         change = here(lat + step[0], lon + step[1], h + step[2]) - here(
@@ -62,53 +62,53 @@ def test_axes_of_enu():
 
 
 def test_radii_at_equator_and_pole_and_along_the_meridian_quadrant():
-    b = earth.A * (1 - earth.F)
-    assert_allclose(earth.radii(0.0), [b**2 / earth.A, earth.A], rtol=1e-14)
-    assert_allclose(earth.radii(np.pi / 2), [earth.A**2 / b] * 2, rtol=1e-14)
+    b = geodesy.A * (1 - geodesy.F)
+    assert_allclose(geodesy.radii(0.0), [b**2 / geodesy.A, geodesy.A], rtol=1e-14)
+    assert_allclose(geodesy.radii(np.pi / 2), [geodesy.A**2 / b] * 2, rtol=1e-14)
     x, weight = np.polynomial.legendre.leggauss(20)
     lat = (x + 1) * np.pi / 4
-    assert weight @ earth.radii(lat)[0] * np.pi / 4 == pytest.approx(10_001_965.729, abs=5e-4)
+    assert weight @ geodesy.radii(lat)[0] * np.pi / 4 == pytest.approx(10_001_965.729, abs=5e-4)
 
 
 @pytest.mark.parametrize(('latitude_deg', 'gamma'), [
     (0, 9.7803253359), (90, 9.8321849378), (-90, 9.8321849378)])   # NIMA TR8350.2, table 3.4
 def test_normal_gravity_published(latitude_deg, gamma):
-    assert earth.gravity(np.deg2rad(latitude_deg), 0.0) == pytest.approx(gamma, abs=1e-10)
+    assert geodesy.gravity(np.deg2rad(latitude_deg), 0.0) == pytest.approx(gamma, abs=1e-10)
 
 
 @pytest.mark.parametrize('latitude', [0.0, 0.6, -1.2, np.pi / 2])
 def test_gravity_gradient_is_that_of_bruns(latitude):
     """At the ellipsoid d gamma / dh = -gamma (1/M + 1/N) - 2 Omega^2, an identity."""
-    meridian, normal = earth.radii(latitude)
-    gamma = earth.gravity(latitude, 0.0)
-    slope = (earth.gravity(latitude, 50.0) - earth.gravity(latitude, -50.0)) / 100
+    meridian, normal = geodesy.radii(latitude)
+    gamma = geodesy.gravity(latitude, 0.0)
+    slope = (geodesy.gravity(latitude, 50.0) - geodesy.gravity(latitude, -50.0)) / 100
     # the formula leaves out 3/2 (F^2 + M_GAMMA^2) = 3.5e-5
-    assert slope == pytest.approx(-gamma * (1 / meridian + 1 / normal) - 2 * earth.OMEGA**2,
+    assert slope == pytest.approx(-gamma * (1 / meridian + 1 / normal) - 2 * geodesy.OMEGA**2,
                                   rel=4e-5)
 
 
 def test_gravity_far_up_falls_with_the_square():
     """At 20 km, minus the centrifugal part, as (R / (R + h))^2 to the third order left out."""
-    h, omega2 = 20e3, earth.OMEGA**2
-    bare = earth.gravity(0.0, 0.0) + omega2 * earth.A
-    there = bare * (earth.A / (earth.A + h))**2 - omega2 * (earth.A + h)
+    h, omega2 = 20e3, geodesy.OMEGA**2
+    bare = geodesy.gravity(0.0, 0.0) + omega2 * geodesy.A
+    there = bare * (geodesy.A / (geodesy.A + h))**2 - omega2 * (geodesy.A + h)
     # third order: 4 (h / a)^3 = 1.2e-7; the quadrupole's faster fall: 2 * 1.5 J2 * 2 h / a = 2e-5
-    assert earth.gravity(0.0, h) == pytest.approx(there, rel=2.5e-5)
-    assert earth.gravity(0.0, h) == pytest.approx(9.780 - 0.0613, abs=2e-3)
+    assert geodesy.gravity(0.0, h) == pytest.approx(there, rel=2.5e-5)
+    assert geodesy.gravity(0.0, h) == pytest.approx(9.780 - 0.0613, abs=2e-3)
 
 
 @given(lat=st.floats(-1.4, 1.4), lon=st.floats(-3, 3))
 def test_earth_rate_is_the_axis_seen_from_anywhere(lat, lon):
-    assert_allclose(earth.C_en(lat, lon) @ earth.earth_rate_n(lat), [0, 0, earth.OMEGA],
+    assert_allclose(geodesy.C_en(lat, lon) @ geodesy.earth_rate_n(lat), [0, 0, geodesy.OMEGA],
                     atol=1e-19)
 
 
 @given(lat=st.floats(-1.4, 1.4), ve=st.floats(-60, 60), vn=st.floats(-60, 60))
 def test_transport_rate_is_how_enu_turns_along_the_way(lat, ve, vn):
     h, dt = 200.0, 1e-3
-    meridian, normal = earth.radii(lat)
+    meridian, normal = geodesy.radii(lat)
     dlat, dlon = vn / (meridian + h) * dt, ve / (normal + h) / np.cos(lat) * dt
-    change = earth.C_en(lat + dlat, dlon) - earth.C_en(lat - dlat, -dlon)
-    w = earth.transport_rate_n(lat, h, np.array([ve, vn, 1.0]))
+    change = geodesy.C_en(lat + dlat, dlon) - geodesy.C_en(lat - dlat, -dlon)
+    w = geodesy.transport_rate_n(lat, h, np.array([ve, vn, 1.0]))
     # differences of 1e-16 over 2 ms; 60 m/s is 5e-5 rad/s at 80 deg
-    assert_allclose(earth.C_en(lat, 0.0).T @ change / (2 * dt), skew(w), atol=3e-13)
+    assert_allclose(geodesy.C_en(lat, 0.0).T @ change / (2 * dt), skew(w), atol=3e-13)

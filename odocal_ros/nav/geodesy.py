@@ -1,0 +1,205 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The Earth: WGS 84 ellipsoid, gravity and rates; geodetic, Earth-fixed, local and plane coordinates.
+
+A local metric frame is a tangent plane of the ellipsoid (x east, y north, z up) at
+FRAME_LONGITUDE, for methods that use the ellipsoid. Only its latitude has a meaning. Plane
+coordinates (leg-centred, Gauss-Krueger, UTM) and geodesics are by pyproj.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from odocal_ros.data.arrays import FloatOrFloats, Floats, Ints
+from odocal_ros.data.samples import FixSamples, LOCAL, of_columns
+from odocal_ros.nav.rotations import arctan2
+from odocal_ros.settings.config import ProjectionConfig
+
+# physical: all of WGS 84 (NIMA TR8350.2)
+A = 6378137.0                  # m, semi-major axis
+F = 1 / 298.257223563          # flattening
+E2 = F * (2 - F)               # first eccentricity squared
+OMEGA = 7.292115e-5            # rad/s, Earth rate
+
+
+def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
+    """Return meridian and normal radius of curvature, m, at a latitude, rad: (...)."""
+    w2 = 1 - E2 * np.sin(latitude) ** 2
+    normal = A / np.sqrt(w2)
+    return normal * (1 - E2) / w2, normal
+
+
+def gravity(latitude: FloatOrFloats, height: FloatOrFloats) -> FloatOrFloats:
+    """Return normal gravity, m/s^2, at latitude (rad) and height (m) (NIMA TR8350.2, 4-1, 4-3)."""
+    s2 = np.sin(latitude) ** 2
+    gamma_e = 9.7803253359    # m/s^2, normal gravity at the equator
+    k_gamma = 0.00193185265241    # Somigliana's constant
+    gamma_0 = gamma_e * (1 + k_gamma * s2) / np.sqrt(1 - E2 * s2)
+    m_gamma = 0.00344978650684    # omega^2 a^2 b / GM
+    gamma: FloatOrFloats = gamma_0 * (
+        1 - 2 / A * (1 + F + m_gamma - 2 * F * s2) * height + 3 / A**2 * height**2)
+    return gamma
+
+
+def earth_rate_n(latitude: ArrayLike) -> Floats:
+    """Return the Earth's turn rate in ENU, rad/s: (...) to (..., 3)."""
+    latitude = np.asarray(latitude, dtype=float)
+    zero = np.zeros_like(latitude)
+    return np.stack([zero, OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)], -1)
+
+
+@dataclass(frozen=True)
+class PartlyKnownRate:
+    """The Earth's turn rate in a frame with unknown north: known part, and 1 sigma, rad/s."""
+
+    rate_n: tuple[float, float, float]
+    sigma_n: tuple[float, float, float]
+
+
+def rate_without_north(latitude: float) -> PartlyKnownRate:
+    """Return the Earth rate in a level frame of unknown azimuth; latitude: rad, NaN: unknown."""
+    if np.isnan(latitude):
+        return PartlyKnownRate((0.0, 0.0, 0.0), (OMEGA, OMEGA, OMEGA))
+    level = float(OMEGA * np.cos(latitude) / np.sqrt(2))
+    return PartlyKnownRate((0.0, 0.0, float(OMEGA * np.sin(latitude))), (level, level, 0.0))
+
+
+def transport_rate_n(latitude: Floats, height: Floats, velocity_n: Floats) -> Floats:
+    """Return the turn rate of the local level relative to the Earth, ENU, rad/s: (..., 3)."""
+    meridian, normal = radii(latitude)
+    east, north = velocity_n[..., 0], velocity_n[..., 1]
+    return np.stack([-north / (meridian + height), east / (normal + height),
+                     east * np.tan(latitude) / (normal + height)], -1)
+
+
+def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Floats:
+    """Return Earth-fixed coordinates, m, from geodetic ones, rad, rad, m: (...) to (..., 3)."""
+    latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
+    normal = radii(latitude)[1]
+    level = (normal + height) * np.cos(latitude)
+    return np.stack([level * np.cos(longitude), level * np.sin(longitude),
+                     (normal * (1 - E2) + height) * np.sin(latitude)], -1)
+
+
+def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    """Return latitude, longitude, rad, height, m, of (..., 3) m (Bowring; within 1e-9 m)."""
+    x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
+    b = A * (1 - F)
+    p = np.hypot(x, y)
+    beta = arctan2(A * z, b * p)
+    for _ in range(3):
+        latitude = arctan2(z + E2 / (1 - E2) * b * np.sin(beta) ** 3,
+                           p - E2 * A * np.cos(beta) ** 3)
+        beta = arctan2((1 - F) * np.sin(latitude), np.cos(latitude))
+    s, c = np.sin(latitude), np.cos(latitude)
+    height = p * c + z * s - A * np.sqrt(1 - E2 * s * s)
+    return latitude, arctan2(y, x), height
+
+
+def C_en(latitude: ArrayLike, longitude: ArrayLike) -> Floats:
+    """Return the rotation from ENU to Earth-fixed axes: (...) to (..., 3, 3)."""
+    latitude, longitude = np.broadcast_arrays(latitude, longitude)
+    sp, cp, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    zero = np.zeros_like(sp)
+    return np.stack([np.stack([-sl, -sp * cl, cp * cl], -1),
+                     np.stack([cl, -sp * sl, cp * sl], -1),
+                     np.stack([zero, cp, sp], -1)], -2)
+
+
+# definition: in the Atlantic, so that the positions are not mistaken for real ones
+FRAME_LONGITUDE = math.radians(-30.0)
+# definition: normal gravity here, 9.806 m/s^2, differs least from that of other latitudes
+USUAL_LATITUDE_DEG = 45.0
+# m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
+# Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
+LARGEST_FRAME = 20_000.0
+# m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
+# rest drifts by many metres, SLAM and motion capture by centimetres
+GNSS_MOVES, LOCAL_MOVES = 20.0, 0.5
+
+
+def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
+    """
+    Return latitude, longitude, rad, and height, m, from (n, 3) m in a local frame: (n,) each.
+
+    NaN for positions beyond LARGEST_FRAME, and for the height if z is 0: the positions of 2D SLAM
+    and AMCL have none.   latitude_deg : NaN for USUAL_LATITUDE_DEG.
+    """
+    latitude = math.radians(USUAL_LATITUDE_DEG if math.isnan(latitude_deg) else latitude_deg)
+    with np.errstate(invalid='ignore'):      # a signalling NaN
+        near = np.all(np.abs(position) <= LARGEST_FRAME, axis=1)[:, None]
+    x, y, z = np.where(near, position, np.nan).T
+    own_e = ecef_from_geodetic(latitude, FRAME_LONGITUDE, 0.0)
+    # no matrix product: its last bits depend on the number of rows, so replay would differ
+    r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
+        own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
+    return geodetic_from_ecef(r_e.T)
+
+
+def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
+    """Return a function that makes fixes from stamps, arrivals, positions and covariances."""
+    def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
+        n = len(stamps)
+        known = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
+        given = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
+        return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
+                          given, known, np.full(n, LOCAL))
+    return build
+
+
+# semi-major axis m, inverse flattening
+ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
+              'Krassovsky': (6378245.0, 298.3)}
+ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A transverse Mercator plane."""
+
+    central_meridian: float     # deg
+    scale: float = 1.0          # on the central meridian
+    ellipsoid: str = 'WGS84'    # a name of ELLIPSOIDS
+
+    def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
+        """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), from rad: (...)."""
+        from pyproj import Proj
+        a, rf = ELLIPSOIDS[self.ellipsoid]
+        proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,
+                    x_0=500000.0, y_0=0, a=a, rf=rf)
+        easting, northing = proj(np.rad2deg(longitude), np.rad2deg(latitude))
+        return np.asarray(northing), np.asarray(easting)
+
+
+def plane_for(projection: ProjectionConfig, longitude: float) -> Plane:
+    """Return the plane by the projection settings for a longitude, rad."""
+    degrees = float(np.rad2deg(longitude))
+    meridian = projection.central_meridian
+    if np.isnan(meridian):
+        zone = ZONE_WIDTH * np.floor(degrees / ZONE_WIDTH) + ZONE_WIDTH / 2
+        meridian = degrees if projection.kind == 'leg' else zone
+    scale = {'leg': 1.0, 'gauss_krueger': 1.0, 'utm': 0.9996}
+    return Plane(float(meridian), scale[projection.kind], projection.ellipsoid)
+
+
+def plane_chord(plane: Plane, start: Sequence[float] | Floats,
+                end: Sequence[float] | Floats) -> tuple[float, float]:
+    """Return length, m, and grid bearing, rad, of a chord between latitudes, longitudes, rad."""
+    (n0, n1), (e0, e1) = plane.forward(np.array([start[0], end[0]]), np.array([start[1], end[1]]))
+    return float(np.hypot(n1 - n0, e1 - e0)), float(np.arctan2(e1 - e0, n1 - n0))
+
+
+def geodesic_chord(start: Sequence[float] | Floats,
+                   end: Sequence[float] | Floats) -> tuple[float, float]:
+    """Return length at the mean height, m, and azimuth, rad, of the WGS 84 geodesic."""
+    from pyproj import Geod
+    azimuth, _, length = Geod(ellps='WGS84').inv(
+        np.rad2deg(start[1]), np.rad2deg(start[0]), np.rad2deg(end[1]), np.rad2deg(end[0]))
+    height = (start[2] + end[2]) / 2
+    return float(length * (1 + height / 6371008.8)), float(np.deg2rad(azimuth))
