@@ -18,13 +18,13 @@ NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagno
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # to a vehicle, not measured
 # poses that a person sets: Nav2 and RViz
 GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
-# estimates from GNSS or all sensors: no odometer if there is another
-FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
-# parts of names of INS, SLAM, cameras and localisation, and of joints that do not drive. Judgement
-ESTIMATED = re.compile(
+# names of estimates by GNSS, INS, SLAM, cameras and filters, and of joints that do not drive: no
+# odometer if there is another. Whole words, then parts of words. Judgement
+ESTIMATES = re.compile(
     '(?:^|[/_])(?:ins|nav|map|local|imu|vio|lio|dlio|dlo|icp|ndt|sbg|arm|reference|zed[0-9a-z]*|'
     'camera[0-9]*|t265|slam|rtabmap|novatel|oem7|vectornav|applanix|microstrain|xsens)(?=[/_]|$)|'
-    'localiz|mapping|kinematic_state|estimat|visual|lidar|laser|vins|steer')
+    'filtered|fused|ekf|estimat|gps|gnss|fix|global|ground_truth|localiz|mapping|kinematic_state|'
+    'visual|lidar|laser|vins|steer')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
@@ -45,28 +45,28 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
     fit. All such inputs are named at once, with the option that selects each.
     """
-    chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
+    chosen = {slot: topic_named(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
     if marked and 'fix' in chosen:
         raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
                        'one of them')
-    troubles: list[str] = []
-    for slot in wanted(config, marked):
+    errors: list[str] = []
+    for slot in required_slots(config, marked):
         if slot in chosen:
             continue
         found = candidates(topics, slot, config, chosen)
         if len(found) == 1:
             chosen[slot] = found[0]
         elif not _optional(slot, config, found):
-            troubles.append(_trouble(topics, slot, found, config, chosen))
-    if troubles:
-        raise BadUsage('; '.join(troubles) + (
-            '' if all('; choose one with ' in text for text in troubles) else
+            errors.append(_open_slot_text(topics, slot, found, config, chosen))
+    if errors:
+        raise BadUsage('; '.join(errors) + (
+            '' if all('; choose one with ' in text for text in errors) else
             f'; the bag has {_described(topics, topics)}'))
     return chosen
 
 
-def wanted(config: Config, marked: bool = False) -> tuple[str, ...]:
+def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
     """Return the slots to fill, in order."""
     surveyed = config.reference.start and config.reference.end or (
         config.reference.marks or marked)
@@ -84,8 +84,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
              and '/calibrator/' not in t.name]
     if slot in ('odometer', 'odometer_right'):
         found = [name for name in found if not _has(name, COMMANDS)]
-        found = _unless_all(found, FUSED)
-        found = [name for name in found if not ESTIMATED.search(name.lower())] or found
+        found = without_estimates(found)
         if config.odometer.own_topics:
             found = [name for name in found if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
@@ -105,6 +104,11 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
         # by the name of the node's input
         found = [name for name in found if _last(name) == slot] or found
     return found
+
+
+def without_estimates(names: list[str]) -> list[str]:
+    """Return the topics whose name is not that of an estimate; all, if none are left."""
+    return [name for name in names if not ESTIMATES.search(name.lower())] or names
 
 
 def _check_reference(chosen: dict[str, str]) -> None:
@@ -145,14 +149,14 @@ def _types(slot: str, config: Config) -> Iterable[str]:
     return tuple(map(full_type, types_of(slot, config.odometer))) or ODOMETERS
 
 
-def named(topics: Topics, slot: str, topic: str) -> str:
+def topic_named(topics: Topics, slot: str, topic: str) -> str:
     """Return the topic that a user named, with or without its leading slash."""
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
         wrong = 'no such topic'
     elif not topics[name].count:
         wrong = 'the topic has no message'
-    elif not _may_serve(topics[name].msgtype, slot):
+    elif not _fits_slot(topics[name].msgtype, slot):
         wrong = (f'the topic is of {topics[name].msgtype}, which cannot be used as '
                  f'{INPUTS[slot].label}')
     else:
@@ -161,15 +165,15 @@ def named(topics: Topics, slot: str, topic: str) -> str:
                    f'{_described(topics, topics)}')
 
 
-def _may_serve(msgtype: str, slot: str) -> bool:
+def _fits_slot(msgtype: str, slot: str) -> bool:
     """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
-def _trouble(topics: Topics, slot: str, found: list[str], config: Config,
-             chosen: dict[str, str]) -> str:
+def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
+                    chosen: dict[str, str]) -> str:
     """Return the explanation why a slot is open and the option that selects it."""
     fix = chosen.get('fix', '')
     if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:

@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.library.topics import COMMANDS, FUSED, GNSS, NEVER
+from odocal_ros.library.topics import COMMANDS, GNSS, NEVER, without_estimates
 from odocal_ros.messages.decode import Deserialize
 from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
@@ -195,10 +195,13 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
     """
     Return a collector for each topic whose fields could be an odometer.
 
-    known : topics that have a reader.   asked : topics that the user named.
+    known : topics that have a reader.   requested : topics that the user named.
     """
-    found = [name for name, info in topics.items() if info.count and name not in known and (
-        name in requested or _possible(info))]
+    possible = [name for name, info in topics.items()
+                if info.count and name not in known and _possible(info)]
+    usable = {*requested, *without_estimates(possible)}
+    found = [name for name, info in topics.items()
+             if info.count and name not in known and name in usable]
     return {name: Fields(topics[name].count) for name in found[:MOST_TOPICS]}
 
 
@@ -207,7 +210,7 @@ def _possible(info: TopicInfo) -> bool:
     package = info.msgtype.partition('/')[0]
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in NEVER
             and package not in STANDARD and '/calibrator/' not in info.name
-            and not any(word.startswith((*RECEIVER, *COMMANDS)) or word in FUSED
+            and not any(word.startswith((*RECEIVER, *COMMANDS))
                         for word in re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())))
 
 

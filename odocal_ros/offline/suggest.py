@@ -8,7 +8,7 @@ from collections.abc import Collection
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import candidates, choose_topics, named, wanted
+from odocal_ros.library.topics import candidates, choose_topics, required_slots, topic_named
 from odocal_ros.messages.message_fields import FIX
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.config import Config, with_settings
@@ -27,13 +27,13 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
 
     still : odometer topics that do not grow with the path of the fixes, while another does.
     """
-    chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
+    chosen = {slot: topic_named(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
             pair := _left_right_pair(topics, [
                 t for t in candidates(topics, 'odometer', config, chosen) if t not in still])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         chosen['odometer'], chosen['odometer_right'] = pair
-    for slot in wanted(config):
+    for slot in required_slots(config):
         found = [] if slot in chosen else candidates(topics, slot, config, chosen)
         if found:
             chosen[slot] = min(found, key=lambda name: _rank(slot, topics[name], still))
