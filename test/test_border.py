@@ -89,7 +89,8 @@ def test_imports_at_the_top_stay_light():
 
 def test_a_method_that_does_not_run_is_not_imported():
     probe = ('import odocal_ros.library.calibrate_bag, odocal_ros.pipeline.calibrate, '
-             'odocal_ros.output.files, odocal_ros.output.stored, odocal_ros.library.legs, sys\n'
+             'odocal_ros.output.files, odocal_ros.output.stored, '
+             'odocal_ros.library.find_legs, sys\n'
              "rooms = ('odocal_ros.estimator', 'odocal_ros.calib.wheel_search', "
              "'odocal_ros.calib.wheels.')\n"
              'print([m for m in sys.modules if m.startswith(rooms)'

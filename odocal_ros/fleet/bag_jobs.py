@@ -219,7 +219,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
 
     Raises BadUsage, BadConfig: a setting or a settings file is wrong.
     """
-    from odocal_ros.library.asked import config_of, legs_of
+    from odocal_ros.library.arguments import config_of, legs_of
     from odocal_ros.offline.replay import config_from_arguments, topics_from_arguments
     settings_of_file: dict[str, dict[str, Any]] = {}
     jobs, topics = [], topics_from_arguments(args)

@@ -146,7 +146,7 @@ def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], outp
 def run_settings(jobs: Sequence[BagJob]) -> dict[str, Any]:
     """Return the settings of this run that do not affect legs, such as the limits."""
     from odocal_ros.fleet.rows import GROUPS_NOT_OF_LEGS
-    from odocal_ros.library.asked import config_of
+    from odocal_ros.library.arguments import config_of
     from odocal_ros.settings.config import flat
     return {name: value for name, value in flat(config_of(jobs[0].config)).items()
             if name.partition('.')[0] in GROUPS_NOT_OF_LEGS and (name != 'frames.imu' or value)}

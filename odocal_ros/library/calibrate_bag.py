@@ -11,7 +11,7 @@ from typing import Any
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.library.asked import (
+from odocal_ros.library.arguments import (
     config_of,
     Leg,
     legs_of,
@@ -22,7 +22,7 @@ from odocal_ros.library.asked import (
     topics_of,
 )
 from odocal_ros.library.calibration import Calibration
-from odocal_ros.library.legs import cut_short, open_ended, OPEN_LEG
+from odocal_ros.library.find_legs import coverage_reasons, missing_stop_reasons, OPEN_LEG
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
@@ -58,44 +58,44 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
-    received = Notes(listener or Listener())
-    asked = _Asked(topics_of(topics), config, legs_of(legs), holdout)
+    collected = Notes(listener or Listener())
+    arguments = _Arguments(topics_of(topics), config, legs_of(legs), holdout)
     imu = known_imu(config_of(config))
-    paths, again = unique_paths(paths_of(path))
-    for twice in again:
-        received.note(f'{twice} is given twice; it is read once')
+    paths, repeated = unique_paths(paths_of(path))
+    for duplicate in repeated:
+        collected.note(f'{duplicate} is given twice; it is read once')
     if len(paths) > 1:
-        look_at_all(paths, lambda one: _look(one, asked))
-    done = _each(paths, asked, received)
+        check_all_bags(paths, lambda one: _check_bag(one, arguments))
+    done = _calibrate_bags(paths, arguments, collected)
     settings = done[-1].config
     first, *others = [flat(one.config) for one in done]      # journals have their own
     # as text: an unset one is NaN, which is not equal to itself
-    if unlike := [name for name, value in first.items()
-                  if any(repr(other[name]) != repr(value) for other in others)]:
-        received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
-                      f'settings, limits and files use those of {done[-1].path.name}')
+    if different := [name for name, value in first.items()
+                     if any(repr(other[name]) != repr(value) for other in others)]:
+        collected.note(f'{", ".join(different)}: differ between the journals; each leg uses its '
+                       f'own settings, limits and files use those of {done[-1].path.name}')
     results, inputs = unique_names([one.path for one in done], [one.legs for one in done],
-                                 [one.entry for one in done])
+                                   [one.entry for one in done])
     frame = next((one.imu_frame for one in done if one.imu_frame), '')
     result, settings = framed(combine(results, settings, imu=imu), settings, frame)
-    return Calibration(result, settings, tuple(inputs), tuple(received.said))
+    return Calibration(result, settings, tuple(inputs), tuple(collected.texts))
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Arguments:
     topics: dict[str, str]
     config: Settings
     legs: list[Any]
     holdout: bool
 
 
-def _look(path: Path, asked: _Asked) -> None:
+def _check_bag(path: Path, arguments: _Arguments) -> None:
     """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
     journal = journal_notes(path)
-    settings = config_of(asked.config, journal.settings if journal else None)
+    settings = config_of(arguments.config, journal.settings if journal else None)
     with open_bag(path) as bag:
-        readers_of(bag, asked.topics, settings, journal)
+        readers_of(bag, arguments.topics, settings, journal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,59 +110,61 @@ class _BagLegs:
     legs: list[LegResult]
 
 
-def _each(paths: list[Path], asked: _Asked, received: Notes) -> list[_BagLegs]:
+def _calibrate_bags(paths: list[Path], arguments: _Arguments, listener: Notes) -> list[_BagLegs]:
     """Return the stored data of each used bag."""
     done: list[_BagLegs] = []
     dropped = None
     for path in paths:
         try:
-            done.append(_one(path, asked, done[0].unit if done else None, received))
+            unit = done[0].unit if done else None
+            done.append(_calibrate_one_bag(path, arguments, unit, listener))
         except LegDropped as error:
             dropped = error
             if len(paths) > 1:
-                received.note(str(error))
+                listener.note(str(error))
         except OdocalError as error:
             if len(paths) == 1:
                 raise
-            raise BadUsage(about(path, error)) from None
+            raise BadUsage(error_about(path, error)) from None
     if dropped and not done:
         raise dropped
     return done
 
 
-def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLegs:
+def _calibrate_one_bag(path: Path, arguments: _Arguments, unit: str | None,
+                       listener: Notes) -> _BagLegs:
     """Read a bag and calibrate its legs; ``unit`` is that of the scale in the bags before."""
-    bag = read_bag(path, asked.topics, asked.config, listener=received)
-    own = bag.form.scale_unit
-    if unit and own != unit:
+    bag = read_bag(path, arguments.topics, arguments.config, listener=listener)
+    own_unit = bag.form.scale_unit
+    if unit and own_unit != unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '
-                       f'{NAMED[own]}, that of the previous bags in {NAMED[unit]}: they cannot '
-                       'be combined; calibrate them separately, or name topics of one kind')
+                       f'{NAMED[own_unit]}, that of the previous bags in {NAMED[unit]}: they '
+                       'cannot be combined; calibrate them separately, or name topics of one kind')
     return _BagLegs(path, {'bag': bag.name, 'sha256': bag.sha256, 'topics': bag.topics},
-                    bag.config, bag.imu_frame, own, _legs_of(bag, asked, received))
+                    bag.config, bag.imu_frame, own_unit, _legs_of(bag, arguments, listener))
 
 
-def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
-    if bag.dropped and not asked.legs:
+def _legs_of(bag: Recording, arguments: _Arguments, listener: Notes) -> list[LegResult]:
+    if bag.dropped and not arguments.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')
-    marks = () if asked.legs else bag.marks
+    marks = () if arguments.legs else bag.marks
     if any(not stop for _, stop in marks):
-        received.note(f'{bag.name}: {OPEN_LEG}')
-    spans = bag.spans(asked.legs)
-    limited = cut_short(bag.recorder) if not (marks or asked.legs) else ()
-    notes = [bag.notes + limited + note for note in open_ended(spans, marks)]
-    results = _calibrated(bag, spans, notes, asked.holdout, received)
-    if bag.config.leg.automatic and not (marks or asked.legs):
-        results = _worth_keeping(results, received)
+        listener.note(f'{bag.name}: {OPEN_LEG}')
+    spans = bag.spans(arguments.legs)
+    limited = coverage_reasons(bag.recorder) if not (marks or arguments.legs) else ()
+    notes = [bag.notes + limited + note for note in missing_stop_reasons(spans, marks)]
+    results = _calibrated(bag, spans, notes, arguments.holdout, listener)
+    if bag.config.leg.automatic and not (marks or arguments.legs):
+        results = _without_refused(results, listener)
     return results
 
 
 def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[Reason, ...]],
-                holdout: bool, received: Notes) -> list[LegResult]:
+                holdout: bool, listener: Notes) -> list[LegResult]:
     from odocal_ros.pipeline.calibrate import calibrate_parts
     results = []
-    with received.phase('calibrating') as progress:
+    with listener.phase('calibrating') as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
             which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
@@ -175,7 +177,7 @@ def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[
     return results
 
 
-def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]:
+def _without_refused(results: list[LegResult], listener: Notes) -> list[LegResult]:
     """Return automatic legs without the unusable ones, as in the node."""
     from odocal_ros.pipeline.automatic import refusal
     kept, notes = [], []
@@ -187,22 +189,22 @@ def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]
         else:
             kept.append(leg)
     for note in notes if kept else ():
-        received.note(note)
+        listener.note(note)
     return kept or results
 
 
 def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Return the bags without duplicates, and the duplicates."""
     first: dict[Path, Path] = {}
-    again = []
+    repeated = []
     for path in paths:
         if path.resolve() in first:
-            again.append(path)
+            repeated.append(path)
         first.setdefault(path.resolve(), path)
-    return list(first.values()), again
+    return list(first.values()), repeated
 
 
-def about(path: Path, error: Exception) -> str:
+def error_about(path: Path, error: Exception) -> str:
     """Return the error of one of several bags, starting with the bag."""
     text = str(error)
     if text.startswith(str(path)):
@@ -212,21 +214,21 @@ def about(path: Path, error: Exception) -> str:
     return f'{path}: {text}'
 
 
-def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
+def check_all_bags(paths: list[Path], check: Callable[[Path], object]) -> None:
     """Check each bag before the work; raise one BadUsage that names all errors."""
-    troubles = []
+    errors = []
     for path in paths:
         try:
-            look(path)
+            check(path)
         except OdocalError as error:
-            troubles.append(about(path, error))
-    if troubles:
-        raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used; nothing was '
-                       f'calibrated: {"; ".join(troubles)}')
+            errors.append(error_about(path, error))
+    if errors:
+        raise BadUsage(f'{len(errors)} of {len(paths)} bags cannot be used; nothing was '
+                       f'calibrated: {"; ".join(errors)}')
 
 
 def unique_names(paths: list[Path], legs: list[list[LegResult]],
-               inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
+                 inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
     """
     Return legs and inputs with unique bag names: paths if the names are not unique.
 

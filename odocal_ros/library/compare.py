@@ -43,7 +43,7 @@ class Difference:
     sigmas_if_shared_cancels: float | None
 
     @property
-    def beyond(self) -> bool:
+    def is_significant(self) -> bool:
         return self.sigmas is not None and abs(self.sigmas) > REMARK_SIGMAS
 
 
@@ -105,14 +105,14 @@ def _differently_mounted(stored: list[Stored]) -> bool:
 
 
 def _change(name: str, stored: list[Stored]) -> Change:
-    have = [i for i, s in enumerate(stored) if s.value(name) is not None]
-    unit = stored[have[0]].estimates[name].unit
+    known = [i for i, s in enumerate(stored) if s.value(name) is not None]
+    unit = stored[known[0]].estimates[name].unit
     entries = []
     first = previous = None
-    for i in have:
+    for i in known:
         if stored[i].estimates[name].unit != unit:
             raise BadUsage(f'{stored[i].name}: {name} is in {stored[i].estimates[name].unit}, in '
-                           f'{stored[have[0]].name} in {unit}; compare calibrations of the same '
+                           f'{stored[known[0]].name} in {unit}; compare calibrations of the same '
                            'odometer and unit')
         entries.append(Entry(i, stored[i].estimates[name], _difference(name, stored, first, i),
                              _difference(name, stored, previous, i)))
@@ -194,17 +194,17 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
     if not found:
         return ('nothing to compare: no value exists in two calibrations that are not '
                 'rejected', None)
-    judged = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
-              for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
-    beyond: dict[str, tuple[float, Change, Difference]] = {}
-    for size, change, difference in judged:
-        if difference.beyond and size > beyond.get(change.parameter, (0.0,))[0]:
-            beyond[change.parameter] = size, change, difference
-    if beyond:
-        return '; '.join(_cause(c, d, stored) for _, c, d in beyond.values()), True
-    if not judged:
+    compared = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
+                for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
+    is_significant: dict[str, tuple[float, Change, Difference]] = {}
+    for size, change, difference in compared:
+        if difference.is_significant and size > is_significant.get(change.parameter, (0.0,))[0]:
+            is_significant[change.parameter] = size, change, difference
+    if is_significant:
+        return '; '.join(_cause(c, d, stored) for _, c, d in is_significant.values()), True
+    if not compared:
         return 'nothing to compare: no sigma is known', None
-    size, change, _ = max(judged, key=lambda one: one[0])
+    size, change, _ = max(compared, key=lambda one: one[0])
     return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label(change.parameter)}, '
             f'{size:.1f} sigma'), False
 
@@ -243,7 +243,7 @@ def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
         last = change.entries[-1]
         for d in (last.to_first, last.to_previous):
             sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
-            if d is not None and stored[last.index].usable and not d.beyond \
+            if d is not None and stored[last.index].usable and not d.is_significant \
                     and sigmas > REMARK_SIGMAS:
                 yield (f'note: the change of the {label(change.parameter)} is {sigmas:.1f} sigma '
                        'if errors of heading source and lever arms are the same in both')

@@ -19,7 +19,15 @@ from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
 from odocal_ros.library import export_pictures
 from odocal_ros.library.calibration import TABLES
-from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
+from odocal_ros.library.series import (
+    residuals,
+    sensor_residuals,
+    SensorResiduals,
+    Series,
+    stack_legs,
+    states,
+    trajectory,
+)
 from odocal_ros.output.drawing import PICTURES
 from odocal_ros.safe_io.atomic_files import whole_file
 
@@ -103,10 +111,10 @@ def kml(columns: Series) -> str:
 def parquet(columns: Series, path: Path) -> None:
     import pyarrow
     from pyarrow import parquet as files
-    held = pyarrow.BufferOutputStream()
-    files.write_table(pyarrow.table(columns), held)
+    buffer = pyarrow.BufferOutputStream()
+    files.write_table(pyarrow.table(columns), buffer)
     with whole_file(path) as file:
-        file.write(held.getvalue())
+        file.write(buffer.getvalue())
 
 
 def mcap(result: Calibration, path: Path) -> None:
@@ -142,21 +150,23 @@ def _topics(result: Calibration) -> list[encode.Topic]:
 def _residual_topics(result: Calibration) -> list[encode.Topic]:
     sensors: dict[str, list[Any]] = {}
     for number, leg in enumerate(result.legs, 1):
-        for left in left_in(leg):
-            sensors.setdefault(left.sensor, []).append((number, leg, _side_by_side(left)))
+        for of_sensor in sensor_residuals(leg):
+            sensors.setdefault(of_sensor.sensor, []).append(
+                (number, leg, _component_columns(of_sensor)))
     return [encode.joints(f'/odocal/residuals/{sensor}', {
         name: OdometerSamples(rows['stamp_ns'], rows['stamp_ns'], column)
         for name, column in rows.items() if name not in ('leg', 'stamp_ns', 't_s')})
-        for sensor, rows in ((sensor, _by_time(stacked(found)))
+        for sensor, rows in ((sensor, _by_time(stack_legs(found)))
                              for sensor, found in sensors.items())]
 
 
-def _side_by_side(left: Left) -> Series:
+def _component_columns(of_sensor: SensorResiduals) -> Series:
     """Return the residuals of a sensor as columns: each component, then its sigma."""
-    columns = {'t': left.t}
-    for name, value, sigma in zip(left.components, left.value.T, left.sigma.T, strict=True):
-        columns |= {f'{name}_{IN_NAMES[left.unit]}': value.astype(float),
-                    f'{name}_sigma_{IN_NAMES[left.unit]}': sigma.astype(float)}
+    columns = {'t': of_sensor.t}
+    for name, value, sigma in zip(of_sensor.components, of_sensor.value.T, of_sensor.sigma.T,
+                                  strict=True):
+        columns |= {f'{name}_{IN_NAMES[of_sensor.unit]}': value.astype(float),
+                    f'{name}_sigma_{IN_NAMES[of_sensor.unit]}': sigma.astype(float)}
     return columns
 
 
@@ -165,7 +175,7 @@ def _by_time(columns: Series) -> Series:
     return {name: column[order] for name, column in columns.items()}
 
 
-def _there(module: str) -> bool:
+def _is_importable(module: str) -> bool:
     try:
         import_module(module)
     except ImportError:
@@ -186,9 +196,9 @@ KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
 def check_names(files: Iterable[Path | str]) -> None:
     """Raise BadUsage for a file with an unknown name, or without a library to write it."""
     for file in files:
-        if Path(file).suffix == '.parquet' and not _there('pyarrow'):
+        if Path(file).suffix == '.parquet' and not _is_importable('pyarrow'):
             raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES}')
-        if Path(file).suffix == '.rrd' and not _there('rerun'):
+        if Path(file).suffix == '.rrd' and not _is_importable('rerun'):
             raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: {RERUN}')
         if Path(file).name not in KNOWN:
             raise BadUsage(f'export: {file}: unknown; available: {", ".join(KNOWN)}')

@@ -43,7 +43,7 @@ def map_figure(shapes: list[dict[str, Any]]) -> Any:
     ax = figure.add_subplot(facecolor='#eef1ea')
     for shape in shapes:
         _draw(ax, shape)
-    _as_map(ax)
+    _add_map_scale(ax)
     return figure
 
 
@@ -64,7 +64,7 @@ def _draw(ax: Any, shape: dict[str, Any]) -> None:
         ax.plot(longitude, latitude, label=None if label in known else label, **style[kind])
 
 
-def _as_map(ax: Any) -> None:
+def _add_map_scale(ax: Any) -> None:
     """Give axes of degrees a true aspect, a graticule and a scale bar."""
     from pyproj import Geod
     ax.margins(0.08)
@@ -86,7 +86,7 @@ def _as_map(ax: Any) -> None:
     ax.figure.legend(loc='outside upper center', ncols=4)
 
 
-def _found(result: Calibration) -> list[tuple[int, SpeedScale]]:
+def _legs_with_speed_scale(result: Calibration) -> list[tuple[int, SpeedScale]]:
     found = [(number, leg.evidence.by_speed) for number, leg in enumerate(result.legs, 1)
              if leg.evidence is not None and len(leg.evidence.by_speed.bins)]
     if not found:
@@ -104,7 +104,7 @@ def scale_by_speed(result: Calibration) -> Series:
     Raises BadUsage: no leg has enough sections.
     """
     parts = []
-    for number, one in _found(result):
+    for number, one in _legs_with_speed_scale(result):
         n = len(one.bins)
         columns = {'leg': np.full(n, number)} | dict(zip(
             ('speed_m_per_s', 'ratio', 'ratio_sigma'), one.bins.T[:3], strict=True))
@@ -121,12 +121,12 @@ def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
     from odocal_ros.output.plots_scale import draw_by_speed, fit_text
     most = 8     # legs in one picture, the newest
-    found = _found(result)[-most:]
+    found = _legs_with_speed_scale(result)[-most:]
     figure = new_figure(7.0, 3.2 * len(found))
     for ax, (number, one) in zip(figure.subplots(len(found), 1, squeeze=False)[:, 0], found,
                                  strict=True):
         draw_by_speed(ax, one)
-        said = [f'Scale against speed, leg {number}', *wrap(fit_text(one), 90)]
-        ax.set_title('\n'.join(said), fontsize=8)
+        title = [f'Scale against speed, leg {number}', *wrap(fit_text(one), 90)]
+        ax.set_title('\n'.join(title), fontsize=8)
         ax.legend(frameon=False, fontsize=8)
     save_figure(figure, path)

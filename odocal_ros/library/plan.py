@@ -19,7 +19,7 @@ from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
 from odocal_ros.forecast.planned_methods import keyframe_spacing, Plan, plan_methods
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
-from odocal_ros.library.asked import config_of, Settings
+from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
@@ -39,10 +39,10 @@ class Change:
 
     def gain(self, before: Plan, parameter: str) -> float:
         """Return the ratio of the old to the new sigma; inf if there was none before."""
-        now, then = self.sigmas[parameter], before.sigma(parameter)
-        if now is None:
-            return 1.0 if then is None else 0.0
-        return math.inf if then is None else then / now
+        new_sigma, old_sigma = self.sigmas[parameter], before.sigma(parameter)
+        if new_sigma is None:
+            return 1.0 if old_sigma is None else 0.0
+        return math.inf if old_sigma is None else old_sigma / new_sigma
 
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
@@ -81,9 +81,9 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
     if sigmas.fix > 2 * RTK:
         yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
     alignment = before.two_point.alignment
-    now = alignment.heading_sigma if alignment.heading_separable else math.inf
+    new_sigma = alignment.heading_sigma if alignment.heading_separable else math.inf
     outside_heading = math.radians(0.1)    # of two antennas a metre or two apart
-    better = outside_heading if now > 2 * outside_heading else now / 2
+    better = outside_heading if new_sigma > 2 * outside_heading else new_sigma / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
                                            'alignment.heading_sigma': better})
     yield (f'a heading with {math.degrees(better):.2g} deg uncertainty', drive,

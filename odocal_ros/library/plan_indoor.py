@@ -20,7 +20,7 @@ from odocal_ros.forecast.planned_indoor import (
     Robot,
     RobotMotion,
 )
-from odocal_ros.library.asked import config_of, Settings
+from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.settings.config import DRIVES, HOLONOMIC, SKID
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.references import REFERENCES

@@ -197,7 +197,7 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
     """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.forecast.leg_so_far import drive_profile, fix_and_count_accuracy
-    from odocal_ros.library.legs import find_legs, marked_legs
+    from odocal_ros.library.find_legs import find_legs, marked_legs
     from odocal_ros.library.read_bag import readers_of, recorded
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:

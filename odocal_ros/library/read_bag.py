@@ -17,8 +17,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library import asked
-from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
+from odocal_ros.library import arguments
+from odocal_ros.library.find_legs import find_legs, has_dropped_legs, last_statuses, marked_legs
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.transforms import add_static_readers
 from odocal_ros.pipeline.floor_marks import (
@@ -94,33 +94,33 @@ class Recording:
         rows: Samples = self.recorder.rows(slot)
         return rows
 
-    def spans(self, legs: list[asked.LegSpan | str]) -> list[tuple[int, int]]:
+    def spans(self, legs: list[arguments.LegSpan | str]) -> list[tuple[int, int]]:
         """Return (start, stop) stamps of legs from ``legs_of``; if none, of the recorded legs."""
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
 
-    def legs(self, legs: asked.Leg | list[asked.Leg] | None = None) -> list[Leg]:
+    def legs(self, legs: arguments.Leg | list[arguments.Leg] | None = None) -> list[Leg]:
         """Return the requested legs, or the recorded ones, for ``pipeline.calibrate``."""
         return [self.recorder.close(start, stop, self.config.leg.preroll)
-                for start, stop in self.spans(asked.legs_of(legs))]
+                for start, stop in self.spans(arguments.legs_of(legs))]
 
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
-               journal: JournalNotes | None,
-               listener: asked.Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
+               journal: JournalNotes | None, listener: arguments.Listener | None = None,
+               ) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
-    chosen = choose_topics(bag.topics, config, named, bool(marks_of(config, bag)))
-    said = local_reference(bag.topics, chosen, named)
-    if said and listener:
-        listener.note(said)
+    chosen = choose_topics(bag.topics, config, named, bool(floor_marks_of(config, bag)))
+    note = local_reference(bag.topics, chosen, named)
+    if note and listener:
+        listener.note(note)
     return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                     for slot, topic in chosen.items()}
 
 
 def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
-             config: asked.Settings = None, *,
-             listener: asked.Listener | None = None) -> Recording:
+             config: arguments.Settings = None, *,
+             listener: arguments.Listener | None = None) -> Recording:
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
@@ -132,25 +132,25 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     Raises BadBag, BadData, BadUsage, BadConfig: the bag cannot be read, or an input is missing or
     ambiguous.
     """
-    listener = listener or asked.Listener()
+    listener = listener or arguments.Listener()
     path = Path(path)
     journal = journal_notes(path)
-    settings = asked.config_of(config, journal.settings if journal else None)
+    settings = arguments.config_of(config, journal.settings if journal else None)
     # the hash takes as long as reading the file: parallel to the decoding, which uses one core
-    with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
+    with open_bag(path) as bag, ThreadPoolExecutor(1) as executor:
         name = one_line(bag.name)
-        floor_marks = marks_of(settings, bag)
+        floor_marks = floor_marks_of(settings, bag)
         if floor_marks:
             settings = with_marks(settings)
         if journal:
             listener.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')
         chosen, readers = readers_of(bag, topics or {}, settings, journal, listener)
-        digest = beside.submit(bag_sha256, bag)
+        digest = executor.submit(bag_sha256, bag)
         with listener.phase(f'reading {name}') as progress:
             recorder = recorded(bag, chosen, readers, progress)
         if settings.reference.marks:        # those of a node were tested when they were set
-            check_still(floor_marks, recorder, bag.start_ns)
+            check_wheels_stand(floor_marks, recorder, bag.start_ns)
         if floor_marks:
             recorder.feed('fix', mark_positions(settings, floor_marks))
         marks = marked_legs(bag)
@@ -163,12 +163,12 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         frame = readers[imu].frame or bag.frame(imu) if imu else ''
         return Recording(
             name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
-            tuple(marks), bool(journal and not marks and dropped_legs(bag)),
+            tuple(marks), bool(journal and not marks and has_dropped_legs(bag)),
             tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)
 
 
 def recorded(bag: Bag, chosen: dict[str, str], readers: dict[str, Reader],
-             progress: asked.Progress | None = None) -> LegRecorder:
+             progress: arguments.Progress | None = None) -> LegRecorder:
     """Return the rows of the chosen topics, slot -> topic, by their readers."""
     recorder = LegRecorder()
     bag.read(add_static_readers(readers, bag.topics), recorder.feed, progress)
@@ -178,7 +178,7 @@ def recorded(bag: Bag, chosen: dict[str, str], readers: dict[str, Reader],
     return recorder
 
 
-def marks_of(config: Config, bag: Bag) -> list[FloorMark]:
+def floor_marks_of(config: Config, bag: Bag) -> list[FloorMark]:
     """Return the marks of a bag in order of time, none without points."""
     reference = config.reference
     if reference.marks:
@@ -190,7 +190,7 @@ def marks_of(config: Config, bag: Bag) -> list[FloorMark]:
 def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
     """Return the marks in the status of a node."""
     found = set[FloorMark]()
-    for values in leg_statuses(bag):
+    for values in last_statuses(bag):
         for word in filter(None, values.get('marks', '').split(',')):
             with suppress(ValueError):      # of another program
                 found.add(FloorMark.of(word))
@@ -201,7 +201,7 @@ def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
     return sorted(found)
 
 
-def check_still(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
+def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
     """
     Raise BadUsage for a mark at which the wheels move, or that is outside the recording.
 

@@ -17,8 +17,8 @@ from odocal_ros.nav.dead_reckoning import forward_b, Origin
 from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 
 Series = dict[str, NDArray[Any]]
-NONE = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
-        'use method auto')
+NO_FIT = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
+          'use method auto')
 # residuals of the smoother: sensors, units, components
 SMOOTHED = (('fix', 'm', ('east', 'north', 'up')), ('odometer', 'm', ('along', 'left', 'up')),
             ('gyro', 'rad/s', ('x', 'y', 'z')), ('accelerometer', 'm/s^2', ('x', 'y', 'z')))
@@ -55,23 +55,23 @@ def _of_fits(result: Calibration,
              if leg.track_n is not None
              and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
     if not found:
-        raise BadUsage(NONE)
-    return stacked(found)
+        raise BadUsage(NO_FIT)
+    return stack_legs(found)
 
 
-def _rows(smoothed: dict[str, Any], column: Floats) -> Floats:
+def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
     """Return the rows of a column by keyframe at the times of the stored track."""
     rows: Floats = column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
     return rows
 
 
-def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
+def _vehicle_attitude(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
     from odocal_ros.estimator.state import C_bv
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']
-    return _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
+    return _at_track(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
@@ -80,7 +80,7 @@ def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
     geodetic = Origin(*leg.origin).to_geodetic(track_n) if leg.origin else np.full(
         track_n.shape, np.nan)
     latitude, longitude, height = geodetic.T
-    quaternion = quat_from_matrix(_vehicle(leg, smoothed))
+    quaternion = quat_from_matrix(_vehicle_attitude(leg, smoothed))
     return {'t': smoothed['track_t'],
             **dict(zip(('east_m', 'north_m', 'up_m'), track_n.T, strict=True)),
             'latitude_deg': np.rad2deg(latitude), 'longitude_deg': np.rad2deg(longitude),
@@ -89,17 +89,17 @@ def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
 
 
 def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
-    angles = rpy_from_matrix(_vehicle(leg, smoothed))
+    angles = rpy_from_matrix(_vehicle_attitude(leg, smoothed))
     columns = {'t': smoothed['track_t'],
                **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True))}
     for ending, key in (('', 'key_biases'), ('_sigma', 'key_bias_sigmas')):
         for sensor, rows in zip(('gyro', 'accelerometer'), smoothed[key], strict=True):
-            columns |= {f'{sensor}_bias_{axis}{ending}': _rows(smoothed, column)
+            columns |= {f'{sensor}_bias_{axis}{ending}': _at_track(smoothed, column)
                         for axis, column in zip('xyz', rows.T, strict=True)}
     return columns
 
 
-def stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
+def stack_legs(found: list[tuple[int, LegResult, Series]]) -> Series:
     """Return the concatenated series of legs, with times and stamps."""
     legs = [{'leg': np.full(len(columns['t']), number),
              'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
@@ -110,7 +110,7 @@ def stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class SensorResiduals:
     """Residuals of a sensor in a leg: t (m,) s, value and sigma (m, c), NaN: none."""
 
     sensor: str
@@ -121,19 +121,19 @@ class Left:
     sigma: NDArray[np.floating]
 
 
-def left_in(leg: LegResult) -> list[Left]:
+def sensor_residuals(leg: LegResult) -> list[SensorResiduals]:
     """Return the residuals of each sensor in a leg, none without track and fit."""
     found = []
     if (e := leg.evidence) is not None:
         sigma = np.repeat(e.fix_sigma[:, None], 2, axis=1)
-        found = [Left(name, 'm', ('along', 'left'), e.t_fix, rows, sigma) for name, rows in (
-            ('track', e.residual), ('track_before', e.residual_before))]
+        found = [SensorResiduals(name, 'm', ('along', 'left'), e.t_fix, rows, sigma)
+                 for name, rows in (('track', e.residual), ('track_before', e.residual_before))]
     smoothed = getattr(leg.methods.get('smoother'), 'details', {})
     for sensor, unit, components in SMOOTHED:
         if f'left_{sensor}' in smoothed:
             t = smoothed['left_fix_t'] if sensor == 'fix' else smoothed['key_t'][1:]
-            found.append(Left(sensor, unit, components, t,
-                              *np.hsplit(smoothed[f'left_{sensor}'], 2)))
+            found.append(SensorResiduals(sensor, unit, components, t,
+                                         *np.hsplit(smoothed[f'left_{sensor}'], 2)))
     return found
 
 
@@ -150,13 +150,13 @@ def residuals(result: Calibration) -> Series:
     x, y, z in the body frame b.   Raises BadUsage: no leg has a track.
     """
     found = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
-             for one in left_in(leg)]
+             for one in sensor_residuals(leg)]
     if not found:
         raise BadUsage('no leg has a track to compare with its fixes; see the reasons')
-    return stacked(found)
+    return stack_legs(found)
 
 
-def _residual_rows(leg: LegResult, left: Left) -> Series:
+def _residual_rows(leg: LegResult, left: SensorResiduals) -> Series:
     m, c = left.value.shape
     known = np.isfinite(left.sigma).ravel()
     t, e = np.repeat(left.t, c), leg.evidence

@@ -36,26 +36,26 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
     """
     if out is not None:
         out = Path(out)
-        for path in beside(out):
-            _check_beside(path, force)
+        for path in truth_paths(out):
+            _check_may_replace(path, force)
         check_target(out, storage, compression, force)
     try:
-        asked = scenario if isinstance(scenario, SimOptions) else SimOptions(
+        drive_options = scenario if isinstance(scenario, SimOptions) else SimOptions(
             scenario=scenario, **options)
     except TypeError as error:
         raise BadUsage(f'simulate: {error}') from None
-    drive = scenarios.simulate(asked)
+    drive = scenarios.simulate(drive_options)
     if out is not None:
         write_bag(out, drive_topics(drive), storage, compression, force, progress)
-        truth, known = beside(out)
+        truth, operator = truth_paths(out)
         node = {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}}
         with uninterrupted():      # a bag is never without its truth
             write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
-            write_yaml(known, node, f'Settings of the operator of {out.name}.')
+            write_yaml(operator, node, f'Settings of the operator of {out.name}.')
     return drive
 
 
-def beside(out: Path) -> list[Path]:
+def truth_paths(out: Path) -> list[Path]:
     """Return the paths of truth and settings; with the name of the bag if others exist there."""
     plain = [out.parent / name for name in (TRUTH, SETTINGS)]
     text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
@@ -64,7 +64,7 @@ def beside(out: Path) -> list[Path]:
     return plain
 
 
-def _check_beside(path: Path, force: bool) -> None:
+def _check_may_replace(path: Path, force: bool) -> None:
     """Refuse to overwrite a file, unless ``force`` is set and it was made here."""
     if not path.exists():
         return

@@ -19,8 +19,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.asked import EACH_STOP, LegSpan
-from odocal_ros.library.legs import find_legs, marked_legs, stops_of
+from odocal_ros.library.arguments import EACH_STOP, LegSpan
+from odocal_ros.library.find_legs import find_legs, marked_legs, standstills_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data
@@ -184,7 +184,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests
                 'chord': chord} | more
 
     marks = marked_legs(bag)
-    stops = stops_of(inputs, first, config)
+    stops = standstills_of(inputs, first, config)
     found['legs'] = [described(a, b, marked=bool(marks))
                      for a, b in find_legs(recorder, bag, [], marks, config, stops)]
     each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(rests) > 2 else []

@@ -13,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import legs_of, Listener
+from odocal_ros.library.arguments import legs_of, Listener
 from odocal_ros.offline.cli import Phase, print_json, print_text, warn
 from odocal_ros.safe_io.text_formats import one_line
 

@@ -196,10 +196,10 @@ def run(args: argparse.Namespace) -> int:
     if heading_sigma_deg is not None and not 0 <= heading_sigma_deg <= 180:
         raise BadUsage(f'--known-heading-sigma-deg {heading_sigma_deg:g}: required: 0 to 180')
     from odocal_ros.bagio.write import drive_topics
-    from odocal_ros.library.simulate import beside, simulate
+    from odocal_ros.library.simulate import simulate, truth_paths
     from odocal_ros.sim.truth import topic_arguments
     out = Path(args.out)
-    truth, settings = beside(out)
+    truth, settings = truth_paths(out)
     with Phase('writing', args.quiet) as progress:
         drive = simulate(options_of(args), out, storage=args.storage,
                          compression=args.compression, force=args.force,

@@ -19,7 +19,7 @@ from odocal_ros import (
     read_bag,
     simulate,
 )
-from odocal_ros.library.asked import config_of
+from odocal_ros.library.arguments import config_of
 from odocal_ros.nav.rotations import matrix_from_quat, rpy_from_matrix
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import with_settings
@@ -212,7 +212,7 @@ def test_settings_may_come_in_any_form(town):
 @pytest.mark.parametrize(('legs', 'seconds'), [
     ('10:70', [60]), (['10:70', '80:90'], [60, 10]), ((10, 70), [60]), ([(10, 70.5)], [60.5])])
 def test_legs_may_come_in_any_form(town, legs, seconds):
-    from odocal_ros.library.asked import legs_of
+    from odocal_ros.library.arguments import legs_of
     found = [(leg.stop_ns - leg.start_ns) * 1e-9 for leg in legs_of(legs)]
     assert found == pytest.approx(seconds)
 

@@ -14,7 +14,7 @@ from bench import wait_for
 from player import messages_of, playing_to, stamp_of, within
 
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.library.legs import marked_legs
+from odocal_ros.library.find_legs import marked_legs
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

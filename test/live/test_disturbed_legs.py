@@ -13,7 +13,7 @@ from kills import NUMBERS, replayed, same_result, stamps_of
 from player import ends_of, messages_of, playing_to, Sent, straight, within
 import pytest
 
-from odocal_ros.library.asked import parse_leg
+from odocal_ros.library.arguments import parse_leg
 from odocal_ros.live.journal import replay_command
 from odocal_ros.messages.cdr import FRAME_AT
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -12,8 +12,14 @@ import pytest
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.asked import LegSpan, parse_leg
-from odocal_ros.library.legs import _marked, cut_short, find_legs, marked_legs, open_ended
+from odocal_ros.library.arguments import LegSpan, parse_leg
+from odocal_ros.library.find_legs import (
+    _marked_spans,
+    coverage_reasons,
+    find_legs,
+    marked_legs,
+    missing_stop_reasons,
+)
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -74,7 +80,7 @@ def test_marks_of_each_run_are_found_and_cancelled_legs_are_not():
         ('3', 30 * S, 0, 'started'), ('3', 30 * S, 40 * S, 'stopped'),
         ('3', 30 * S, 40 * S, 'undone'), ('4', 50 * S, 0, 'started')])
     assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
-    ended, broken_off = open_ended([(5 * S, 9 * S), (50 * S, 70 * S)], marked_legs(bag))
+    ended, broken_off = missing_stop_reasons([(5 * S, 9 * S), (50 * S, 70 * S)], marked_legs(bag))
     assert (ended, [r.code for r in broken_off]) == ((), [Code.STOP_MARK_MISSING])
     bag = StatusBag([('1', 5 * S, 9 * S, 'stopped'), ('1', 20 * S, 0, 'started'),
                      ('1', 20 * S, 30 * S, 'stopped')])
@@ -126,7 +132,7 @@ def test_stamps_without_a_time_in_common(out_and_back):
 @pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
 def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot):
     whole, _ = recorded(out_and_back)
-    assert cut_short(whole) == ()
+    assert coverage_reasons(whole) == ()
     begin, end = out_and_back.imu.stamp_ns[[0, -1]]
     half_s = (end - begin) / 2 / S
     for early in (True, False):
@@ -135,7 +141,7 @@ def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot)
             rows = whole.rows(name)
             kept = (rows.stamp_ns < (begin + end) // 2) == early
             recorder.feed(name, take(rows, kept | (name != slot)))
-        (reason,) = cut_short(recorder)
+        (reason,) = coverage_reasons(recorder)
         assert reason.code is Code.TOPIC_GAP
         missing = float(reason.text.split(' s ')[0].split()[-1])
         assert missing == pytest.approx(half_s, abs=2.0)      # fixes come each second
@@ -174,5 +180,5 @@ def test_a_leg_outside_the_bag_is_refused_with_the_span_there_is(out_and_back):
 def test_a_recording_that_broke_off_at_its_start_mark_says_so():
     bag = SimpleNamespace(name='2026-01-02T03-04-05Z_leg_1')
     with pytest.raises(BadData, match='ended at the start mark.* drive it again'):
-        _marked([(10, 0)], 10, bag)
-    assert _marked([(10, 0)], 11, bag) == [(10, 11)]
+        _marked_spans([(10, 0)], 10, bag)
+    assert _marked_spans([(10, 0)], 11, bag) == [(10, 11)]

@@ -140,6 +140,6 @@ def test_marks_and_a_reference_topic_exclude_each_other(tmp_path):
 def test_a_status_of_another_program_has_no_marks(tmp_path, monkeypatch):
     made, bag = robot(tmp_path, imu_rate=20.0)
     stored = [{'marks': '12:x,,7', 'leg_event': 'stopped'}, {}]
-    monkeypatch.setattr('odocal_ros.library.read_bag.leg_statuses', lambda bag: stored)
+    monkeypatch.setattr('odocal_ros.library.read_bag.last_statuses', lambda bag: stored)
     with pytest.raises(BadUsage, match=r'no fix \(a topic of'):
         calibrate_bag(bag, TOPICS, asked(made) | {'reference.marks': []})

@@ -12,7 +12,7 @@ import ros_bags
 import yaml
 
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.library.asked import parse_leg
+from odocal_ros.library.arguments import parse_leg
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config_file import parse_set, read_config_file
 

@@ -90,7 +90,7 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
         shutil.copytree(bags / name.replace('dropped', 'one'), tmp_path / name)
         (tmp_path / name / JOURNAL).write_text(
             f'/**:\n  ros__parameters:\n    verdict.min_legs: {limit}\n')
-    monkeypatch.setattr('odocal_ros.library.read_bag.dropped_legs',
+    monkeypatch.setattr('odocal_ros.library.read_bag.has_dropped_legs',
                         lambda bag: bag.name == 'dropped')
     said = {}
     for names in ('one', 'one dropped', 'one other'):

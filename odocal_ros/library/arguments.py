@@ -40,17 +40,17 @@ class Listener:
 class Notes(Listener):
     """Store the notes, and forward everything."""
 
-    def __init__(self, onward: Listener) -> None:
-        self.said: list[str] = []
-        self._onward = onward
+    def __init__(self, following: Listener) -> None:
+        self.texts: list[str] = []
+        self._next = following
 
     def note(self, text: str) -> None:
         """Store and forward a note."""
-        self.said.append(text)
-        self._onward.note(text)
+        self.texts.append(text)
+        self._next.note(text)
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        return self._onward.phase(title)
+        return self._next.phase(title)
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class LegSpan:
     relative: tuple[bool, bool] = (False, False)   # from the bag's first message
 
 
-def paths_of(asked: Any) -> list[Path]:
+def paths_of(argument: Any) -> list[Path]:
     """
     Return the paths of one bag or several.
 
     Raises BadUsage: there is none, or one is not a path.
     """
-    several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
-        else list(asked)
+    one_alone = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
+    several = [argument] if one_alone else list(argument)
     if not several:
         raise BadUsage('no bag is given; required: one path or several')
     for one in several:
@@ -82,59 +82,59 @@ def paths_of(asked: Any) -> list[Path]:
     return [Path(one) for one in several]
 
 
-def topics_of(asked: Any) -> dict[str, str]:
+def topics_of(argument: Any) -> dict[str, str]:
     """Return slot -> topic, or raise BadUsage if the argument is no mapping of slots."""
-    if asked is not None and not isinstance(asked, Mapping):
+    if argument is not None and not isinstance(argument, Mapping):
         raise BadUsage("topics: required: a mapping of slot to topic such as {'imu': "
-                       f"'/imu/data'}}, not {type(asked).__name__}")
-    unknown = [one for one in asked or () if one not in TOPICS]
+                       f"'/imu/data'}}, not {type(argument).__name__}")
+    unknown = [one for one in argument or () if one not in TOPICS]
     if unknown:
         raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is not a slot; required: '
                        f'one of {", ".join(TOPICS)}')
-    return dict(asked or {})
+    return dict(argument or {})
 
 
-def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> Config:
+def config_of(argument: Settings, journal: Mapping[str, object] | None = None) -> Config:
     """
-    Return all settings: defaults, then those of a journal, then those of ``asked``.
+    Return all settings: defaults, then those of a journal, then those of ``argument``.
 
-    asked : by dotted name, or a ROS parameter file; a Config is returned unchanged.
+    argument : by dotted name, or a ROS parameter file; a Config is returned unchanged.
 
     Raises BadConfig, BadUsage: a setting is unknown or of a wrong value; the file cannot be read.
     """
-    if isinstance(asked, Config):
-        return asked
-    if asked is not None and not isinstance(asked, (str, Path, Mapping)):
+    if isinstance(argument, Config):
+        return argument
+    if argument is not None and not isinstance(argument, (str, Path, Mapping)):
         raise BadUsage('config: required: a Config, a mapping of dotted names, or a parameter '
-                       f'file, not {type(asked).__name__}')
-    if '\0' in str(asked):
+                       f'file, not {type(argument).__name__}')
+    if '\0' in str(argument):
         raise BadUsage('config: the path contains a zero byte')
-    if isinstance(asked, (str, Path)):
+    if isinstance(argument, (str, Path)):
         from odocal_ros.settings.config_file import read_config_file
-        asked = read_config_file(Path(asked))
-    return with_settings(with_settings(Config(), journal or {}), asked or {})
+        argument = read_config_file(Path(argument))
+    return with_settings(with_settings(Config(), journal or {}), argument or {})
 
 
-def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
+def legs_of(argument: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     """
     Return legs in the form of ``find_legs``.
 
-    asked : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
-        or (A, B), None for open; one or many.
+    argument : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates,
+        'each-stop', or (A, B), None for open; one or many.
 
     Raises BadUsage: one is not of these forms.
     """
-    if asked is None:
+    if argument is None:
         return []
-    if not isinstance(asked, Iterable):
-        raise BadUsage(f'legs: {asked!r}: {LEG_FORMS}')
-    one_alone = isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked)
-    wanted: Iterable[Any] = [asked] if one_alone else asked
-    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in wanted]
+    if not isinstance(argument, Iterable):
+        raise BadUsage(f'legs: {argument!r}: {LEG_FORMS}')
+    one_alone = isinstance(argument, str) or isinstance(argument, tuple) and _is_pair(argument)
+    several: Iterable[Any] = [argument] if one_alone else argument
+    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in several]
 
 
-def _is_pair(asked: tuple[Any, ...]) -> bool:
-    return len(asked) == 2 and not any(isinstance(edge, (str, tuple)) for edge in asked)
+def _is_pair(argument: tuple[Any, ...]) -> bool:
+    return len(argument) == 2 and not any(isinstance(edge, (str, tuple)) for edge in argument)
 
 
 def _text(leg: Any) -> str:

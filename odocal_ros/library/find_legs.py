@@ -4,7 +4,7 @@
 """Legs of a recording: as requested, as marked by the node, or from its standstills."""
 
 from collections.abc import Sequence
-from typing import Any, TYPE_CHECKING, TypeAlias
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.asked import EACH_STOP, LegSpan
+from odocal_ros.library.arguments import EACH_STOP, LegSpan
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.clocks import OFFSET_REACH
@@ -28,11 +28,18 @@ if TYPE_CHECKING:
 
 Recorded: TypeAlias = 'Bag | Recording'     # open, or read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
-Stops = tuple[Ints, Floats, float]     # result of ``stops_of``
 OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
 CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
+
+
+class Standstills(NamedTuple):
+    """Standstills of a recording, and the path length up to them."""
+
+    spans_ns: Ints      # (k, 2)
+    path_m: Floats      # (k, 2), at begin and end
+    distance: float     # m, path length of the whole recording
 
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:
@@ -42,14 +49,15 @@ def marked_legs(bag: Bag) -> list[tuple[int, int]]:
     The stop is 0 where the bag ends before it.
     """
     legs = []
-    for values in leg_statuses(bag):
+    for values in last_statuses(bag):
         start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
         if values.get('leg_event') not in DROPPED_EVENTS and start > 0:
             legs.append((start, stop))
     return sorted(legs)
 
 
-def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Reason, ...]]:
+def missing_stop_reasons(spans: Spans,
+                         marks: Sequence[tuple[int, int]]) -> list[tuple[Reason, ...]]:
     """
     Return a note for each leg that was marked at its start and not at its end.
 
@@ -60,9 +68,9 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
             for start, _ in spans]
 
 
-def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
+def coverage_reasons(recorder: LegRecorder) -> tuple[Reason, ...]:
     """Return TOPIC_GAP for topics that begin after the others, or end before them."""
-    ends = _ends(recorder)
+    ends = _first_and_last(recorder)
     if not ends:
         return ()
     begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
@@ -77,12 +85,12 @@ def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
                    'cable and the recorder.'),) if what else ()
 
 
-def dropped_legs(bag: Bag) -> bool:
+def has_dropped_legs(bag: Bag) -> bool:
     """Return True if the operator cancelled or undid a leg that is marked in the bag."""
-    return any(values.get('leg_event') in DROPPED_EVENTS for values in leg_statuses(bag))
+    return any(values.get('leg_event') in DROPPED_EVENTS for values in last_statuses(bag))
 
 
-def leg_statuses(bag: Bag) -> list[dict[str, str]]:
+def last_statuses(bag: Bag) -> list[dict[str, str]]:
     """Return the last status of each leg in a bag."""
     last: dict[tuple[str, int], dict[str, str]] = {}
     for topic in bag.topics.values():
@@ -92,11 +100,11 @@ def leg_statuses(bag: Bag) -> list[dict[str, str]]:
         for _, message in bag.messages(topic.name):
             for status in message.status:
                 if status.name.endswith(STATUS_NAME):
-                    _remember(last, {kv.key: kv.value for kv in status.values})
+                    _store_status(last, {kv.key: kv.value for kv in status.values})
     return list(last.values())
 
 
-def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str]) -> None:
+def _store_status(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str]) -> None:
     try:
         start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
     except (KeyError, ValueError):
@@ -108,44 +116,44 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
         last[leg_id] = values | {'leg_event': values.get('leg_event') or before}
 
 
-def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | str],
+def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan | str],
               marks: Sequence[tuple[int, int]], config: Config,
-              stops: Stops | None = None) -> Spans:
+              stops: Standstills | None = None) -> Spans:
     """
     Return (start, stop) stamps of the legs of one bag.
 
-    recorder : fed with the whole bag.   bag : for its time span.   asked : requested legs; empty:
-    the marks, else automatic legs with leg.automatic, else one from standstill to standstill.
-    marks : (start, stop) by the node.   config : standstills, least distance.   stops : result of
-    ``stops_of`` for the common time of the topics, if known.
+    recorder : fed with the whole bag.   bag : for its time span.   requested : legs; empty: the
+    marks, else automatic legs with leg.automatic, else one between standstills.   marks :
+    (start, stop) by the node.   config : standstills, least distance.   stops : result of
+    ``standstills_of`` for the common time of the topics, if known.
 
     Raises BadUsage: a requested leg is outside the bag; BadData: the stamps of the topics have no
     common time, and a leg must be searched or is open-ended.
     """
-    firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
+    firsts, lasts = zip(*_first_and_last(recorder).values() or [(0, 1)], strict=True)
     first, last = max(firsts), min(lasts)     # last before first: no common time
-    closed = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
-                          for a in asked)
-    if first - last > OFFSET_REACH * 1e9 and not closed:
-        raise BadData(f'{bag.name}: {_apart(recorder)}')
+    has_both_ends = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
+                                 for a in requested)
+    if first - last > OFFSET_REACH * 1e9 and not has_both_ends:
+        raise BadData(f'{bag.name}: {_no_common_time_text(recorder)}')
     last = max(last, first + 1)
 
-    def stops_known() -> Stops:
-        return stops or stops_of(screen(recorder.close(first, last, preroll=0.0), config,
-                                        check_faults=False)[0], first, config)
-    legs = [_placed(a, bag, first, last) for a in asked if isinstance(a, LegSpan)]
-    if EACH_STOP in asked:
-        legs += _each_stop(stops_known(), settings_by_frame(recorder.rows('fix'), config))
+    def standstills() -> Standstills:
+        return stops or standstills_of(screen(recorder.close(first, last, preroll=0.0), config,
+                                              check_faults=False)[0], first, config)
+    legs = [_span_in_bag(a, bag, first, last) for a in requested if isinstance(a, LegSpan)]
+    if EACH_STOP in requested:
+        legs += _each_stop(standstills(), settings_by_frame(recorder.rows('fix'), config))
     if legs:
         return legs
     if marks:
-        return _marked(marks, last, bag)
+        return _marked_spans(marks, last, bag)
     if config.leg.automatic:
         return automatic_legs(recorder, last, config) or [(first, last)]
-    return [_by_standstill(first, last, stops_known())]
+    return [_by_standstill(first, last, standstills())]
 
 
-def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans:
+def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans:
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
@@ -154,7 +162,7 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans
     return legs
 
 
-def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
+def _first_and_last(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
     """Return the first and the last stamp of each required slot that has stamps."""
     rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
     stamps = {slot: s[s > 0] for slot, s in rows.items()}
@@ -163,45 +171,44 @@ def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
             else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
 
 
-def _apart(recorder: LegRecorder) -> str:
+def _no_common_time_text(recorder: LegRecorder) -> str:
     """Return a sentence with the first and last stamp of each required topic."""
     spans = ', '.join(
         f'{INPUTS[slot].label} {" to ".join(str(np.datetime64(ns, "ns"))[:19] for ns in ends)}'
-        for slot, ends in _ends(recorder).items())
+        for slot, ends in _first_and_last(recorder).items())
     return (f'the stamps of the topics have no time in common: {spans} (UTC); stamp all sensors '
             'with one clock (likely causes: a time zone, time since boot, GPS time), use arrival '
             'times (imu.arrival_time, odometer.arrival_time, gnss.arrival_time), or record them '
             'together')
 
 
-def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
+def _span_in_bag(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
     # stamps may be on another clock than bag times, as in a recording of a replay
     begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
     if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
-        asked = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
-        raise BadUsage(f'{bag.name}: the leg {asked} is empty; the bag runs from 0 to '
+        requested = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
+        raise BadUsage(f'{bag.name}: the leg {requested} is empty; the bag runs from 0 to '
                        f'{length:.1f} s')
     return start, stop
 
 
-def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
+def standstills_of(inputs: Inputs, first: int, config: Config) -> Standstills:
     """
-    Return the standstills of a recording, and the path length up to them.
+    Return the standstills of a recording, none if a topic lacks.
 
     inputs : screened, over the common time of the topics.   first : their start, ns.
-
-    Returns (k, 2) ns, the path length at these, (k, 2) m, and the total; none if a topic lacks.
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
-        return np.empty((0, 2), np.int64), np.empty((0, 2)), 0.0
+        return Standstills(np.empty((0, 2), np.int64), np.empty((0, 2)), 0.0)
     scale = place(inputs, config).rough or 1.0
     spans = inputs.standstills(scale, config)
     path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))
-    return first + np.round(spans * 1e9).astype(np.int64), metres, float(path_length[-1])
+    return Standstills(first + np.round(spans * 1e9).astype(np.int64), metres,
+                       float(path_length[-1]))
 
 
 def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
@@ -213,23 +220,23 @@ def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
             if (leg.stop_ns or last) > leg.start_ns]
 
 
-def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
+def _by_standstill(first: int, last: int, stops: Standstills) -> tuple[int, int]:
     """Return one leg, from the first standstill to the last; intermediate stops never split."""
-    stops, metres, whole = known
-    if not len(stops):
+    count, distance = len(stops.spans_ns), stops.distance
+    if not count:
         return first, last
     start, stop, opening = first, last, 0
-    if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
-        start, opening = int(stops[0, 1]), 1
-    if len(stops) > opening and whole - metres[-1, 1] < 0.02 * whole + 1.0:
-        stop = int(stops[-1, 1])
+    if stops.path_m[0, 0] < OPENING * distance:       # else an intermediate stop, or the last one
+        start, opening = int(stops.spans_ns[0, 1]), 1
+    if count > opening and distance - stops.path_m[-1, 1] < 0.02 * distance + 1.0:
+        stop = int(stops.spans_ns[-1, 1])
     return start, stop
 
 
-def _each_stop(known: Stops, config: Config) -> Spans:
+def _each_stop(stops: Standstills, config: Config) -> Spans:
     """Return a leg from each standstill to the next, without short ones if others are left."""
-    stops, metres, _ = known
-    legs = list(zip(stops[:-1, 1].tolist(), stops[1:, 1].tolist(), strict=True))
-    lengths = metres[1:, 0] - metres[:-1, 1]
+    starts, ends = stops.spans_ns[:-1, 1].tolist(), stops.spans_ns[1:, 1].tolist()
+    legs = list(zip(starts, ends, strict=True))
+    lengths = stops.path_m[1:, 0] - stops.path_m[:-1, 1]
     return [leg for leg, m in zip(legs, lengths, strict=True)
             if m >= config.leg.min_distance] or legs
