@@ -167,7 +167,7 @@ def blocks_of(topics):
 
 def run(drive, odometry, topics):
     """Return (restarts so far, pose) of a stream, and what was said."""
-    blocks, out, said = blocks_of(topics), [], []
+    blocks, out, notes = blocks_of(topics), [], []
     begin, end = topics['imu']['arrival'][[0, -1]]
     for edge in range(int(begin), int(end) + 1, PIECE_NS):
         for slot, block in blocks.items():
@@ -176,8 +176,8 @@ def run(drive, odometry, topics):
                 odometry.feed(slot, take(block, slice(a, b)), drive.form)
         path = odometry.restarts          # of what comes before a restart in it
         out += [(path, pose) for pose in odometry.poses()]
-        said += odometry.take_notes()
-    return out, said
+        notes += odometry.take_notes()
+    return out, notes
 
 
 def worst_of(drive, poses, topics, path=0):
@@ -222,9 +222,9 @@ def stream(seed, number):
             rng.choice([1, 1, 2, 3]))] if number >= DRIVES else ['none']
     odometry = started(drive, number)
     try:
-        poses, said = run(drive, odometry, topics)
+        poses, notes = run(drive, odometry, topics)
     except Exception as error:       # that none comes is what is tested
         return number, faults, np.inf, repr(error), 0, True
     worst = max([worst_of(drive, [p for r, p in poses if r == restart], topics, restart)
                  for restart in {r for r, _ in poses}], default=(0.0, ''))
-    return number, faults, *worst, odometry.restarts, bool(said)
+    return number, faults, *worst, odometry.restarts, bool(notes)

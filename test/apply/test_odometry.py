@@ -63,11 +63,11 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     run, _ = prepare(made.leg(), screen(made.leg(), config)[0], config, alignment=alignment)
     left, right = (dead_reckon(*run.epochs, travel).P * scale for travel, scale in zip(
         (run.inputs.travels[0], run.inputs.travels[1]), made.truth.wheel_scales, strict=True))
-    wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
+    expected = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
     poses = poses_of(odometry_of(made, **given(alignment, run.origin.latitude)),
                      samples_of(made, made.imu.stamp_ns[row]), made.form)
     rows = np.searchsorted(made.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
-    off = np.array([p.position for p in poses]) - (wanted[rows] - wanted[0])
+    off = np.array([p.position for p in poses]) - (expected[rows] - expected[0])
     assert np.abs(off).max() < 1e-9
 
 
@@ -124,13 +124,13 @@ def test_what_a_counter_does_costs_little_of_the_path(counted, whole, fault):
     form = OdometerForm('cumulative', 2**16 if change is rolling else 2**64, 'm/pulse')
     odometry = odometry_of(counted)
     poses = poses_of(odometry, blocks_with(counted, change), form)
-    wanted = {p.stamp_ns: p for p in whole}
-    off = np.array([p.position - wanted[p.stamp_ns].position for p in poses
-                    if p.stamp_ns in wanted])
+    expected = {p.stamp_ns: p for p in whole}
+    off = np.array([p.position - expected[p.stamp_ns].position for p in poses
+                    if p.stamp_ns in expected])
     assert len(off) > 1100
     assert np.abs(off).max() <= most
-    said = odometry.take_notes()
-    assert any('jumps by' in text for text in said) == (change in (reset, one_false))
+    notes = odometry.take_notes()
+    assert any('jumps by' in text for text in notes) == (change in (reset, one_false))
     assert max(np.linalg.norm(p.velocity) for p in poses) < 25.0
 
 
@@ -211,13 +211,14 @@ def test_the_last_of_the_braking_is_no_tilt():
     t = np.arange(0.0, 20 * period, 1 / rate)
     since = (t - 4.0) % period
     accel = np.select([t < 4.0, since < 2.0, since < 3.5, since < 4.5], [0.0, 3.0, 0.0, -6.0])
-    way = np.cumsum(np.cumsum(accel)) / rate**2
+    path_length = np.cumsum(np.cumsum(accel)) / rate**2
     stamp = 10**18 + np.rint(t * 1e9).astype(np.int64)
     force = np.stack([accel, 0 * t, np.full(len(t), 9.81)], -1)
     imu = ImuSamples(stamp, stamp, 0 * force, force, np.zeros((len(t), 4)),
                      np.full(len(t), np.nan))
     form = OdometerForm('cumulative', 0, 'm/pulse')
-    wheel = OdometerSamples(stamp[::4], stamp[::4], np.floor(way[::4] / 0.005).astype(np.int64))
+    wheel = OdometerSamples(stamp[::4], stamp[::4],
+                            np.floor(path_length[::4] / 0.005).astype(np.int64))
     config = with_settings(ApplyConfig(), {'imu.grade': 'consumer', 'publish.rate': 10.0})
     known = {'scale_factor': Estimate(0.005, 1e-7, 'm/pulse'),
              'yaw_mounting_angle': Estimate(0.0, 1e-4, 'rad'),
@@ -262,11 +263,11 @@ def test_after_the_wait_the_next_pose_has_all_it_needs():
                                odometer_rate=100.0, imu_grade='tactical'))
     odometry, blocks = odometry_of(made, publish__rate=20.0), samples_of(made)
     fed_ns, now_ns = 0, int(made.imu.stamp_ns[0]) + 5 * 10**9
-    for looks in range(101):
+    for seconds in range(101):
         for slot, block in blocks.items():
             inside = (block.stamp_ns > fed_ns) & (block.stamp_ns <= now_ns)
             if inside.any():
                 odometry.feed(slot, take(block, inside), made.form)
         poses = odometry.poses()
-        assert len(poses) == 1 if looks else poses
+        assert len(poses) == 1 if seconds else poses
         fed_ns, now_ns = now_ns, now_ns + round((odometry.wait_s() + 1e-3) * 1e9)

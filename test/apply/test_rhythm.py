@@ -222,8 +222,8 @@ def test_late_stamps_of_a_drive_are_reported(late):
     topics = columns_of(drive)
     for column in ('stamp', 'arrival'):
         topics['imu'][column] = topics['imu'][column] + round(late * 1e9)
-    _, said = run(drive, started(drive, 5), topics)
-    reports = [text for text in said if REPORT in text]
+    _, texts = run(drive, started(drive, 5), topics)
+    reports = [text for text in texts if REPORT in text]
     if late:
         assert float(reports[-1].split('are ')[1].split(' s')[0]) == pytest.approx(late, abs=0.04)
     else:

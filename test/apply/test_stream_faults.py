@@ -21,8 +21,8 @@ def published(drive, topics):
     topics = {name: {k: v[:row_at(topic, 75.0)] for k, v in topic.items()}
               for name, topic in topics.items()}
     odometry = started(drive, 5)
-    poses, said = run(drive, odometry, topics)
-    return odometry, poses, said
+    poses, notes = run(drive, odometry, topics)
+    return odometry, poses, notes
 
 
 def row_at(topic, seconds):
@@ -75,20 +75,20 @@ def test_one_fault_is_said_and_within_the_covariance(fault):
     drive = drive_of(4 if 'speed' in fault else 0)      # 50 Hz: speeds, counts
     topics = columns_of(drive)
     FAULTS[fault](topics)
-    odometry, poses, said = published(drive, topics)
-    assert said
+    odometry, poses, notes = published(drive, topics)
+    assert notes
     assert len(poses) > 140
     for path in {path for path, _ in poses}:
         worst, what = worst_of(drive, [pose for p, pose in poses if p == path], topics, path)
         assert worst <= SIGMAS, what
-    assert odometry.restarts == sum('restarts' in text for text in said)
+    assert odometry.restarts == sum('restarts' in text for text in notes)
 
 
 def test_an_unharmed_stream_is_not_talked_about():
     for number in range(3):          # counts, speeds, angles
         drive = drive_of(number)
-        odometry, poses, said = published(drive, columns_of(drive))
-        assert (said, odometry.restarts) == ([], 0)
+        odometry, poses, notes = published(drive, columns_of(drive))
+        assert (notes, odometry.restarts) == ([], 0)
         assert worst_of(drive, [pose for _, pose in poses], {})[0] < SIGMAS
 
 
@@ -119,11 +119,11 @@ def test_what_the_rows_do_not_show_of_the_travel_is_in_the_covariance(fault, num
     drive = drive_of(number)         # counts, speeds, angles
     topics = columns_of(drive)
     fault(topics)
-    odometry, poses, said = published(drive, topics)
+    odometry, poses, notes = published(drive, topics)
     assert odometry.restarts == 0
     worst, what = worst_of(drive, [pose for _, pose in poses], topics)
     assert worst <= SIGMAS, what
-    assert bool(said) or fault is not lost_steps
+    assert bool(notes) or fault is not lost_steps
 
 
 # that were beyond their covariance, or ended it; more: benchmarks/stream_faults.py
@@ -139,10 +139,10 @@ KNOWN = {
 @pytest.mark.parametrize(('seed', 'number'), KNOWN, ids=[
     f'{number}: {what}' for (_, number), what in KNOWN.items()])
 def test_known_streams(seed, number):
-    _, faults, worst, what, _, said = stream(seed, number)
+    _, faults, worst, what, _, notes = stream(seed, number)
     assert seed == 1 or 'counter put -1e+300 in 3 rows' in faults
     assert worst <= SIGMAS, (faults, what)
-    assert said
+    assert notes
 
 
 def sifted(rows, block):
@@ -188,9 +188,9 @@ def test_a_turn_that_no_vehicle_begins_is_doubted():
     topics = columns_of(drive)
     at = row_at(topics['imu'], 45.0)
     topics['imu']['w'][at:at + 50, 2] += 1.0
-    odometry, poses, said = published(drive, topics)
+    odometry, poses, notes = published(drive, topics)
     assert odometry.restarts == 0
-    assert any('more than a vehicle can turn' in text for text in said)
+    assert any('more than a vehicle can turn' in text for text in notes)
     before, after = (np.sqrt(poses[k][1].pose_cov[5, 5]) for k in (150, -1))
     assert before < 0.05
     assert 0.3 < after < 2.0         # of 1 rad that it turned falsely

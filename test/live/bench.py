@@ -142,15 +142,15 @@ class Client:
         """Return the newest status, empty before the first."""
         return self.statuses[-1] if self.statuses else {}
 
-    def until(self, **wanted) -> dict:
+    def until(self, **required) -> dict:
         """Return the first status from now on (the newest included) that has these values."""
         first = max(0, len(self.statuses) - 1)
 
         def found():     # in all that came: a state may be over before it is looked at
             return next((status for status in self.statuses[first:] if all(
-                status.get(k) == v for k, v in wanted.items())), None)
+                status.get(k) == v for k, v in required.items())), None)
         try:
-            return wait_for(found, f'status with {wanted}')
+            return wait_for(found, f'status with {required}')
         except AssertionError as error:
             raise AssertionError(f'{error}; last: {self.status}') from None
 

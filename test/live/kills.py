@@ -40,8 +40,8 @@ def killed(driven, moment_s: float, folder: Path) -> SimpleNamespace:
             status = client.until(state='recording')
             time.sleep(max(0.0, moment_s - (time.monotonic() - marked)))
             # a busy machine: by then the node must have heard of most of it
-            wait_for(lambda: told(client) >= moment_s - 1.0, 'the leg in the status')
-            told_s, end_ns = told(client), time.time_ns()
+            wait_for(lambda: duration_in_status(client) >= moment_s - 1.0, 'the leg in the status')
+            told_s, end_ns = duration_in_status(client), time.time_ns()
             leg.node.process.kill()
             leg.node.wait()
             moment_s = time.monotonic() - marked
@@ -49,7 +49,7 @@ def killed(driven, moment_s: float, folder: Path) -> SimpleNamespace:
     return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
 
 
-def told(client) -> float:
+def duration_in_status(client) -> float:
     """Return how long the leg is by the newest status, in s as it is played."""
     return float(client.status['duration_s']) / SPEED
 
@@ -67,10 +67,10 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
         newest_ns = max(time_ns for time_ns, _ in rows)
         kept_s = (max(stamp for _, stamp in rows) - start_ns) * 1e-9 / SPEED
         marks, files = marked_legs(bag), len(bag.files)
-    code, result, said = replayed(journal, *NUMBERS)
+    code, result, stderr = replayed(journal, *NUMBERS)
     return SimpleNamespace(
         moment_s=moment_s, told_s=told_s, files=files, marks=marks, start_ns=start_ns, code=code,
-        text=said, results=[result] if result else [], legs=result['legs'] if result else [],
+        text=stderr, results=[result] if result else [], legs=result['legs'] if result else [],
         # wall time that is lost, and by how much the journal is shorter than the status said
         lost_s=(end_ns - newest_ns) * 1e-9, short_s=told_s - kept_s)
 
@@ -83,11 +83,11 @@ def stamps_of(journal: Path, topic: str) -> list[int]:
 
 def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
     """Return exit code, calibration.json and what ``odocal replay JOURNAL more`` says."""
-    out, said = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+    out, stderr = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(stderr):
         code = main(['replay', str(journal), *more, '--json', '--force', '--output',
                      str(journal.parent.parent / 'replayed')])
-    return code, json.loads(out.getvalue()) if out.getvalue() else None, said.getvalue()
+    return code, json.loads(out.getvalue()) if out.getvalue() else None, stderr.getvalue()
 
 
 def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
@@ -129,13 +129,13 @@ def same_result(live: dict, offline: dict, *more: str) -> None:
 
 def check_replay(live: dict, journal: Path) -> str:
     """Assert that a journal replays to the result of the node, to the last bit; return its log."""
-    code, offline, said = replayed(journal)
-    assert code == 0, said
+    code, offline, stderr = replayed(journal)
+    assert code == 0, stderr
     same_result(live, offline, 'config')
     for here, there in zip(live['legs'], offline['legs'], strict=True):
         assert here | {'bag': journal.name} == there
     assert live['inputs'][0]['topics'] == offline['inputs'][0]['topics']
-    return said
+    return stderr
 
 
 def wrong(left: SimpleNamespace) -> list[float]:

@@ -262,8 +262,8 @@ def leg_of(folder: Path, options: dict, topics=lambda drive: {}, settings=lambda
     drive = simulate(SimOptions(**options))
     driven = messages_of(drive, **topics(drive))
     start_s = (drive.leg().start_ns - driven[1][0].stamp_ns) * 1e-9
-    wanted = {'output.directory': folder, 'leg.preroll': 20.0} | settings(drive)
-    with playing_to(driven, wanted, **more) as leg:
+    overrides = {'output.directory': folder, 'leg.preroll': 20.0} | settings(drive)
+    with playing_to(driven, overrides, **more) as leg:
         leg.record(start_s - rest_s, start_s, start_s + leg_s)
         seen = leg.stopped(start_s + leg_s, 3.0)
     assert seen.stop.success, seen.stop.message

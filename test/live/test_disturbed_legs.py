@@ -43,24 +43,25 @@ def gap(tmp_path_factory):
         leg.play(*GAP, speed=1.0)
         silent = client.until(reasons='LEG_CUT')
         leg.play(GAP[1], 130)
-        told = wait_for(lambda: '3.02 s' in client.status['hint'] and client.status,
-                        'the whole gap')
+        status_with_gap = wait_for(lambda: '3.02 s' in client.status['hint'] and client.status,
+                                   'the whole gap')
         leg.play(130, 190)
         seen = leg.stopped(190)
-        return SimpleNamespace(truth=drive.truth, silent=silent, told=told,
+        return SimpleNamespace(truth=drive.truth, silent=silent, status_with_gap=status_with_gap,
                                undone=client.call('undo_leg'), **vars(seen))
 
 
 def test_a_gap_is_said_at_once_and_what_was_good_enough_stays_so(gap):
-    assert gap.told['level'] == b'\1'
-    assert 'no IMU data for 3.02 s at t = ' in gap.told['hint']
-    assert 'the leg is cut there' in gap.told['hint']
-    assert 'cancel_leg' not in gap.told['hint']
+    assert gap.status_with_gap['level'] == b'\1'
+    assert 'no IMU data for 3.02 s at t = ' in gap.status_with_gap['hint']
+    assert 'the leg is cut there' in gap.status_with_gap['hint']
+    assert 'cancel_leg' not in gap.status_with_gap['hint']
     warned, = [line for line in gap.node.lines if 'WARN' in line and 'LEG_CUT' in line]
     assert '3.02 s' not in gap.silent['hint']     # it is silent still; 0.95 s on an idle machine
-    for told in (gap.silent, gap.told):
-        assert told['scale_ok'] == 'yes'
-        value, sigma = (float(told[f'estimate_scale_factor{end}']) for end in ('', '_sigma'))
+    for status_with_gap in (gap.silent, gap.status_with_gap):
+        assert status_with_gap['scale_ok'] == 'yes'
+        value, sigma = (float(status_with_gap[f'estimate_scale_factor{end}'])
+                        for end in ('', '_sigma'))
         assert within({'value': value, 'sigma': sigma}, gap.truth.scale)
 
 
@@ -109,8 +110,8 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(play
         assert times == sorted(times)           # nothing of the time after the jump
         code, result, _ = replayed(folder)
         assert (code, result) == (2, None)      # it was cancelled: not without being asked
-        code, result, said = replayed(folder, option, mark)
-        assert code == 0, said
+        code, result, stderr = replayed(folder, option, mark)
+        assert code == 0, stderr
         one, = result['legs']
         assert abs(one['start_ns'] - mark_ns) < 1000
         # 54 s of 55 were heard before the jump, and a journal may lack the last second

@@ -29,8 +29,8 @@ BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
 @pytest.fixture
 def filing():
     """Return worker, filing, the warnings of both, and a function that saves and answers."""
-    worker, said = Worker(), []
-    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
+    worker, messages = Worker(), []
+    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=messages.append),
                     lambda: None, '/calibrator')
 
     def run(calibration, folder, by_operator=True):
@@ -38,7 +38,7 @@ def filing():
         future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, by_operator)
         wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
         return future.result()
-    yield SimpleNamespace(worker=worker, filing=filing, said=said, save=run)
+    yield SimpleNamespace(worker=worker, filing=filing, messages=messages, save=run)
     worker.close()
 
 
@@ -58,7 +58,7 @@ def test_what_cannot_be_saved_is_a_warning_until_it_is(filing, tmp_path):
     (tmp_path / 'file').touch()
     success, text = filing.save(GOOD, tmp_path / 'file')
     assert not success
-    assert filing.said == [text]
+    assert filing.messages == [text]
     assert filing.filing.trouble in text
     assert 'output.directory' in filing.filing.trouble
     assert filing.save(GOOD, tmp_path)[0]
@@ -92,7 +92,7 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_p
     assert not filing.filing.close(0.05)
     gate.set()
     wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
-    assert done + filing.said == ['a leg']
+    assert done + filing.messages == ['a leg']
 
 
 def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path):

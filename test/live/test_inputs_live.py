@@ -56,9 +56,9 @@ def test_an_input_that_never_spoke_is_an_error_in_the_diagnostics(play_to, sent)
     leg = play_to(sent)
     health = leg.client.health
 
-    def imu(**wanted):
+    def imu(**fields):
         return wait_for(lambda: (found := health.get('calibrator: imu', {'level': None}))
-                        and found['level'] == wanted['level'] and found, f'IMU with {wanted}')
+                        and found['level'] == fields['level'] and found, f'IMU with {fields}')
     # as diagnostic_updater has it; STALE is not ours to say
     assert imu(level=b'\x02')['message'].startswith('no IMU on /imu/data')
     with leg.playing(0, 60, 10):

@@ -56,10 +56,10 @@ def session(tmp_path_factory):
 
 
 def test_a_journal_replays_to_the_last_bit_without_options(session):
-    said = check_replay(session.live, session.journal)
+    stderr = check_replay(session.live, session.journal)
     assert session.live['inputs'][0]['topics'] == {
         'imu': '/front/imu', 'odometer': '/odometer', 'fix': '/gps/fix'}
-    assert 'is a journal: settings and topics come from' in said
+    assert 'is a journal: settings and topics come from' in stderr
 
 
 def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):
@@ -80,14 +80,14 @@ def test_options_win_over_the_settings_of_a_journal(session):
 
 def test_dropped_legs_are_not_replayed(session):
     for journal in (session.cancelled, session.undone):
-        code, result, said = replayed(journal)
+        code, result, stderr = replayed(journal)
         assert (code, result) == (2, None)
-        assert 'cancelled or undone' in said
-        assert '--leg :' in said
+        assert 'cancelled or undone' in stderr
+        assert '--leg :' in stderr
     assert replayed(session.undone, '--leg', ':')[1] is not None
-    code, result, said = replayed(session.undone, str(session.journal))
-    assert code == 0, said
-    assert 'cancelled or undone' in said
+    code, result, stderr = replayed(session.undone, str(session.journal))
+    assert code == 0, stderr
+    assert 'cancelled or undone' in stderr
     same_result(session.live, result, 'config')
 
 

@@ -39,14 +39,14 @@ def journal(root, name=NAME, limit=10**9):
 def driven(root):
     """Write a leg of six seconds and a mark added later; return its journal."""
     one = journal(root)
-    said = []
+    logged = []
     for k in range(CHUNKS):
         one.put([chunk(k)])
-        said.append(one.trouble)
+        logged.append(one.trouble)
     one.finish()
-    said.append(one.trouble)
+    logged.append(one.trouble)
     one.add([chunk(CHUNKS)])
-    return one, [*said, one.trouble]
+    return one, [*logged, one.trouble]
 
 
 def chunk(k):
@@ -74,27 +74,28 @@ def joined_soon(monkeypatch):
 
 
 def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):
-    wanted, without_mark = times_of(*range(CHUNKS + 1)), 0
+    expected_times, without_mark = times_of(*range(CHUNKS + 1)), 0
     for step in count(1):
         with monkeypatch.context() as patch:
             disk = Refusing(step, errno.EIO).put_in(patch)
-            one, said = driven(tmp_path / str(step))
+            one, logged = driven(tmp_path / str(step))
         if len(disk.steps) < step:
             break
         name = disk.steps[step - 1]
         found = times(one.folder)
-        without_mark += found == wanted[:-2]    # of the added mark, until it is tried again
-        assert found in (wanted, wanted[:-2]), (step, name)
+        # the added mark is missing until it is tried again
+        without_mark += found == expected_times[:-2]
+        assert found in (expected_times, expected_times[:-2]), (step, name)
         one.retry()
-        assert sorted(set(times(one.folder))) == wanted, (step, name)
-        assert one.trouble == '' or found == wanted, (step, name)
+        assert sorted(set(times(one.folder))) == expected_times, (step, name)
+        assert one.trouble == '' or found == expected_times, (step, name)
         folders = os.listdir(tmp_path / str(step))
         assert len(folders) == 1, folders
         assert not [n for n in os.listdir(one.folder) if n.endswith('.part')], name
-        if any(said):
-            assert os.strerror(errno.EIO) in ''.join(said)
+        if any(logged):
+            assert os.strerror(errno.EIO) in ''.join(logged)
         else:
-            assert found == wanted
+            assert found == expected_times
     assert step > 60
     assert 0 < without_mark < 20
 
@@ -105,10 +106,10 @@ def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, cod
         root = tmp_path / str(step)
         with monkeypatch.context() as patch:
             disk = Refusing(step, code, for_ever=True).put_in(patch)
-            _, said = driven(root)
+            _, logged = driven(root)
         if len(disk.steps) < step:
             break
-        assert os.strerror(code) in said[-1] or os.strerror(code) in said[-2]
+        assert os.strerror(code) in logged[-1] or os.strerror(code) in logged[-2]
         folders = list(root.iterdir())
         if not folders:
             continue        # nothing of it could be written, and nothing is left

@@ -37,9 +37,9 @@ def test_settings_come_back_to_the_last_bit(tmp_path):
     (tmp_path / JOURNAL).write_text(journal_text(config, 3, 5, topics), encoding='utf-8')
     found = journal_notes(tmp_path)
     assert found.topics == topics
-    wanted = flat(config)
-    assert set(found.settings) == set(wanted)
-    for name, value in wanted.items():
+    expected = flat(config)
+    assert set(found.settings) == set(expected)
+    for name, value in expected.items():
         got = found.settings[name]
         assert type(got) is type(value), name
         assert got == value or math.isnan(got) and math.isnan(value), name

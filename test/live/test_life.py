@@ -94,11 +94,13 @@ EACH = ('import sys\nfrom odocal_ros.live.node import main\nfor override in sys.
 
 def test_a_bad_override_is_one_line_and_exit_1():
     overrides = [override for override, _ in BAD_OVERRIDES]
-    said = subprocess.run([sys.executable, '-c', EACH, *overrides], capture_output=True, text=True,
-                          timeout=PATIENCE, env=os.environ | {'PYTHONPATH': str(ROOT)}, check=True)
-    lines = said.stderr.splitlines()
-    assert lines[1::2] == ['1'] * len(overrides), said.stderr
-    assert not said.stdout
+    finished = subprocess.run([sys.executable, '-c', EACH, *overrides], capture_output=True,
+                              text=True,
+                              timeout=PATIENCE, env=os.environ | {'PYTHONPATH': str(ROOT)},
+                              check=True)
+    lines = finished.stderr.splitlines()
+    assert lines[1::2] == ['1'] * len(overrides), finished.stderr
+    assert not finished.stdout
     for (override, words), line in zip(BAD_OVERRIDES, lines[::2], strict=True):
         assert line.startswith('calibrator: '), override
         assert words in line, override

@@ -136,8 +136,8 @@ def test_odocal_replay_finds_the_mark_and_agrees_in_every_digit(session, written
         names[slot]: kind for slot, kind in session.types.items()} | {
             status: 'diagnostic_msgs/msg/DiagnosticArray'})
     options = [x for name, value in session.settings.items() for x in ('--set', f'{name}={value}')]
-    code, offline, said = replayed(bag, *options, *NUMBERS)
-    assert code == 0, said
+    code, offline, stderr = replayed(bag, *options, *NUMBERS)
+    assert code == 0, stderr
     same_result(written, offline)
     (live,), (replay,) = written['legs'], offline['legs']
     assert live | {'bag': 'leg'} == replay

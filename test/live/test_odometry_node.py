@@ -107,10 +107,10 @@ def test_its_path_is_that_of_replay_as_calibrated(received, drive, replayed):
     rows = np.searchsorted(drive.imu.stamp_ns, [stamp_of(m) for m in received.odometry])
     path = np.array([[getattr(m.pose.pose.position, axis) for axis in 'xyz']
                      for m in received.odometry])
-    wanted = replayed.result.track_n[rows - replayed.row] - replayed.result.track_n[0]
+    expected_track = replayed.result.track_n[rows - replayed.row] - replayed.result.track_n[0]
     assert len(path) > 1000
-    assert np.linalg.norm(wanted[-1]) > 200.0
-    assert np.abs(path - wanted).max() < 1e-9
+    assert np.linalg.norm(expected_track[-1]) > 200.0
+    assert np.abs(path - expected_track).max() < 1e-9
 
 
 def test_messages_are_what_robot_localization_takes(received):
@@ -149,15 +149,15 @@ def test_the_launch_file_starts_it_with_both_files():
 
 
 def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed):
-    wanted = allowed('/odometry')
+    expected_track = allowed('/odometry')
     settings = {'odometer.left': 'topic', 'odometer.right': 'topic', 'use_sim_time': True,
                 'odometer.type': 'std_msgs/msg/Int64'}
     with playing_to(({}, []), settings, module='odometry', words=(
             '--params-file', str(ROOT / 'config' / 'odometry.yaml'), '--params-file',
             str(replayed.path))) as leg:
         for kind in ('publish', 'subscribe'):
-            wait_for(lambda kind=kind: seen(leg.client, kind, 'odometry') == wanted[kind],
-                     f'{kind}: {wanted[kind]}')
+            wait_for(lambda kind=kind: seen(leg.client, kind, 'odometry') == expected_track[kind],
+                     f'{kind}: {expected_track[kind]}')
         assert leg.node.end() == 0
 
 

@@ -74,10 +74,11 @@ def leg(tmp_path_factory):
         for loop in loops:
             loop.kill()
         client = leg.client
-        said = wait_for(lambda: int(client.status['messages_lost']) and client.status, 'a count')
+        loss_status = wait_for(lambda: int(client.status['messages_lost']) and client.status,
+                               'a count')
         seen = leg.stopped(115)
         wait_for(lambda: 'messages of /odometer lost. Likely' in leg.node.text, 'a word')
-        return SimpleNamespace(sent=leg.sent, said=said, **vars(seen))
+        return SimpleNamespace(sent=leg.sent, loss_status=loss_status, **vars(seen))
 
 
 def test_what_the_queue_lost_is_counted_and_said(leg):
@@ -89,7 +90,7 @@ def test_what_the_queue_lost_is_counted_and_said(leg):
     assert int(lost) == sent - kept
     # while the node is stopped the socket overflows as well: of other topics
     assert int(leg.status['messages_lost']) >= int(lost)
-    assert 'messages of /odometer lost' in leg.said['message']
+    assert 'messages of /odometer lost' in leg.loss_status['message']
 
 
 def test_the_result_is_that_of_a_replay(leg):
@@ -105,12 +106,13 @@ def flood(client):
     wait_for(call.done, 'the names of the parameters')
     names, futures = call.result().result.names, []
     for k in range(REQUESTS):
-        wanted = [Parameter(name, value=value).to_parameter_msg()
-                  for name in names for value in (k, 'x' * 50, float('nan'), [True] * 100)]
+        new_parameters = [Parameter(name, value=value).to_parameter_msg()
+                          for name in names for value in (k, 'x' * 50, float('nan'), [True] * 100)]
         futures += [
-            client.send(SetParameters, 'set_parameters', SetParameters.Request(parameters=wanted)),
+            client.send(SetParameters, 'set_parameters',
+                        SetParameters.Request(parameters=new_parameters)),
             client.send(SetParametersAtomically, 'set_parameters_atomically',
-                        SetParametersAtomically.Request(parameters=wanted))]
+                        SetParametersAtomically.Request(parameters=new_parameters))]
     return futures
 
 
@@ -235,8 +237,8 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
     for name in LEGS:     # each with a folder and a journal of its own
         own = tmp_path / 'odocal' / name / 'calibrator'
         assert len(list((own / 'journal').iterdir())) == 1
-        told = json.loads((own / 'latest' / 'calibration.json').read_text())
-        assert (told['vehicle'], told['inputs'][0]['node']) == (name, f'/{name}/calibrator')
+        content = json.loads((own / 'latest' / 'calibration.json').read_text())
+        assert (content['vehicle'], content['inputs'][0]['node']) == (name, f'/{name}/calibrator')
     text = answers['slip'].message
     assert 'WHEEL_SLIP' in text
     size, at = text.split('travel of the vehicle: ')[1].split(' s (')[0].split(' m at t = ')

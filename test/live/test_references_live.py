@@ -70,19 +70,19 @@ def tf(tmp_path_factory):
         return SimpleNamespace(drive=drive, **vars(leg.stopped(start_s + 150, 3.0)))
 
 
-@pytest.mark.parametrize(('leg', 'says'), [
+@pytest.mark.parametrize(('leg', 'words'), [
     ('posed', 'fix: geometry_msgs/msg/PoseStamped on /slam/pose, best effort'),
     ('tf', 'fix: tf2_msgs/msg/TFMessage on /tf, best effort')])
-def test_a_leg_by_positions_finds_the_truth_and_replays_to_the_last_bit(leg, says, request):
+def test_a_leg_by_positions_finds_the_truth_and_replays_to_the_last_bit(leg, words, request):
     seen = request.getfixturevalue(leg)
-    assert says in seen.node.text
+    assert words in seen.node.text
     assert 'Traceback' not in seen.node.text
     assert seen.stop.success, seen.stop.message
     scale = seen.live['result']['scale_factor']
     assert within(scale, seen.drive.truth.scale)
     assert 4 * scale['sigma'] < 0.004
     assert 'LOCAL_FRAME' in {r['code'] for r in seen.live['legs'][0]['reasons']}
-    assert seen.live['inputs'][0]['topics']['fix'] == says.split(' on ')[1].split(',')[0]
+    assert seen.live['inputs'][0]['topics']['fix'] == words.split(' on ')[1].split(',')[0]
     assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # it names its topics
 
 
@@ -154,9 +154,9 @@ def test_marks_are_refused_answered_and_asked_for(marked):
     assert not marked.turning.success
     assert 'stand on the point and call again' in marked.turning.message
     assert all(answer.success for answer in marked.answers)
-    said = [answer.message for answer in marked.answers]
-    assert said[0] == 'mark 1 of leg 1: point 1, x 0 m, y 0 m'
-    assert said[7] == 'mark 8 of leg 1: point 8, x 0 m, y -4 m'
+    answer_texts = [answer.message for answer in marked.answers]
+    assert answer_texts[0] == 'mark 1 of leg 1: point 1, x 0 m, y 0 m'
+    assert answer_texts[7] == 'mark 8 of leg 1: point 8, x 0 m, y -4 m'
     assert len(marked.status['marks'].split(',')) == len(TIMES)
     assert 'call ~/mark at rest on each point, ' in marked.hints[0]
     assert 'call ~/mark' not in marked.hints[1]

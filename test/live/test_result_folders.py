@@ -176,7 +176,7 @@ def test_a_node_killed_at_its_files_leaves_whole_ones(driven, tmp_path, stage, m
     left = killed_at_files(driven, stage, moment_s, tmp_path, **QUICK)
     assert left.half == []
     assert left.latest
-    code, result, said = left.journal
-    assert code in (0, 1), said
+    code, result, stderr = left.journal
+    assert code in (0, 1), stderr
     assert result is not None
     assert wrong(left) == []

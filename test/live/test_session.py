@@ -180,11 +180,11 @@ def test_legs_beyond_those_kept_stay_in_the_result(town, monkeypatch):
     assert done.folded == 1
     assert done.carried.legs == 1
     assert done.calibration.legs == tuple(every[1:])
-    for name, wanted in combine(every, config).estimates.items():
-        if wanted.value is not None:
+    for name, expected in combine(every, config).estimates.items():
+        if expected.value is not None:
             found = done.calibration.estimates[name]
-            assert abs(found.value - wanted.value) < 0.05 * wanted.sigma, name
-            assert found.sigma == pytest.approx(wanted.sigma, rel=0.05), name
+            assert abs(found.value - expected.value) < 0.05 * expected.sigma, name
+            assert found.sigma == pytest.approx(expected.sigma, rel=0.05), name
     for one in every:      # two-point results have no information to carry over
         del one.methods['smoother']
     done = computed()

@@ -72,11 +72,11 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
         if topic != '/diagnostics':      # the display asks for it: latched
             assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
     assert shown.status_keys() <= set(status)
-    told = keys_on_the_page()
-    assert len(told) > 40
-    assert told <= set(status)
+    documented = keys_on_the_page()
+    assert len(documented) > 40
+    assert documented <= set(status)
     # and no key is kept from the reader; a sigma stands with its value
-    rest = set(status) - told - {'level', 'name', 'message'}
+    rest = set(status) - documented - {'level', 'name', 'message'}
     assert not {key for key in rest if '_sigma' not in key}
     array = client.arrays[-1].status[0]
     assert shown.status_names() == {(array.hardware_id, array.name)}
@@ -128,8 +128,8 @@ def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, c
         # found by their publishers
         client.node.create_publisher(kind, name, 10)
     client.until(state='waiting')
-    wanted = allowed('/calibrator')
-    for kind, names in wanted.items():
+    expected = allowed('/calibrator')
+    for kind, names in expected.items():
         wait_for(lambda kind=kind, names=names: seen(client, kind) == names,
                  f'{kind}: {sorted(names)}')
 

@@ -130,10 +130,10 @@ def test_what_anybody_publishes_does_not_reach_the_terminal():
         listener._executor.spin_once(timeout_sec=1.0)
         status.publish(DiagnosticArray(status=[DiagnosticStatus(
             values=[KeyValue(key='state', value=odd)] * 5000)]))
-        _, values, said = next(found)
-        assert len(said) < 3000
-        assert (said + values['state']).isprintable()
-        assert 'waiting' in said
+        _, values, hint_text = next(found)
+        assert len(hint_text) < 3000
+        assert (hint_text + values['state']).isprintable()
+        assert 'waiting' in hint_text
 
 
 def test_a_status_comes_with_its_own_hint(connect):
@@ -160,15 +160,15 @@ SECOND = 10**9
 
 
 def test_each_thing_is_said_once_or_seldom():
-    said = []
-    console = Console(SimpleNamespace(info=lambda x: said.append(('info', x)),
-                                      warning=lambda x: said.append(('warning', x))))
+    hint_text = []
+    console = Console(SimpleNamespace(info=lambda x: hint_text.append(('info', x)),
+                                      warning=lambda x: hint_text.append(('warning', x))))
     session = Session()
 
     def report(second, **known):
-        before = len(said)
+        before = len(hint_text)
         console.report(SessionView(session, Config(), **known), second * SECOND)
-        return said[before:]
+        return hint_text[before:]
 
     nothing = {'missing': ['no IMU on /imu/data']}
     times = [s for s in range(-20000, 280) if report(s, **nothing)]
@@ -204,14 +204,14 @@ def test_each_thing_is_said_once_or_seldom():
 
 def test_a_problem_that_later_messages_contradict_is_withdrawn_once():
     """An IMU whose messages are late looks silent; then all of them arrive."""
-    said, session = [], Session()
-    console = Console(SimpleNamespace(info=said.append, warning=said.append))
+    hint_text, session = [], Session()
+    console = Console(SimpleNamespace(info=hint_text.append, warning=hint_text.append))
     cut = (Reason(Code.LEG_CUT, 'the IMU is missing for 1.30 s'),)
     session.start(1, Config())
     for second, faults in enumerate([cut, (), (), cut, ()]):
         console.report(SessionView(session, Config(), faults=faults), second * SECOND)
-    assert [x for x in said if 'LEG_CUT' in x and 'no longer' not in x] == [said[0]]
-    assert [x for x in said if 'no longer' in x] == [
+    assert [x for x in hint_text if 'LEG_CUT' in x and 'no longer' not in x] == [hint_text[0]]
+    assert [x for x in hint_text if 'no longer' in x] == [
         'leg 1: LEG_CUT no longer applies: later messages contradict it']
     # the end of a leg withdraws nothing
     session.cancel()
@@ -219,13 +219,14 @@ def test_a_problem_that_later_messages_contradict_is_withdrawn_once():
     console.report(SessionView(session, Config(), faults=cut), 9 * SECOND)
     session.cancel()
     console.report(SessionView(session, Config()), 10 * SECOND)
-    assert sum('no longer' in x for x in said) == 1
+    assert sum('no longer' in x for x in hint_text) == 1
 
 
 def test_ready_without_known_rates_has_no_empty_brackets():
-    said = []
-    Console(SimpleNamespace(info=said.append)).report(SessionView(Session(), Config()), SECOND)
-    assert said == ['ready: stand still for 10 s, then call ~/start_leg']
+    hint_text = []
+    Console(SimpleNamespace(info=hint_text.append)).report(SessionView(Session(), Config()),
+                                                           SECOND)
+    assert hint_text == ['ready: stand still for 10 s, then call ~/start_leg']
 
 
 def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connect):

@@ -67,7 +67,7 @@ def test_arrival_times_replace_stamps_where_set(slot, group, message):
         assert row[:2] == (9, 9)
 
 
-@pytest.mark.parametrize(('slot', 'message', 'wanted'), [
+@pytest.mark.parametrize(('slot', 'message', 'expected'), [
     ('heading', make.imu(5, q=(0, 0, 1, 0), covariance=np.full(9, 0.1)),
      {'q_ni': [0, 0, 1, 0], 'yaw_variance': 0.1}),
     ('fix', make.fix(10**9, 180.0, -90.0, 12.5, sigma=2.0, status=-1, known=3),
@@ -77,9 +77,9 @@ def test_arrival_times_replace_stamps_where_set(slot, group, message):
      {'velocity_n': [1, 2, 3], 'variance_n': [0, 0, 0]}),
     ('fix_velocity', make.twist_covariance(3, 1, 2, 3, (0.5, -1.0, math.nan)),
      {'variance_n': [0.5, 0, 0]})])      # unknown is 0
-def test_other_sensors(slot, message, wanted):
+def test_other_sensors(slot, message, expected):
     block = read(slot, [message])[0][slot]
-    assert {name: getattr(block, name)[0].tolist() for name in wanted} == wanted
+    assert {name: getattr(block, name)[0].tolist() for name in expected} == expected
 
 
 def span(name):
@@ -222,7 +222,7 @@ JOINTS, COUNT = 'sensor_msgs/msg/JointState', 'std_msgs/msg/Int64'
 LEFT, RIGHT, LIST, FIELD = (f'odometer__{name}' for name in ('left', 'right', 'wheels', 'field'))
 
 
-@pytest.mark.parametrize(('slot', 'msgtype', 'settings_', 'error', 'says'), [
+@pytest.mark.parametrize(('slot', 'msgtype', 'settings_', 'error', 'words'), [
     ('imu', 'std_msgs/msg/String', {}, BadData, 'give a topic of type sensor_msgs/msg/Imu'),
     ('fix', 'sensor_msgs/msg/Imu', {}, BadData, 'sensor_msgs/msg/NavSatFix'),
     ('fix_velocity', 'geometry_msgs/msg/Twist', {}, BadData, 'TwistWithCovarianceStamped'),
@@ -236,8 +236,8 @@ LEFT, RIGHT, LIST, FIELD = (f'odometer__{name}' for name in ('left', 'right', 'w
     ('odometer', JOINTS, {LIST: tuple('abcdefghi')}, BadConfig, '8 at most'),
     ('odometer', JOINTS, {LIST: ('a', 'a')}, BadConfig, "'a', 'a'; required: different wheels"),
     ('odometer', JOINTS, {LEFT: 'a', RIGHT: 'a'}, BadConfig, 'required: different wheels')])
-def test_refused(slot, msgtype, settings_, error, says):
-    with pytest.raises(error, match=says):
+def test_refused(slot, msgtype, settings_, error, words):
+    with pytest.raises(error, match=words):
         make_reader(slot, msgtype, config(**settings_))
 
 

@@ -31,11 +31,11 @@ pytestmark = pytest.mark.core
 TENTH_MM = 1e-4
 
 
-def read(frames, pieces=(), wanted='', little_endian=True):
+def read(frames, pieces=(), frame_id='', little_endian=True):
     """Return the rows by slot of messages of some frames, read in pieces; and the reader."""
     raws = [make.cdr(make.imu(10**9 + k, frame=frame), little_endian)
             for k, frame in enumerate(frames)]
-    reader = make_reader('imu', IMU, with_settings(Config(), {'imu.frame_id': wanted}))
+    reader = make_reader('imu', IMU, with_settings(Config(), {'imu.frame_id': frame_id}))
     found = {}
     edges = [0, *pieces, len(raws)]
     for a, b in zip(edges, edges[1:], strict=False):
@@ -68,7 +68,7 @@ def test_a_damaged_frame_decides_nothing_and_one_that_is_set_is_used_at_once():
     found, reader = read(['x\x07', *['front'] * 9])
     assert reader.frame == 'front'
     assert found.keys() == {'imu'}
-    found, _ = read(['front', 'rear'] * 5, wanted='rear')
+    found, _ = read(['front', 'rear'] * 5, frame_id='rear')
     assert found['imu'].received_ns.tolist() == [1, 3, 5, 7, 9]
     assert len(found['imu_other'].stamp_ns) == 5
 
@@ -93,31 +93,33 @@ def made():
     return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=3)
 
 
-def said(made, topics, path, **more):
+def found_reasons(made, topics, path, **more):
     write_bag(path, topics)
     result = calibrate_bag(path, config=with_settings(settings(made), more))
     return result, {r.code: r for r in result.reasons}
 
 
 def test_two_imus_on_one_topic_reject_the_leg_and_the_setting_chooses_one(made, tmp_path):
-    result, reasons = said(made, mixed(made, 2), tmp_path / 'bag')
+    result, reasons = found_reasons(made, mixed(made, 2), tmp_path / 'bag')
     assert result.verdict.value == 'rejected'
     used, other = map(int, re.findall(r"(\d+) (?:messages )?of 'imu_[ab]'",
                                       reasons[Code.SEVERAL_IMUS].text))
     assert used == pytest.approx(other, abs=5)
     assert "imu.frame_id: 'imu_b'" in reasons[Code.SEVERAL_IMUS].do
 
-    chosen, reasons = said(made, mixed(made, 2), tmp_path / 'a', **{'imu.frame_id': 'imu_a'})
+    chosen, reasons = found_reasons(made, mixed(made, 2), tmp_path / 'a',
+                                    **{'imu.frame_id': 'imu_a'})
     assert Code.SEVERAL_IMUS not in reasons
     name = 'yaw_mounting_angle'
     assert abs(chosen.values[name] - made.truth.yaw) < 4 * chosen.sigmas[name]
 
-    _, reasons = said(made, mixed(made, 2), tmp_path / 'none', **{'imu.frame_id': 'imu_c'})
+    _, reasons = found_reasons(made, mixed(made, 2), tmp_path / 'none',
+                               **{'imu.frame_id': 'imu_c'})
     assert "'imu_c' of imu.frame_id" in reasons[Code.NO_IMU].text
 
 
 def test_a_few_messages_of_another_frame_are_dropped(made, tmp_path):
-    _, reasons = said(made, mixed(made, 500), tmp_path / 'bag')
+    _, reasons = found_reasons(made, mixed(made, 500), tmp_path / 'bag')
     assert Code.SEVERAL_IMUS not in reasons
     assert "have another frame_id than 'imu_a'" in reasons[Code.BAD_ROWS_DROPPED].text
 

@@ -166,10 +166,10 @@ def test_a_correction_that_is_sent_again_gives_no_position():
 
 
 def test_a_recording_that_starts_again_is_read_on():
-    once = read(reader())
+    at_once = read(reader())
     for block in (13, 10**9):
         twice = read(reader(), MOVING + MOVING, block=block)
-        for a, b in zip(once, twice, strict=True):
+        for a, b in zip(at_once, twice, strict=True):
             assert np.hstack([a, a]).tobytes() == b.tobytes()
 
 

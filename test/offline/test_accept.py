@@ -109,17 +109,17 @@ def test_the_exit_code_and_one_line_of_json_tell_the_decision(bag, low, high, op
             'output.formats=[legs]', '--output', str(tmp_path / 'out'), '--accept',
             f'scale_ratio={true + low!r}:{true + high!r}', *options]
     assert main([*argv, '--quiet']) == code
-    told = json.loads(capsys.readouterr().out)       # this line alone
-    assert (told['vehicle'], told['decision']) == ('bus 7', decision)
-    held = told['values']['scale_ratio']
+    answer = json.loads(capsys.readouterr().out)       # this line alone
+    assert (answer['vehicle'], answer['decision']) == ('bus 7', decision)
+    held = answer['values']['scale_ratio']
     assert abs(held['value'] - true) < 4 * held['sigma']
     stored = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
     assert stored['acceptance']['decision'] == decision
     if options:      # its heading is not known: a caution
-        assert 'YAW_NOT_SEPARABLE' in told['why']
+        assert 'YAW_NOT_SEPARABLE' in answer['why']
         assert main([*argv, '--force']) == code
         lines = capsys.readouterr().out.splitlines()
-        assert json.loads(lines[-1]) == told
+        assert json.loads(lines[-1]) == answer
         assert decision in lines
 
 

@@ -89,7 +89,7 @@ def test_the_package_run_as_a_module_is_the_command():
 def test_a_command_of_a_package_that_is_not_installed_names_what_to_install(
         argv, monkeypatch, capsys):
     assert set(cli.COMMANDS) - set(OWN) == {'paper', 'patent'}
-    monkeypatch.setattr('importlib.metadata.entry_points', lambda **asked: [])
+    monkeypatch.setattr('importlib.metadata.entry_points', lambda **calls: [])
     assert cli.main(argv) == 2
     out, err = capsys.readouterr()
     assert out == ''
@@ -145,11 +145,11 @@ def ros2(*argv):
 
 
 def test_all_words_reach_the_command(monkeypatch):
-    asked = []
-    monkeypatch.setattr(cli, 'main', lambda argv: asked.append(argv) or 5)
+    calls = []
+    monkeypatch.setattr(cli, 'main', lambda argv: calls.append(argv) or 5)
     words = ['replay', 'a bag', '--imu-topic', '/imu', '--set', 'a=b', '--help']
     assert ros2('odocal', *words) == 5
-    assert asked == [words]
+    assert calls == [words]
 
 
 def test_help_lists_the_commands_and_errors_are_those_of_odocal(capsys):

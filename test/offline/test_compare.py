@@ -190,9 +190,9 @@ def test_every_compared_name_has_a_cause():
 def broken(path, value):
     """Return a content with one place changed or, by ..., taken out."""
     one = copy.deepcopy(content())
-    *way, last = path
+    *keys, last = path
     place = one
-    for key in way:
+    for key in keys:
         place = place[key]
     if value is ...:
         del place[last]

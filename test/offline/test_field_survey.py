@@ -196,17 +196,17 @@ def test_the_search_is_bounded():
                    temperature=0.0, speed_kmh=0.0, delta=0, east=np.zeros(300),
                    motors=[motor(rpm=0.0, angle=0.0)] * 100)
     raw = bytes(types().serialize_cdr(message, kind.__msgtype__))
-    asked = []
+    requests = []
 
     def deserialize(raw):
-        asked.append(raw)
+        requests.append(raw)
         return message
     n = 100_000
     fields = Fields(n)
     for k in range(10):
         fields.rows([raw] * (n // 10), range(k * n // 10, (k + 1) * n // 10), deserialize)
     assert len(fields.paths) == 8 + 16 + 2 * 16
-    assert len(asked) < 400_000 / len(fields.paths) + 1
+    assert len(requests) < 400_000 / len(fields.paths) + 1
     image = Fields(5)
     image.rows([bytes(2**20)] * 5, range(5), deserialize)
     assert image.trouble == 'no numeric field'

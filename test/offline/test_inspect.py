@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def look(tmp_path, capsys):
+def inspect_drive(tmp_path, capsys):
     """Return a function that writes rows to a bag and inspects it."""
     def written(rows, *options, types=None):
         path = ros_bags.write(tmp_path / f'bag_{len(list(tmp_path.iterdir()))}', rows, types=types)
@@ -35,8 +35,8 @@ def look(tmp_path, capsys):
 
 
 @pytest.mark.core
-def test_a_good_drive_lacks_only_a_heading(look):
-    seen, text = look(drive())
+def test_a_good_drive_lacks_only_a_heading(inspect_drive):
+    seen, text = inspect_drive(drive())
     assert codes(seen) == {'YAW_NOT_SEPARABLE'}
     assert np.ravel(seen['standstills']) == pytest.approx([0, 12, 140, 150], abs=1.2)
     leg, = seen['legs']
@@ -53,10 +53,10 @@ def test_a_good_drive_lacks_only_a_heading(look):
 @pytest.mark.parametrize('rpy', [
     (math.pi, 0, 0), (math.pi / 2, 0, -math.pi / 2), (0, math.pi / 2, 0), (0, 0, math.pi / 2),
     (0, 0, math.pi), (math.pi, 0, math.pi / 2)])
-def test_axes_are_told(look, capsys, rpy):
+def test_axes_are_told(inspect_drive, capsys, rpy):
     C_bi = matrix_from_rpy(rpy)
     small = matrix_from_rpy((0.0, 0.05, 0.08))    # what calibration is for must not confuse it
-    seen, _ = look(drive(C_ib=C_bi.T @ small.T))
+    seen, _ = inspect_drive(drive(C_ib=C_bi.T @ small.T))
     assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
     assert seen['mounting']['needed']
     assert seen['mounting']['off'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
@@ -68,20 +68,21 @@ def test_axes_are_told(look, capsys, rpy):
     assert not seen['mounting']['needed']
 
 
-def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(look):
+def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(inspect_drive):
     upright, over = drive(), drive(C_ib=np.diag([1.0, -1.0, -1.0]))
     half = len(upright) // 2
-    seen, text = look(upright[:half] + over[half:])
+    seen, text = inspect_drive(upright[:half] + over[half:])
     assert 'IMU_UNITS' not in codes(seen)
     assert 'gravity turns by 180 deg' in text
 
 
 @pytest.mark.parametrize('rpy', [(0, 0, 0), (math.pi, 0, 0)])
-def test_a_counter_that_counts_down_does_not_turn_the_imu(look, rpy):
+def test_a_counter_that_counts_down_does_not_turn_the_imu(inspect_drive, rpy):
     """Nobody drives a whole recording backwards; the IMU would be set 180 deg off."""
     C_bi = matrix_from_rpy(rpy)
-    seen, _ = look([(name, ns, make.whole(-message.data) if name == '/odometer' else message)
-                    for name, ns, message in drive(C_ib=C_bi.T)])
+    seen, _ = inspect_drive([(name, ns, make.whole(-message.data) if name == '/odometer'
+                              else message)
+                             for name, ns, message in drive(C_ib=C_bi.T)])
     assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
     assert 'odometer.reversed=true' in seen['command']
 
@@ -112,21 +113,22 @@ def test_axes_far_from_quarter_turns_are_stated_as_measured():
     w_b = np.stack([0 * w, 0 * w, w], -1)
     m = mounting(t, w_b @ C_bi, f_b @ C_bi, Travel(t, np.cumsum(v) / RATE, 0.0), 1.0)
     assert m.rpy is None
-    said = remedy(m)
-    assert 'The IMU axes are 45 deg from quarter turns (limit 30 deg)' in said
-    assert json.loads(re.search(r'\[.*\]', said)[0]) == pytest.approx([0, 0, 0.785], abs=0.02)
+    remedy_text = remedy(m)
+    assert 'The IMU axes are 45 deg from quarter turns (limit 30 deg)' in remedy_text
+    assert json.loads(re.search(r'\[.*\]', remedy_text)[0]) == pytest.approx([0, 0, 0.785],
+                                                                             abs=0.02)
 
 
-@pytest.mark.parametrize(('wrong', 'code', 'said'), [
+@pytest.mark.parametrize(('wrong', 'code', 'remedy_text'), [
     ({'accel': 1 / 9.80665}, 'IMU_UNITS', 'specific force is not in m/s^2 but in g'),
     ({'accel': 1 / 9.80665}, 'IMU_UNITS', '--set imu.accel_scale=9.80665'),
     ({'gyro': 180 / math.pi}, 'IMU_UNITS', f'--set imu.gyro_scale={math.pi / 180!r}'),
     ({'gyro': 2.0}, 'IMU_UNITS', 'IMU_UNITS: turns by the gyro are 2.'),
     ({'gyro': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN'), ({'accel': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN')])
-def test_units_and_signs(look, capsys, wrong, code, said):
-    seen, text = look(drive(**wrong))
+def test_units_and_signs(inspect_drive, capsys, wrong, code, remedy_text):
+    seen, text = inspect_drive(drive(**wrong))
     assert code in codes(seen)
-    assert said in ' '.join(text.split())
+    assert remedy_text in ' '.join(text.split())
     assert 'imu.mounting_rpy' not in seen['command'], 'no rotation corrects a sign'
     if wrong == {'gyro': 2.0}:
         assert seen['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
@@ -138,45 +140,47 @@ def test_units_and_signs(look, capsys, wrong, code, said):
     ('/imu/data', 'NO_IMU', 'sensor_msgs/msg/Imu'),
     ('/odometer', 'NO_ODOMETER', 'std_msgs/msg/Int64'),
     ('/fix', 'NO_FIX', 'sensor_msgs/msg/NavSatFix')])
-def test_a_topic_whose_messages_cannot_be_read_is_missing(look, name, code, kind):
-    seen, text = look([(topic, ns, b'' if topic == name else m) for topic, ns, m in drive(60)],
-                      types={name: kind})
+def test_a_topic_whose_messages_cannot_be_read_is_missing(inspect_drive, name, code, kind):
+    seen, text = inspect_drive([(topic, ns, b'' if topic == name else m) for topic, ns,
+                                m in drive(60)],
+                               types={name: kind})
     assert code in codes(seen)
     assert f'{code}: {name}: no message can be used: ' in ' '.join(text.split())
     assert 'under open sky' not in text
 
 
-def test_counts_read_as_floats_are_no_motion(look, recwarn):
-    look([(topic, ns, b'\0\1\0\0' + struct.pack('<q', m.data) if topic == '/odometer' else m)
-          for topic, ns, m in drive(60)], types={'/odometer': 'std_msgs/msg/Float64'})
+def test_counts_read_as_floats_are_no_motion(inspect_drive, recwarn):
+    inspect_drive([(topic, ns, b'\0\1\0\0' + struct.pack('<q', m.data) if topic == '/odometer'
+                    else m)
+                   for topic, ns, m in drive(60)], types={'/odometer': 'std_msgs/msg/Float64'})
     assert not [one for one in recwarn if one.category is RuntimeWarning]
 
 
-def test_topics_that_cannot_be_combined(look):
+def test_topics_that_cannot_be_combined(inspect_drive):
     rows = drive(60)
     for name, _, message in rows:
         if name == '/imu/data':
             message.header.stamp = make.header(0).stamp
-    seen, text = look(rows)
+    seen, text = inspect_drive(rows)
     assert topic(seen, '/imu/data')['timing']['header_to_bag'] is None
     assert 'NO_IMU: none of the ' in text
     assert 'CLOCKS_DIFFER' not in codes(seen)
-    seen, text = look(drive(60, lag=8 * 3600.0))
+    seen, text = inspect_drive(drive(60, lag=8 * 3600.0))
     assert codes(seen) == {'CLOCKS_DIFFER'}
     assert 'have no time in common' in text
-    seen, _ = look(drive(lag=-3.0))
+    seen, _ = inspect_drive(drive(lag=-3.0))
     assert 'CLOCKS_DIFFER' in codes(seen)
     assert topic(seen, '/fix')['timing']['header_to_bag'] == pytest.approx(3.0, abs=1e-3)
 
 
-def test_odd_stamps_and_gaps(look):
+def test_odd_stamps_and_gaps(inspect_drive):
     rows = drive()
     imu = [i for i, row in enumerate(rows) if row[0] == '/imu/data']
     rows[imu[100]][2].header.stamp = make.header(0).stamp
     rows[imu[200]][2].header.stamp.sec -= 5         # backward, once
     rows[imu[301]] = (*rows[imu[301]][:2], rows[imu[300]][2])    # a row sent twice
-    gone = set(imu[2000:2600])                      # 12 s of IMU
-    seen, text = look([row for i, row in enumerate(rows) if i not in gone])
+    missing_rows = set(imu[2000:2600])                      # 12 s of IMU
+    seen, text = inspect_drive([row for i, row in enumerate(rows) if i not in missing_rows])
     timing = topic(seen, '/imu/data')['timing']
     assert [timing[k] for k in ('zero_stamps', 'backward_steps', 'repeated_stamps')] == [1, 1, 1]
     longest = max(timing['gaps'], key=lambda gap: gap['length'])
@@ -187,70 +191,71 @@ def test_odd_stamps_and_gaps(look):
     assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(seen)
 
 
-def test_fixes_that_are_none(look):
-    seen, text = look(drive(status=-1))
+def test_fixes_that_are_none(inspect_drive):
+    seen, text = inspect_drive(drive(status=-1))
     assert 'FIXES_UNUSABLE' in codes(seen)
     assert topic(seen, '/fix')['fix']['status'] == {'-1': 750}
     assert '750 no fix' in text
-    seen, _ = look(drive(known=0))
+    seen, _ = inspect_drive(drive(known=0))
     assert topic(seen, '/fix')['fix']['sigma'] is None
     assert 'COVARIANCE_UNKNOWN' in codes(seen)
-    seen, _ = look([row for row in drive() if row[0] != '/fix'])
+    seen, _ = inspect_drive([row for row in drive() if row[0] != '/fix'])
     assert [(f['text'], f['remedy']) for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
         ('no topic for the fixes', 'Record it, or name it with --fix-topic.')]
     assert len(seen['standstills']) == 2            # seen without fixes too
 
 
 @pytest.mark.filterwarnings('error')
-def test_fixes_off_the_earth(look):
+def test_fixes_off_the_earth(inspect_drive):
     rows = drive()
     fixes = (message for name, _, message in rows if name == '/fix')
     for latitude in (1e300, -1e308, np.inf, 91.0):
         next(fixes).latitude = latitude
-    assert topic(look(rows)[0], '/fix')['fix']['positions'] == 750 - 4
+    assert topic(inspect_drive(rows)[0], '/fix')['fix']['positions'] == 750 - 4
 
 
-@pytest.mark.parametrize(('q', 'variance', 'says'), [
+@pytest.mark.parametrize(('q', 'variance', 'words'), [
     ((0, 0, 0.6, 0.8), 1e-6, ''), ((0, 0, 0.6, 0.8), 0.01, 'uncertainty of 5.7 deg'),
     ((0, 0, 0.6, 0.8), 0.0, 'has no covariance'),
     ((0, 0, 0, 1), 0.0, 'publishes no orientation')])       # a default
-def test_orientation_as_heading(look, q, variance, says):
+def test_orientation_as_heading(inspect_drive, q, variance, words):
     def oriented(ns, m):
         w, f = ((v.x, v.y, v.z) for v in (m.angular_velocity, m.linear_acceleration))
         return make.imu(ns, w=w, f=f, q=q, covariance=np.append(np.zeros(8), variance))
-    seen, _ = look([(name, ns, oriented(ns, m) if name == '/imu/data' else m)
-                    for name, ns, m in drive()])
+    seen, _ = inspect_drive([(name, ns, oriented(ns, m) if name == '/imu/data' else m)
+                             for name, ns, m in drive()])
     texts = [f['text'] for f in seen['findings'] if f['code'] == 'YAW_NOT_SEPARABLE']
-    assert bool(texts) == bool(says)
-    assert says in ''.join(texts)
+    assert bool(texts) == bool(words)
+    assert words in ''.join(texts)
 
 
-def test_loops_short_drives_and_odd_values(look):
-    seen, _ = look(drive(loop=True))
+def test_loops_short_drives_and_odd_values(inspect_drive):
+    seen, _ = inspect_drive(drive(loop=True))
     assert 'CHORD_TOO_SHORT' in codes(seen)
     assert seen['legs'][0]['chord'] < 5
     rows = drive(30)
     at = next(i for i, row in enumerate(rows) if i > 5 and row[0] == '/imu/data')
     rows[at] = ('/imu/data', rows[at][1], make.imu(rows[at][1], w=(math.nan, 0, 0)))
-    seen, _ = look(rows)
+    seen, _ = inspect_drive(rows)
     assert 'LEG_TOO_SHORT' not in codes(seen) or seen['legs'][0]['distance'] < 100
     assert topic(seen, '/imu/data')['imu']['not_finite'] == 1
-    assert 'no valid value' in look([('/speed', T0 + i, make.real(math.nan)) for i in range(5)])[1]
-    assert look([row for row in drive(1) if row[1] < T0 + 3])[0]['messages'] == 3
+    assert 'no valid value' in inspect_drive([('/speed', T0 + i, make.real(math.nan))
+                                              for i in range(5)])[1]
+    assert inspect_drive([row for row in drive(1) if row[1] < T0 + 3])[0]['messages'] == 3
 
 
-def test_two_wheels_on_two_topics_are_seen(look):
-    seen, _ = look([row for name, ns, m in drive() for row in (
+def test_two_wheels_on_two_topics_are_seen(inspect_drive):
+    seen, _ = inspect_drive([row for name, ns, m in drive() for row in (
         [('/ticks/left', ns, m), ('/ticks/right', ns, m)] if name == '/odometer'
         else [(name, ns, m)])])
     assert seen['mapping']['odometer_right'] == '/ticks/right'
     assert seen['command'].endswith('--set odometer.left=topic --set odometer.right=topic')
 
 
-def test_topic_named_by_the_user(look, capsys):
+def test_topic_named_by_the_user(inspect_drive, capsys):
     rows = drive(20) + [('/speed', T0 + i * 10**8, make.twist_stamped(T0 + i * 10**8, 1.0))
                         for i in range(200)]
-    seen, _ = look(sorted(rows, key=lambda row: row[1]))
+    seen, _ = inspect_drive(sorted(rows, key=lambda row: row[1]))
     path = seen['path']
     assert seen['mapping']['odometer'] == '/odometer'     # a counter before a speed
     assert '2 topics can be the odometer' in seen['open']
@@ -258,23 +263,23 @@ def test_topic_named_by_the_user(look, capsys):
     seen, _ = inspect(path, capsys, '--odometer-topic', 'speed')
     assert seen['mapping']['odometer'] == '/speed'
     assert '--odometer-topic /speed' in seen['command']
-    for option, topic_, says in (('--fix-topic', '/gps', ' --fix-topic /gps: no such topic'),
-                                 ('--imu-topic', '/fix', 'which cannot be used as IMU')):
+    for option, topic_, words in (('--fix-topic', '/gps', ' --fix-topic /gps: no such topic'),
+                                  ('--imu-topic', '/fix', 'which cannot be used as IMU')):
         assert main(['inspect', path, option, topic_]) == 2
-        assert says in capsys.readouterr().err
+        assert words in capsys.readouterr().err
 
 
-def test_a_drive_is_screened_once(look, capsys, monkeypatch):
+def test_a_drive_is_screened_once(inspect_drive, capsys, monkeypatch):
     """The legs are found in what was screened for the rest: with nothing to screen, the same."""
-    wanted = look(drive())
-    assert wanted[0]['legs']
+    expected = inspect_drive(drive())
+    assert expected[0]['legs']
     monkeypatch.setattr(legs, 'screen', None)
-    assert inspect(wanted[0]['path'], capsys) == wanted
+    assert inspect(expected[0]['path'], capsys) == expected
 
 
-def test_a_counter_that_stops_gives_no_scale_and_no_axes(look):
-    seen, text = look([(topic, ns, make.whole(700) if topic == '/odometer' and ns > T0 + 60e9
-                        else raw) for topic, ns, raw in drive()])
+def test_a_counter_that_stops_gives_no_scale_and_no_axes(inspect_drive):
+    seen, text = inspect_drive([(topic, ns, make.whole(700) if topic == '/odometer'
+                                 and ns > T0 + 60e9 else raw) for topic, ns, raw in drive()])
     assert 'ODOMETER_STILL' in codes(seen)
     assert seen['drive'] is None
     assert 'scale factor' not in text

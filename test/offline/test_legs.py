@@ -161,8 +161,8 @@ def test_marks_win_over_standstills_and_asked_legs_over_marks(out_and_back):
     recorder, bag = recorded(out_and_back)
     mark = (bag.start_ns + 100 * S, bag.start_ns + 200 * S)
     assert find_legs(recorder, bag, [], [mark], Config()) == [mark]
-    asked = parse_leg('120:150')
-    assert find_legs(recorder, bag, [asked], [mark], Config()) == [
+    requested = parse_leg('120:150')
+    assert find_legs(recorder, bag, [requested], [mark], Config()) == [
         (bag.start_ns + 120 * S, bag.start_ns + 150 * S)]
     still_open = find_legs(recorder, bag, [], [(mark[0], 0)], Config())
     assert still_open[0][1] == min(out_and_back.imu.stamp_ns[-1],

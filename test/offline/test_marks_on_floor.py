@@ -27,7 +27,7 @@ def robot(folder, **options):
     return made, write_bag(folder / 'bag', topics)
 
 
-def asked(made, **more):
+def marks_config(made, **more):
     return {'odometer.nominal_scale': made.options.nominal_scale, 'odometer.left': 'topic',
             'odometer.right': 'topic', 'reference.points': [float(x) for x in POINTS],
             'reference.marks': list(TIMES)} | more
@@ -39,7 +39,7 @@ TOPICS = {'odometer': '/odometer/left', 'odometer_right': '/odometer/right'}
 def test_marks_are_sufficient_without_an_imu(tmp_path):
     """Four steps between marks are compared with the wheels at first: fewer fit any path."""
     made, bag = robot(tmp_path, imu=False)
-    found = calibrate_bag(bag, TOPICS, asked(made, **{'verdict.max_scale_sigma': 0.005}))
+    found = calibrate_bag(bag, TOPICS, marks_config(made, **{'verdict.max_scale_sigma': 0.005}))
     assert found.verdict.value == 'accepted', found.reasons
     for name, true in (('scale_factor_left', made.truth.wheel_scales[0]),
                        ('scale_factor_right', made.truth.wheel_scales[1]),
@@ -66,7 +66,7 @@ def test_without_noise_wheels_and_width_are_those_of_the_closed_form(tmp_path):
     turns = [(b, b + 4.5) for b in TIMES[1:5]]
     width = sum(K_r * counted(right, *turn) - K_l * counted(left, *turn)
                 for turn in turns) / (2 * np.pi)
-    found = calibrate_bag(bag, TOPICS, asked(made, **{'imu.grade': 'navigation'})).values
+    found = calibrate_bag(bag, TOPICS, marks_config(made, **{'imu.grade': 'navigation'})).values
     # a tenth of the sigma, to which the other unknowns have priors; the ratio has no such
     for name, true in (('scale_factor_left', K_l), ('scale_factor_right', K_r),
                        ('track_width', width)):
@@ -82,7 +82,7 @@ def test_marks_may_be_given_in_any_order_with_their_points(tmp_path):
     made, bag = robot(tmp_path)
     pairs = np.reshape(POINTS, (-1, 2))[np.arange(len(TIMES)) % (len(POINTS) // 2)]
     order = [4, 0, 8, 2, 6, 1, 5, 3, 7]
-    plain, shuffled = (calibrate_bag(bag, TOPICS, asked(made, **more)) for more in (
+    plain, shuffled = (calibrate_bag(bag, TOPICS, marks_config(made, **more)) for more in (
         {}, {'reference.marks': [TIMES[k] for k in order],
              'reference.points': pairs[order].ravel().astype(float).tolist()}))
     assert shuffled.values == plain.values
@@ -90,7 +90,7 @@ def test_marks_may_be_given_in_any_order_with_their_points(tmp_path):
 
 def test_the_axes_of_the_points_are_free(tmp_path):
     made, bag = robot(tmp_path)
-    plain, turned = (calibrate_bag(bag, TOPICS, asked(made, **{'reference.points': list(
+    plain, turned = (calibrate_bag(bag, TOPICS, marks_config(made, **{'reference.points': list(
         map(float, points))})) for points in (POINTS, TURNED))
     for name, value in plain.values.items():
         if name in ('scale_factor', 'track_width', 'yaw_mounting_angle'):
@@ -107,8 +107,8 @@ def test_replay_takes_marks(tmp_path, capsys):
                      points, *marks, '--odometer-topic', '/odometer/left',
                      '--odometer-right-topic', '/odometer/right', '--output',
                      str(tmp_path / 'out')]) == 0
-    said = capsys.readouterr()
-    assert 'position reference' not in said.err
+    printed = capsys.readouterr()
+    assert 'position reference' not in printed.err
     written = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
     codes = {r['code'] for r in written['legs'][0]['reasons']}
     assert 'LOCAL_FRAME' in codes
@@ -127,14 +127,14 @@ def test_replay_takes_marks(tmp_path, capsys):
 def test_marks_that_cannot_be_are_refused(change, message, tmp_path):
     made, bag = robot(tmp_path, imu_rate=20.0)
     with pytest.raises(BadUsage, match=message):
-        calibrate_bag(bag, TOPICS, asked(made) | change)
+        calibrate_bag(bag, TOPICS, marks_config(made) | change)
 
 
 def test_marks_and_a_reference_topic_exclude_each_other(tmp_path):
     made = simulate(SimOptions(scenario='square', imu_rate=20.0))
     bag = write_bag(tmp_path / 'bag', drive_topics(made))
     with pytest.raises(BadUsage, match='--fix-topic /slam/pose: marks'):
-        calibrate_bag(bag, TOPICS | {'fix': '/slam/pose'}, asked(made))
+        calibrate_bag(bag, TOPICS | {'fix': '/slam/pose'}, marks_config(made))
 
 
 def test_a_status_of_another_program_has_no_marks(tmp_path, monkeypatch):
@@ -142,4 +142,4 @@ def test_a_status_of_another_program_has_no_marks(tmp_path, monkeypatch):
     stored = [{'marks': '12:x,,7', 'leg_event': 'stopped'}, {}]
     monkeypatch.setattr('odocal_ros.library.read_bag.last_statuses', lambda bag: stored)
     with pytest.raises(BadUsage, match=r'no fix \(a topic of'):
-        calibrate_bag(bag, TOPICS, asked(made) | {'reference.marks': []})
+        calibrate_bag(bag, TOPICS, marks_config(made) | {'reference.marks': []})

@@ -35,7 +35,7 @@ def bag(tmp_path_factory):
     return ros_bags.write(tmp_path_factory.mktemp('odd') / 'bag', ros_bags.drive())
 
 
-def said(capsys, *argv):
+def output(capsys, *argv):
     """Run a command: 0, 1 or 2, and no more than one line on stderr from exit 2; return both."""
     code = main([*map(str, argv)])
     errors = capsys.readouterr().err
@@ -49,35 +49,35 @@ def test_metadata_of_any_type(tmp_path, bag, capsys):
     path = shutil.copytree(bag, tmp_path / 'bag')
     whole = yaml.safe_load((bag / 'metadata.yaml').read_text())
 
-    def places(node, way=()):
-        yield way
+    def places(node, keys=()):
+        yield keys
         items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(
             node, list) else ()
         for key, inner in items:
-            yield from places(inner, (*way, key))
+            yield from places(inner, (*keys, key))
     rng = random.Random(1)
-    for way in list(places(whole))[1:]:
+    for keys in list(places(whole))[1:]:
         for odd in rng.sample(ODD, 3):
             tree = yaml.safe_load((bag / 'metadata.yaml').read_text())
             node = tree
-            for key in way[:-1]:
+            for key in keys[:-1]:
                 node = node[key]
-            node[way[-1]] = odd
+            node[keys[-1]] = odd
             (path / 'metadata.yaml').write_text(yaml.safe_dump(tree))
-            said(capsys, 'inspect', path)
+            output(capsys, 'inspect', path)
 
 
 def test_metadata_and_journals_of_any_text(tmp_path, bag, capsys):
     path = shutil.copytree(bag, tmp_path / 'bag')
     for text in TEXTS:
         (path / 'metadata.yaml').write_text(f'rosbag2_bagfile_information: {text}')
-        said(capsys, 'inspect', path)
+        output(capsys, 'inspect', path)
     shutil.copy(bag / 'metadata.yaml', path)
     journal = HEAD + 'leg.min_distance: 50.0\nodocal_journal:\n  ros__parameters:'
     for text in TEXTS:
         for form in (' {}', '\n    topics.imu: {}'):
             (path / 'journal.yaml').write_text((journal + form).format(text))
-            said(capsys, 'replay', path, *QUICK, '--output', tmp_path / 'out', '--force')
+            output(capsys, 'replay', path, *QUICK, '--output', tmp_path / 'out', '--force')
 
 
 def test_settings_of_any_text(tmp_path, bag, capsys):
@@ -93,7 +93,7 @@ def test_settings_of_any_text(tmp_path, bag, capsys):
             config.write_text(form.format(text))
             with suppress(OdocalError):
                 read_config_file(config)
-    said(capsys, 'inspect', bag, '--config', config)
+    output(capsys, 'inspect', bag, '--config', config)
 
 
 def test_legs_of_any_text():
@@ -107,5 +107,5 @@ def test_legs_of_any_text():
 
 
 def test_a_sentence_ends_somewhere(capsys):
-    _, errors = said(capsys, 'inspect', 'x' * 50_000)
+    _, errors = output(capsys, 'inspect', 'x' * 50_000)
     assert len(errors) < 2200

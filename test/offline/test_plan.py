@@ -28,7 +28,7 @@ STRAIGHT = ['--distance', '1000', '--speed', '15', '--imu-grade', 'industrial']
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
-def asked(capsys, *argv):
+def plan_of(capsys, *argv):
     assert main(['plan', *argv, '--json']) == 0
     out, err = capsys.readouterr()
     assert err == ''
@@ -44,8 +44,8 @@ def refused(capsys, *argv):
 
 
 def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
-    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
-                   *TWO_POINT)
+    answer = plan_of(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
+                     *TWO_POINT)
     assert answer['drive']['distance'] == pytest.approx(11_200, rel=1e-9)
     assert answer['drive']['standing'] == pytest.approx([300.0, 30.0])
     estimates = answer['methods']['two_point']['estimates']
@@ -62,8 +62,8 @@ def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
 
 
 def test_changes_are_computed_not_told(capsys):
-    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
-                   *TWO_POINT)
+    answer = plan_of(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
+                     *TWO_POINT)
     before = answer['methods']['two_point']['estimates']
     scale, yaw = (before[n]['sigma'] for n in ('scale_factor', 'yaw_mounting_angle'))
     changes = {c['text']: c for c in answer['changes']}
@@ -83,7 +83,7 @@ def test_changes_are_computed_not_told(capsys):
 
 
 def test_a_gyrocompass_heading_averages_down_over_legs(capsys):
-    answer = asked(capsys, *PAPER[1:], *TWO_POINT)
+    answer = plan_of(capsys, *PAPER[1:], *TWO_POINT)
     assert answer['sigmas']['heading_source'] == 'gyrocompass'
     assert list(answer['methods']) == ['two_point']
     yaw = answer['methods']['two_point']['estimates']['yaw_mounting_angle']['sigma']
@@ -104,8 +104,8 @@ def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
     assert after == sorted(after)
     assert 'RTK' in lines[begin + 1]
     # a better IMU has straighter axes too
-    wanted = 'heading' if 'method=two_point' in drive else 'stop and go'
-    assert any(wanted in line for line in lines[end + 1:end + 3])
+    expected_word = 'heading' if 'method=two_point' in drive else 'stop and go'
+    assert any(expected_word in line for line in lines[end + 1:end + 3])
 
 
 def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
@@ -114,7 +114,7 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     out = capsys.readouterr().out
     assert 'CHORD_TOO_SHORT' in out
     assert '(result: all by smoother' in out
-    answer = asked(capsys, *drive, *TWO_POINT)
+    answer = plan_of(capsys, *drive, *TWO_POINT)
     assert answer['methods']['two_point']['estimates']['scale_factor']['sigma'] is None
     assert answer['verdict'] == 'rejected'
     assert answer['estimates']['scale_factor'] == {'sigma': None, 'method': None}
@@ -131,8 +131,8 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
 
 
 def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys):
-    answer = asked(capsys, *STRAIGHT, '--fix-noise', 'white', '--pulse', '0.02', '--sway', '0.1',
-                   '--slip-walk', '0.005')
+    answer = plan_of(capsys, *STRAIGHT, '--fix-noise', 'white', '--pulse', '0.02', '--sway', '0.1',
+                     '--slip-walk', '0.005')
     assert list(answer['methods']) == ['smoother', 'two_point']
     assert answer['verdict'] == 'accepted'      # the two-point method alone gives no yaw
     drive = planned_drives.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
@@ -166,10 +166,10 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     out = capsys.readouterr().out
     # an IMU whose axes are off by half a degree: without turns no pitch against the plane of them
     assert '(result: scale by smoother, yaw and pitch unknown' in out
-    said = ' '.join(out.split())
-    assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in said
-    assert 'Drive with stops, starts and turns' in said
-    answer = asked(capsys, '--gpx', path, '--imu-grade', 'consumer')
+    plain_text = ' '.join(out.split())
+    assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in plain_text
+    assert 'Drive with stops, starts and turns' in plain_text
+    answer = plan_of(capsys, '--gpx', path, '--imu-grade', 'consumer')
     assert answer['estimates']['yaw_mounting_angle'] == {'sigma': None, 'method': None}
     changes = {c['text']: c['yaw_mounting_angle'] for c in answer['changes']}
     assert changes['5 min more, stop and go with turns'] < math.radians(0.05)
@@ -228,8 +228,9 @@ def gpx(path, times=True, rest=30.0, count=200, corner=math.pi / 2):
     """Write a track: rest, east at 10 m/s with a point a second, left as far, rest."""
     t = np.concatenate([[0.0, rest / 2], rest + np.arange(2 * count + 1), [2 * count + 2 * rest]])
     t = t[np.diff(t, prepend=-1.0) > 0]
-    way = np.clip(t - rest, 0, 2 * count) * 10.0
-    first, second = np.minimum(way, count * 10.0), np.maximum(way - count * 10.0, 0.0)
+    path_length = np.clip(t - rest, 0, 2 * count) * 10.0
+    first, second = np.minimum(path_length, count * 10.0), np.maximum(path_length - count * 10.0,
+                                                                      0.0)
     east, north = first + second * math.cos(corner), second * math.sin(corner)
     return gpx_of(path, t, east, north, times)
 
@@ -278,14 +279,14 @@ def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
     assert drive.yaw[0] == pytest.approx(0.0, abs=1e-3)            # east
     assert drive.yaw[-1] == pytest.approx(math.pi / 2, abs=1e-3)   # north
     assert math.degrees(drive.latitude) == pytest.approx(48.0)
-    answer = asked(capsys, '--gpx', str(tmp_path / 'a.gpx'), *TWO_POINT)
+    answer = plan_of(capsys, '--gpx', str(tmp_path / 'a.gpx'), *TWO_POINT)
     assert answer['drive']['chord'] == pytest.approx(math.hypot(2000, 2000), rel=5e-3)
 
 
 def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
     path = str(gpx(tmp_path / 'a.gpx', times=False))
     assert 'no times; give --speed' in refused(capsys, '--gpx', path)
-    answer = asked(capsys, '--gpx', path, '--speed', '20', *TWO_POINT)
+    answer = plan_of(capsys, '--gpx', path, '--speed', '20', *TWO_POINT)
     assert answer['drive']['duration'] == pytest.approx(200.0, rel=0.01)
 
 
@@ -316,21 +317,21 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     assert main(['simulate', '--scenario', 'straight', '--out', str(bag), '--duration', '200',
                  '--imu-rate', '50', '--fix-sigma', '0.5', '--fix-rate', '2', '--quiet']) == 0
     capsys.readouterr()
-    answer = asked(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
+    answer = plan_of(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
     assert answer['sigmas']['fix_sigma'] == pytest.approx(0.5, rel=1e-6)
     assert answer['sigmas']['fix_rate'] == pytest.approx(2.0, rel=1e-6)
     motion = motion_of(resolved(SimOptions(scenario='straight', duration=200.0)))
     assert answer['drive']['distance'] == pytest.approx(motion.distance, rel=0.01)
     assert answer['drive']['standing'] == pytest.approx([60.0, 60.0], abs=1.5)
     assert answer['sigmas']['pulse'] == pytest.approx(0.0213, rel=0.02)     # its own counts
-    own = asked(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
+    own = plan_of(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
     assert own['sigmas']['pulse'] == 0.1
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
     (bag / 'journal.yaml').write_text(
         '/**/calibrator:\n  ros__parameters:\n    imu.grade: tactical\n'
         'odocal_journal:\n  ros__parameters:\n    leg_id: 1\n')
-    assert asked(capsys, '--bag', str(bag))['sigmas']['imu_grade'] == 'tactical'
-    given = asked(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
+    assert plan_of(capsys, '--bag', str(bag))['sigmas']['imu_grade'] == 'tactical'
+    given = plan_of(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
     assert given['sigmas']['imu_grade'] == 'industrial'
 
 

@@ -51,9 +51,9 @@ def test_inspect_shows_the_reference_and_suggests_the_command(bag, capsys):
 def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys):
     assert cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
                      '--output', str(tmp_path / 'out'), *NUMBERS]) == 0
-    said = capsys.readouterr()
-    assert said.err.count('no NavSatFix with messages in the bag; position reference: /pose '
-                          '(geometry_msgs/msg/PoseStamped); another one: --fix-topic') == 1
+    printed = capsys.readouterr()
+    assert printed.err.count('no NavSatFix with messages in the bag; position reference: /pose '
+                             '(geometry_msgs/msg/PoseStamped); another one: --fix-topic') == 1
     written = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
     assert written['inputs'][0]['topics']['fix'] == '/pose'
     scale = written['result']['scale_factor']

@@ -66,22 +66,22 @@ def test_the_two_point_method_waits_for_nothing_it_does_not_use(bag, tmp_path):
 
 
 def test_the_verdict_does_not_wait_for_the_report(drive, bag, tmp_path, monkeypatch, capsys):
-    said = []
+    warnings = []
     given = files.report_or_why
     monkeypatch.setattr(files, 'report_or_why',
-                        lambda *args: said.append(capsys.readouterr().out) or given(*args))
+                        lambda *args: warnings.append(capsys.readouterr().out) or given(*args))
     assert replay(bag, *known(drive), '--method', 'two_point', '--output', tmp_path / 'out',
                   '--set', 'output.formats=[params, report]') == 0
-    assert 'scale factor' in said[0]
-    assert 'written' not in said[0]
+    assert 'scale factor' in warnings[0]
+    assert 'written' not in warnings[0]
     assert 'written: ' in capsys.readouterr().out
 
 
 def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
     command = [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(bag), '--method',
                'two_point', '--output', str(tmp_path / 'out'), *known(drive)]
-    gone, pipe = os.pipe()
-    os.close(gone)
+    read_end, pipe = os.pipe()
+    os.close(read_end)
     assert subprocess.run(command, stdout=pipe, check=False).returncode == 0
     os.close(pipe)
     assert (tmp_path / 'out' / 'report.html').exists()
@@ -167,16 +167,16 @@ def test_config_file_then_set_then_default(bag, tmp_path, capsys):
                   tmp_path / 'b', '--quiet') == 0
 
 
-@pytest.mark.parametrize(('argv', 'says'), [
+@pytest.mark.parametrize(('argv', 'words'), [
     (['--set', 'leg.min_distanse=3'], 'leg.min_distance'),
     (['--config', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--leg', '900000:900001'], 'runs from 0'),
     (['--imu-topic', '/other'], '/other'),
     (['--set', 'method=best'], 'method')])
-def test_wrong_requests_are_one_line_and_exit_2(argv, says, bag, tmp_path, capsys):
+def test_wrong_requests_are_one_line_and_exit_2(argv, words, bag, tmp_path, capsys):
     assert replay(bag, '--output', tmp_path / 'out', *argv) == 2
     err = capsys.readouterr().err
-    assert says in err
+    assert words in err
     assert err.count('\n') == 1
     assert not (tmp_path / 'out').exists()
 

@@ -48,9 +48,9 @@ def replayed(bags, names, out, *options):
 def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path, capsys):
     names = ['one', 'cut.mcap', 'nofix', 'wheels', 'foreign.txt', 'nosuch']
     assert replayed(bags, names, tmp_path / 'out') == 2
-    told = capsys.readouterr()
-    assert told.out == ''
-    line, = told.err.splitlines()
+    printed = capsys.readouterr()
+    assert printed.out == ''
+    line, = printed.err.splitlines()
     assert line.startswith('odocal: 4 of 6 bags cannot be used; nothing was calibrated: ')
     for name, why in (('nofix', 'no fix (a topic of '), ('wheels', '2 topics can be the odometer'),
                       ('foreign.txt', 'is not a bag'), ('nosuch', 'no such file')):
@@ -70,18 +70,18 @@ def test_an_empty_leg_and_a_speed_beside_counts_are_errors_of_their_bag(bags, tm
 
 def test_two_vehicles_are_rejected(bags, tmp_path, capsys):
     assert replayed(bags, ['one', 'other'], tmp_path / 'out') == 1
-    said = capsys.readouterr().out
-    assert 'LEGS_UNLIKE: the scale of leg 2 is 40.' in ' '.join(said.split())    # 0.03 / 0.0213
-    assert '  leg 1: one; leg 2: other' in said.splitlines()
+    stdout = capsys.readouterr().out
+    assert 'LEGS_UNLIKE: the scale of leg 2 is 40.' in ' '.join(stdout.split())    # 0.03 / 0.0213
+    assert '  leg 1: one; leg 2: other' in stdout.splitlines()
 
 
 def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
     assert replayed(bags, ['other', 'cut.mcap'], tmp_path / 'out', '--json') == 0
-    told = json.loads(capsys.readouterr().out)
-    codes = {r['code'] for r in told['reasons']}
+    printed = json.loads(capsys.readouterr().out)
+    codes = {r['code'] for r in printed['reasons']}
     assert 'LEGS_OVERLAP' in codes
     assert 'BAG_TRUNCATED' not in codes         # of a leg that is not used
-    assert 'BAG_TRUNCATED' in {r['code'] for r in told['legs'][1]['reasons']}
+    assert 'BAG_TRUNCATED' in {r['code'] for r in printed['legs'][1]['reasons']}
 
 
 def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys, monkeypatch):
@@ -92,17 +92,17 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
             f'/**:\n  ros__parameters:\n    verdict.min_legs: {limit}\n')
     monkeypatch.setattr('odocal_ros.library.read_bag.has_dropped_legs',
                         lambda bag: bag.name == 'dropped')
-    said = {}
+    notes = {}
     for names in ('one', 'one dropped', 'one other'):
         replayed(tmp_path, names.split(), tmp_path / f'to {names}', '--json')
-        told = capsys.readouterr()
-        said[names] = told.err
-        result = json.loads(told.out)
+        printed = capsys.readouterr()
+        notes[names] = printed.err
+        result = json.loads(printed.out)
         text, = (r['text'] for r in result['reasons'] if r['code'] == 'MORE_LEGS_NEEDED')
         assert text.endswith('required: 5' if 'other' in names else 'required: 3'), names
-    assert 'verdict.min_legs: differ between the journals' in said['one other']
-    assert 'use those of other' in said['one other']
-    assert 'not the same' not in said['one dropped'] + said['one']
+    assert 'verdict.min_legs: differ between the journals' in notes['one other']
+    assert 'use those of other' in notes['one other']
+    assert 'not the same' not in notes['one dropped'] + notes['one']
 
 
 def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
@@ -110,10 +110,10 @@ def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
         shutil.copytree(bags / name, tmp_path / name / 'bag')
     names = ['one/bag', 'other/bag']
     assert replayed(tmp_path, names, tmp_path / 'out', '--json') == 1
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     paths = [str(tmp_path / name) for name in names]
-    assert [leg['bag'] for leg in told['legs']] == paths
-    assert [entry['bag'] for entry in told['inputs']] == paths
+    assert [leg['bag'] for leg in printed['legs']] == paths
+    assert [entry['bag'] for entry in printed['inputs']] == paths
 
 
 @pytest.fixture(scope='module')
@@ -135,12 +135,13 @@ def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
     args = Args()
     args.quiet = quiet
     worse = result.Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
-    for said in (not quiet, False):      # the second time a rejected one goes: nothing is lost
+    # the second time a rejected one goes: nothing is lost
+    for is_stated in (not quiet, False):
         assert replay._report(Calibration(worse), tmp_path, args) == 1
         err = capsys.readouterr().err
         assert ('--force replaced a better calibration: the new result is rejected (NO_FIX), the '
-                'old one is accepted' in err) == said
-        assert bool(err) == said
+                'old one is accepted' in err) == is_stated
+        assert bool(err) == is_stated
     assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
 
 
@@ -148,16 +149,17 @@ def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(('where', 'said'), [
+@pytest.mark.parametrize(('where', 'last_line'), [
     ('odocal_ros.pipeline.calibrate.combine', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.folder._which', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.files.report_or_why', 'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.screen', 'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.sentence', 'the results are in {out}/\n')])
-def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where, said):
+def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where,
+                                               last_line):
     monkeypatch.setattr(where, interrupted)
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 130
-    assert capsys.readouterr().err.endswith(said.format(out=tmp_path / 'out'))
+    assert capsys.readouterr().err.endswith(last_line.format(out=tmp_path / 'out'))
     written = (tmp_path / 'out').exists()
-    assert written == ('results are' in said)
+    assert written == ('results are' in last_line)
     assert not list(tmp_path.glob('.*'))

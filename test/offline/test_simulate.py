@@ -52,12 +52,12 @@ def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
     assert truth['distance']['value'] == drive.truth.distance
     assert truth['marks'] == {'start_ns': drive.truth.start_ns, 'stop_ns': drive.truth.stop_ns}
     assert truth['options']['seed'] == 7
-    told = capsys.readouterr()
-    assert told.err == ''                   # no terminal, no bar
-    assert told.out.count('\n') == 1
+    printed = capsys.readouterr()
+    assert printed.err == ''                   # no terminal, no bar
+    assert printed.out.count('\n') == 1
     n = len(drive.imu.stamp_ns) + len(drive.odometer.stamp_ns) + len(drive.fix.stamp_ns)
-    assert f'{n} messages' in told.out
-    assert f'odocal replay {out} --config {out.parent / "calibrator.yaml"}' in told.out
+    assert f'{n} messages' in printed.out
+    assert f'odocal replay {out} --config {out.parent / "calibrator.yaml"}' in printed.out
 
 
 def test_the_settings_are_settings_of_the_node(tmp_path):
@@ -135,7 +135,7 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
     assert files(tmp_path) == ['calibrator.yaml']
 
 
-@pytest.mark.parametrize(('asked', 'told'), [
+@pytest.mark.parametrize(('wrong_options', 'printed'), [
     (['--scenario', 'moon'], '--scenario moon: required: one of paper'),
     (['--reference', 'sonar'], '--reference sonar: required: one of fix, pose'),
     (['--imu-rate', 'fast'], "invalid float value: 'fast'"),
@@ -148,12 +148,12 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
     (['--vehicle', 'real', '--odometer', 'speed'], 'has its own odometer'),
     (['--vehicle', 'clean', '--effect', 'squat'], 'omit one of them'),
     (['--vehicle', 'real', '--imu-grade', 'navigation'], 'required: one of consumer')])
-def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, asked, told):
-    assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 2
-    said = capsys.readouterr()
-    assert said.out == ''
-    assert said.err.count('\n') == 1
-    assert told in said.err
+def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, wrong_options, printed):
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', *wrong_options) == 2
+    output = capsys.readouterr()
+    assert output.out == ''
+    assert output.err.count('\n') == 1
+    assert printed in output.err
     assert files(tmp_path) == []
 
 

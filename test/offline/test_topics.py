@@ -40,11 +40,11 @@ def choose(found, overrides=None, **settings):
 
 
 def test_one_of_each():
-    wanted = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
-    assert choose(topics()) == wanted
-    assert choose(topics() | {n: TopicInfo(n, t, 5) for n, t in ODD.items()}) == wanted
+    expected = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
+    assert choose(topics()) == expected
+    assert choose(topics() | {n: TopicInfo(n, t, 5) for n, t in ODD.items()}) == expected
     # without a message a topic is none
-    assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == wanted
+    assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == expected
 
 
 @pytest.mark.parametrize(('found', 'overrides', 'settings', 'match'), [
@@ -91,7 +91,7 @@ def test_what_cannot_be_chosen_is_told_with_the_option(found, overrides, setting
         choose(found, overrides, **settings)
 
 
-@pytest.mark.parametrize(('found', 'overrides', 'settings', 'wanted'), [
+@pytest.mark.parametrize(('found', 'overrides', 'settings', 'expected'), [
     (topics(speed=TWIST), {'odometer': 'speed'}, {}, '/speed'),
     (topics(speed=TWIST), {}, {'odometer__type': TWIST}, '/speed'),
     (topics(odometry__filtered=ODOM), {}, {}, '/odometer'),
@@ -99,15 +99,15 @@ def test_what_cannot_be_chosen_is_told_with_the_option(found, overrides, setting
     # a fused odometer is better than none
     (topics(odometer=None, localization__fused=ODOM), {}, {}, '/localization/fused'),
     (SIDES, {}, TWO, '/ticks_left')])
-def test_the_odometer_is_chosen_by_name_type_and_setting(found, overrides, settings, wanted):
-    assert choose(found, overrides, **settings)['odometer'] == wanted
+def test_the_odometer_is_chosen_by_name_type_and_setting(found, overrides, settings, expected):
+    assert choose(found, overrides, **settings)['odometer'] == expected
 
 
-@pytest.mark.parametrize(('found', 'overrides', 'wanted'), [
+@pytest.mark.parametrize(('found', 'overrides', 'expected'), [
     (SIDES, {}, '/ticks_right'), (topics(odometer_right=INT), {}, '/odometer_right'),
     (topics(a=INT), {'odometer': '/odometer', 'odometer_right': 'a'}, '/a')])
-def test_the_right_wheel_has_its_own_topic(found, overrides, wanted):
-    assert choose(found, overrides, **TWO)['odometer_right'] == wanted
+def test_the_right_wheel_has_its_own_topic(found, overrides, expected):
+    assert choose(found, overrides, **TWO)['odometer_right'] == expected
 
 
 def test_fixes_are_not_needed_when_the_ends_are_surveyed():

@@ -35,7 +35,7 @@ def bag(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def replay_calls(monkeypatch):
     """Return what the replay is asked; it only writes an empty report."""
     found = []
 
@@ -78,17 +78,17 @@ def test_the_likeliest_topic_is_taken_and_the_command_gives_the_same(bag, tmp_pa
     assert content_of(tmp_path / 'odocal_bag') == first
 
 
-def test_a_person_at_a_terminal_is_asked(bag, asked, monkeypatch, capsys):
+def test_a_person_at_a_terminal_is_asked(bag, replay_calls, monkeypatch, capsys):
     at_a_terminal(monkeypatch, 'x\n3\n2\n')
     assert main(['try', bag, '--no-browser']) == 0
     out = capsys.readouterr().out
     assert '2 candidate topics for the odometer:\n  1  /odometer  std_msgs/msg/Int64, ' in out
     assert out.count('enter a number from 1 to 2') == 2
     assert 'odometer: /wheel/ticks, because you selected it' in out
-    assert asked[0].odometer_topic == '/wheel/ticks'
+    assert replay_calls[0].odometer_topic == '/wheel/ticks'
     at_a_terminal(monkeypatch, '\n')
     assert main(['try', bag, '--no-browser', '--force']) == 0
-    assert asked[1].odometer_topic == '/odometer'
+    assert replay_calls[1].odometer_topic == '/odometer'
     at_a_terminal(monkeypatch, '')      # closed
     assert main(['try', bag, '--force']) == 130
 
@@ -110,7 +110,8 @@ def test_what_the_user_asks_goes_on_to_the_replay(bag, tmp_path, capsys):
     assert 'already exists; give --force' in capsys.readouterr().err
 
 
-def test_the_report_opens_where_there_is_a_display(bag, asked, tmp_path, monkeypatch, capsys):
+def test_the_report_opens_where_there_is_a_display(bag, replay_calls, tmp_path, monkeypatch,
+                                                   capsys):
     opened = []
     monkeypatch.setattr(webbrowser, 'open', lambda url: opened.append(url) or True)
     report = tmp_path / 'odocal_bag' / 'report.html'

@@ -29,18 +29,18 @@ def drive(message):
 
 
 @pytest.fixture
-def look(tmp_path, capsys):
+def inspect_drive(tmp_path, capsys):
     """Return a function: the findings on a drive with such an odometer, its wheels, the text."""
     def inspected(message):
         path = ros_bags.write(tmp_path / 'bag', drive(message))
-        told, text = inspect(path, capsys)
-        return told, topic(told, '/wheels'), text
+        facts, text = inspect(path, capsys)
+        return facts, topic(facts, '/wheels'), text
     return inspected
 
 
-def test_unnamed_joints_are_told_apart_by_how_they_move(look):
+def test_unnamed_joints_are_told_apart_by_how_they_move(inspect_drive):
     names = ['j1', 'j2', 'j3']
-    printed, wheels, text = look(lambda ns, i, left, right: make.joints(
+    printed, wheels, text = inspect_drive(lambda ns, i, left, right: make.joints(
         ns, names, [0.4 * np.sin(i / 30), right, left]))
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
@@ -49,29 +49,29 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(look):
     assert 'j1 travels' in text
 
 
-def test_four_unnamed_joints_are_a_list_of_axles(look):
-    found, wheels, _ = look(lambda ns, i, left, right: make.joints(
+def test_four_unnamed_joints_are_a_list_of_axles(inspect_drive):
+    found, wheels, _ = inspect_drive(lambda ns, i, left, right: make.joints(
         ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left]))
     assert [v['side'] for v in wheels['values']] == ['right', 'left', 'right', 'left']
     assert found['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
 
 
-def test_the_sides_of_two_counters_are_told_and_their_replay_runs(look, tmp_path, capsys):
-    printed, wheels, _ = look(lambda ns, i, left, right: (
+def test_the_sides_of_two_counters_are_told_and_their_replay_runs(inspect_drive, tmp_path, capsys):
+    printed, wheels, _ = inspect_drive(lambda ns, i, left, right: (
         make.whole_array([int(right * 50), int(left * 50)])))
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
     assert printed['command'].split()[-4:] == options
     assert main(['replay', printed['path'], *options, '--output', str(tmp_path / 'out'), '--json',
                  '--set', 'output.formats=[params]']) < 2
-    said = capsys.readouterr().out
-    assert 'scale_factor_left' in json.loads(said)['methods']['smoother']['estimates']
-    assert 'WHEELS_SWAPPED' not in said
+    stdout = capsys.readouterr().out
+    assert 'scale_factor_left' in json.loads(stdout)['methods']['smoother']['estimates']
+    assert 'WHEELS_SWAPPED' not in stdout
 
 
-def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(look):
+def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(inspect_drive):
     names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
-    found, wheels, _ = look(lambda ns, i, left, right: make.joints(
+    found, wheels, _ = inspect_drive(lambda ns, i, left, right: make.joints(
         ns, names, velocity=[0.1, left, 0.1, right]))
     assert 'left_wheel is used as left wheel, right_wheel as right' in wheels['chosen']
     assert found['command'].endswith(

@@ -72,7 +72,7 @@ class Case:
         """Return the true compass heading of b's x axis at the mark, rad."""
         return float(heading_from_yaw(np.arctan2(*self.truth(0.0)[[1, 0], 0])))
 
-    def asked(self, **changes):
+    def with_settings_of(self, **changes):
         """Return the case with other settings (those that the screening does not use)."""
         other = copy(self)
         other.config = settings(**{'imu__grade': 'navigation'} | changes)

@@ -32,7 +32,8 @@ def far():
 
 @pytest.mark.parametrize('source', ['heading_topic', 'gyrocompass', 'fixed'])
 def test_a_standstill_far_from_the_mark_is_level_and_north_where_it_was(far, source):
-    a, _ = far.asked(alignment__heading_source=source, alignment__heading=far.heading()).align()
+    a, _ = far.with_settings_of(alignment__heading_source=source,
+                                alignment__heading=far.heading()).align()
     assert a.t < -250
     assert a.heading_source == source
     # fixes to a millimetre; a heading carried back is that of an axis pitched by 0.01 rad, and the
@@ -64,10 +65,10 @@ def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
     epochs = attitude_of(inputs, case.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     later = case.spans[case.spans[:, 0] > alignment.t]
     assert len(later) > 1
-    seen = with_observed_walk(alignment, inputs, case.spans, epochs, case.origin.earth_rate_n)
+    observed = with_observed_walk(alignment, inputs, case.spans, epochs, case.origin.earth_rate_n)
     # the heading of a course has an error, and with it the Earth rate
     walk = slope * np.sqrt(np.median(later.mean(axis=1) - alignment.t))
-    assert seen.gyro_bias_walk == pytest.approx(max(walk, alignment.gyro_bias_walk), rel=0.1)
+    assert observed.gyro_bias_walk == pytest.approx(max(walk, alignment.gyro_bias_walk), rel=0.1)
     if slope:
         assert walk > 10 * alignment.gyro_bias_walk
     unknown = with_observed_walk(replace(alignment, standstill=None), inputs, case.spans, epochs,

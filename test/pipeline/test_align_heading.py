@@ -33,7 +33,7 @@ def plain():
 @pytest.mark.parametrize('heading_deg', [43.3, 0.0, 270.0])
 def test_a_fixed_heading_is_a_compass_quantity(heading_deg):
     case = Case(replace(PLAIN, heading=np.deg2rad(heading_deg), yaw=0.0, pitch=0.0))
-    a, _ = case.asked(alignment__heading=float(np.deg2rad(heading_deg)),
+    a, _ = case.with_settings_of(alignment__heading=float(np.deg2rad(heading_deg)),
                  alignment__heading_sigma=0.003).align()
     assert wrap(yaw_of(a) - np.deg2rad(90 - heading_deg)) == pytest.approx(0, abs=PLACE)
     assert_allclose(case.miss(a), 0, atol=1e-6)
@@ -43,7 +43,7 @@ def test_a_fixed_heading_is_a_compass_quantity(heading_deg):
 @pytest.mark.parametrize('later', [8.0, 25.0, 80.0])
 def test_a_fixed_heading_at_a_moving_mark_is_carried_back_to_the_standstill(later):
     case = Case(replace(TURNING, fix_sigma=0.0), later=later)
-    a, _ = case.asked(alignment__heading=case.heading()).align()
+    a, _ = case.with_settings_of(alignment__heading=case.heading()).align()
     # a perfect gyro at 50 Hz; Earth rate left on axes that the body has turned from: 7e-5 rad/s
     # times what it is tilted by, 0.01 rad, for a minute: 4e-5 at the very most
     assert_allclose(case.miss(a), 0, atol=5e-6)
@@ -69,7 +69,7 @@ def yaw_of(alignment):
 
 @pytest.mark.parametrize(('variance', 'sigma'), [(1e-4, 0.01), (0.0, 0.0175)])
 def test_orientation_of_the_imu_with_its_sigma_or_the_setting(plain, variance, sigma):
-    case = plain.asked(alignment__heading_source='imu_orientation')
+    case = plain.with_settings_of(alignment__heading_source='imu_orientation')
     a, reasons = case.align(**orientations(plain, 2.9, variance))
     assert yaw_of(a) == pytest.approx(2.9, abs=PLACE)
     assert (a.heading_source, a.heading_shared) == ('imu_orientation', True)
@@ -87,11 +87,12 @@ def test_orientation_is_of_the_imu_frame_not_of_the_body():
 
 
 def test_means_of_headings_go_over_the_seam_and_have_their_offset(plain):
-    case = plain.asked(alignment__heading_source='heading_topic')
+    case = plain.with_settings_of(alignment__heading_source='heading_topic')
     t = np.linspace(-30, -10, 200)
     a, _ = case.align(**heading_rows(np.pi + 0.01 * (-1.0)**np.arange(200), 1e-4, t))
     assert abs(yaw_of(a)) == pytest.approx(np.pi, abs=PLACE)
-    case = plain.asked(alignment__heading_source='heading_topic', alignment__heading_offset=0.3)
+    case = plain.with_settings_of(alignment__heading_source='heading_topic',
+                                  alignment__heading_offset=0.3)
     a, _ = case.align(**heading_rows(1.0, 4e-6, np.linspace(-50, 50, 1001)))
     assert yaw_of(a) == pytest.approx(1.3, abs=PLACE)
     assert (a.heading_source, a.heading_shared) == ('heading_topic', True)
@@ -99,7 +100,7 @@ def test_means_of_headings_go_over_the_seam_and_have_their_offset(plain):
 
 
 def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
-    case = plain.asked(alignment__heading_source='heading_topic')
+    case = plain.with_settings_of(alignment__heading_source='heading_topic')
     rows = heading_rows(np.array([9.0, 1.0, 2.0, 9.0]), np.array([np.nan, 1e-4, 1e-4, 1e-4]),
                         np.array([0.0, 0.1, 0.3, 0.6]))
     a, _ = case.align(spans=np.empty((0, 2)), **rows)
@@ -111,28 +112,28 @@ def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
 
 
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
-@pytest.mark.parametrize(('variance', 'says'), [
+@pytest.mark.parametrize(('variance', 'words'), [
     (np.nan, 'covariance[0] = -1'), (10.0, 'sigma is 181 deg; the limit is')])
-def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, says):
-    case = plain.asked(alignment__heading_source=source)
+def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, words):
+    case = plain.with_settings_of(alignment__heading_source=source)
     rows = orientations(plain, 1.0, variance) if source == 'imu_orientation' else \
         heading_rows(1.0, variance, np.linspace(-50, 50, 1001))
     a, reasons = case.align(**rows)
     assert a.heading_source == 'course'
     assert [r.code for r in reasons] == [Code.HEADING_UNAVAILABLE]
     assert source in reasons[0].text
-    assert says in reasons[0].text
+    assert words in reasons[0].text
 
 
-@pytest.mark.parametrize(('source', 'says', 'sent'), [
+@pytest.mark.parametrize(('source', 'words', 'sent'), [
     ('fixed', 'alignment.heading is not set', {}), ('heading_topic', 'no message', {}),
     ('imu_orientation', '', {'q_ni': 0.0, 'yaw_variance': 0.0})])       # quaternions of zeros
-def test_a_source_without_data_is_refused(plain, source, says, sent):
-    a, reasons = plain.asked(alignment__heading_source=source).align(**{
+def test_a_source_without_data_is_refused(plain, source, words, sent):
+    a, reasons = plain.with_settings_of(alignment__heading_source=source).align(**{
         name: value * getattr(plain.inputs, name) for name, value in sent.items()})
     assert a.heading_source == 'course'
     assert reasons[0].code is Code.HEADING_UNAVAILABLE
-    assert says in reasons[0].text
+    assert words in reasons[0].text
 
 
 TOO_POOR = 'causes a heading uncertainty of'
@@ -144,7 +145,7 @@ TOO_POOR = 'causes a heading uncertainty of'
     ({}, [5.0, 0.0, 0.0], 'the Earth rate'), ({}, [0.0, 0.0, -2.0], 'the Earth rate')])
 def test_a_gyro_that_does_not_show_the_turn_of_the_earth_is_no_compass(
         plain, changes, bias_deg_h, text):
-    case = plain.asked(alignment__heading_source='gyrocompass', **changes)
+    case = plain.with_settings_of(alignment__heading_source='gyrocompass', **changes)
     case.inputs = replace(case.inputs, w_b=case.inputs.w_b + np.deg2rad(bias_deg_h) / 3600)
     a, reasons = case.align()
     assert a.heading_source == 'course'
@@ -153,7 +154,7 @@ def test_a_gyro_that_does_not_show_the_turn_of_the_earth_is_no_compass(
 
 
 def test_a_gyrocompass_needs_a_standstill(plain):
-    _, reasons = plain.asked(alignment__heading_source='gyrocompass').align(
+    _, reasons = plain.with_settings_of(alignment__heading_source='gyrocompass').align(
         spans=np.empty((0, 2)))
     assert {r.code for r in reasons} == {Code.NO_STANDSTILL, Code.GYROCOMPASS_REFUSED}
 
@@ -161,7 +162,7 @@ def test_a_gyrocompass_needs_a_standstill(plain):
 @pytest.mark.parametrize('heading_deg', [0.0, 45.0, 180.0, 269.0])
 def test_course_of_the_first_thirty_metres_holds_the_mounting_angle(heading_deg):
     case = Case(replace(PLAIN, heading=np.deg2rad(heading_deg), fix_sigma=0.0))
-    a, reasons = case.asked(alignment__heading_source='course').align()
+    a, reasons = case.with_settings_of(alignment__heading_source='course').align()
     assert reasons == ()
     assert not a.heading_separable
     assert a.heading_shared
@@ -177,7 +178,7 @@ def test_course_sigma_holds():
     z = []
     for seed in range(30):
         case = Case(replace(PLAIN, imu_rate=20.0, odometer_rate=20.0, seed=seed, duration=190.0))
-        a, _ = case.asked(alignment__heading_source='course').align()
+        a, _ = case.with_settings_of(alignment__heading_source='course').align()
         z.append(wrap(yaw_of(a) - yaw_from_heading(PLAIN.heading)) / a.heading_sigma)
     # the variance of 30 normal draws is within 4 * sqrt(2 / 30) = 1.03 of one, never below 0.3
     assert 0.3 < np.mean(np.square(z)) < 2.03
@@ -185,14 +186,14 @@ def test_course_sigma_holds():
 
 def test_course_of_a_vehicle_that_first_reverses(plain):
     t = plain.inputs.travel
-    case = plain.asked(alignment__heading_source='course')
+    case = plain.with_settings_of(alignment__heading_source='course')
     a, _ = case.align(travel=Travel(t.t, -t.s, t.quantum))
     forwards, _ = case.align()
     assert abs(wrap(yaw_of(a) - yaw_of(forwards))) == pytest.approx(np.pi, abs=1e-6)
 
 
 def test_without_motion_or_fixes_after_the_mark_there_is_no_course(plain):
-    case = plain.asked(alignment__heading_source='course')
+    case = plain.with_settings_of(alignment__heading_source='course')
     a, reasons = case.align(travel=Travel(plain.inputs.travel.t, 0 * plain.inputs.travel.s, 1.0))
     assert a.heading_sigma == np.pi
     assert reasons[-1].code is Code.HEADING_UNAVAILABLE
@@ -204,22 +205,22 @@ def test_without_motion_or_fixes_after_the_mark_there_is_no_course(plain):
 
 def test_auto_takes_the_first_that_answers(plain):
     t = np.linspace(-50, 50, 1001)
-    case = plain.asked()
+    case = plain.with_settings_of()
     everything = heading_rows(1.0, 1e-4, t) | orientations(plain, 2.0, 1e-4)
     assert case.align(**everything)[0].heading_source == 'heading_topic'
     assert case.align(**orientations(plain, 2.0, 1e-4))[0].heading_source == 'imu_orientation'
     a, reasons = case.align()
     assert (a.heading_source, a.heading_shared, reasons) == ('gyrocompass', False, ())
     assert_allclose(a.gyro_bias, 0, atol=1e-10)        # 1e-6 rad of level times the Earth rate
-    a, reasons = plain.asked(imu__grade='industrial').align()
+    a, reasons = plain.with_settings_of(imu__grade='industrial').align()
     assert a.heading_source == 'course'
     assert reasons == ()        # nobody asked for the others
-    given = plain.asked(alignment__heading=1.0)
+    given = plain.with_settings_of(alignment__heading=1.0)
     assert given.align(**everything)[0].heading_source == 'fixed'
 
 
 @pytest.mark.parametrize('source', ['heading_topic', 'imu_orientation', 'gyrocompass', 'course'])
 def test_an_asked_source_is_taken_though_others_come_first(plain, source):
     rows = heading_rows(1.0, 1e-4, np.linspace(-50, 50, 1001)) | orientations(plain, 2.0, 1e-4)
-    case = plain.asked(alignment__heading_source=source)
+    case = plain.with_settings_of(alignment__heading_source=source)
     assert case.align(**rows)[0].heading_source == source

@@ -36,8 +36,8 @@ def sent(drive, form=COUNTER, imu_gap=(0, 0), only_counts=False):
     ends = np.cumsum([length for length, _ in drive])
     t = np.arange(0.01, ends[-1], 0.05)
     speed = np.array([v for _, v in drive])[np.searchsorted(ends, t, side='right')]
-    way = np.cumsum(speed) * 0.05
-    value = speed if form is SPEED else np.floor(50 * way).astype(np.int64) % 2**16
+    travel = np.cumsum(speed) * 0.05
+    value = speed if form is SPEED else np.floor(50 * travel).astype(np.int64) % 2**16
     keep = np.diff(value, prepend=value[0]) != 0 if only_counts else np.ones(len(t), bool)
     imu = np.arange(0.0, ends[-1] + 0.2, 0.02)
     imu = imu[(imu <= imu_gap[0]) | (imu >= imu_gap[1])]

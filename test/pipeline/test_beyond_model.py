@@ -25,14 +25,15 @@ SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(± ([\d.]+) s\) (late|early).*
                   r'set (gnss|odometer)\.time_offset to (-?[\d.]+)')
 
 
-def said(made, method, **changes):
+def delay_texts(made, method, **changes):
     """Return what is said of a delay: (sensor, seconds late, sigma, setting, its value)."""
     result = calibrate(made.leg(), settings(made, method=method, heading_sigma=None, **changes))
     text = everything_said(result).get(Code.DELAY_SEEN)
     if text is None:
         return None
-    what, size, sigma, way, name, offset = SAID.search(text).groups()
-    return what, float(size) * (1 if way == 'late' else -1), float(sigma), name, float(offset)
+    what, size, sigma, direction, name, offset = SAID.search(text).groups()
+    return what, float(size) * (1 if direction == 'late'
+                                else -1), float(sigma), name, float(offset)
 
 
 @pytest.mark.parametrize(('late', 'sensor', 'setting', 'prior', 'options'), [
@@ -41,13 +42,13 @@ def said(made, method, **changes):
     (0.04, 'odometer', 'odometer', 0.01, {'odometer_delay': 0.04, 'fix_noise': 'rtk'})])
 def test_late_and_early_sensors_are_said(late, sensor, setting, prior, options):
     made = drive(**ROUTE, **options)
-    what, size, sigma, name, offset = said(made, 'smoother')
+    what, size, sigma, name, offset = delay_texts(made, 'smoother')
     assert (what, name) == (sensor, setting)
     # the prior of its delay, time_sigma, pulls it towards none by (sigma / prior)^2 of itself
     pull = abs(late) * (sigma / prior)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001
     assert offset == pytest.approx(-size, abs=0.001)
-    assert said(made, 'smoother', **{f'{name}__time_offset': offset}) is None
+    assert delay_texts(made, 'smoother', **{f'{name}__time_offset': offset}) is None
 
 
 def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is():
@@ -61,7 +62,7 @@ def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is(
 
 
 def test_of_no_delay_nothing_is_said():
-    assert said(drive(**ROUTE), 'smoother') is None
+    assert delay_texts(drive(**ROUTE), 'smoother') is None
 
 
 @pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [
@@ -79,8 +80,8 @@ def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
 
 def test_what_is_set_already_is_counted_in_and_one_method_says_it_once():
     made = drive(**ROUTE, fix_delay=0.12)
-    *_, offset = said(made, 'smoother', gnss__time_offset=0.05)
-    assert said(made, 'smoother', gnss__time_offset=offset) is None
+    *_, offset = delay_texts(made, 'smoother', gnss__time_offset=0.05)
+    assert delay_texts(made, 'smoother', gnss__time_offset=offset) is None
     result = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
     assert [r.code for r in result.reasons].count(Code.DELAY_SEEN) == 1
 
@@ -96,15 +97,15 @@ def run(name, odometer, reasons=()):
     return MethodRun(method, odometer=odometer)
 
 
-@pytest.mark.parametrize(('smoother', 'said'), [
+@pytest.mark.parametrize(('smoother', 'delay_texts'), [
     ([run('smoother', ())], []),                        # it fitted the leg and saw none
     ([run('smoother', (SLID,))], [SLID]),
     ([run('smoother', None)], [SPUN]),                  # it did not look
     ([run('smoother', (), REJECTED)], [SPUN]),
     ([], [SPUN])])
-def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, said):
+def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, delay_texts):
     runs = (*smoother, run('two_point', (SPUN,), REJECTED))
-    assert reasons_on_data({one.result.name: one for one in runs}, None) == said
+    assert reasons_on_data({one.result.name: one for one in runs}, None) == delay_texts
 
 
 def whole_kmh(leg, spun=0.0):
@@ -120,10 +121,11 @@ def test_slip_of_a_coarse_speed_is_seen_by_the_smoothers_own_track(spun):
     made = drive(**SPEED)
     leg, at = whole_kmh(made.leg(), spun)
     result = calibrate(leg, settings(made, None, method='auto'))
-    said = [r.text for r in result.reasons if r.code is Code.WHEEL_SLIP]
-    assert len(said) == (spun > 0)
+    delay_texts = [r.text for r in result.reasons if r.code is Code.WHEEL_SLIP]
+    assert len(delay_texts) == (spun > 0)
     if spun:
-        assert float(said[0].split('t = ')[1].split(' s')[0]) == pytest.approx(at + 1.0, abs=1.5)
+        assert float(delay_texts[0].split('t = ')[1].split(' s')[0]) == pytest.approx(at + 1.0,
+                                                                                      abs=1.5)
     assert Code.SPEED_COARSE in everything_said(result)
 
 
@@ -135,20 +137,21 @@ WHEELS = ('scale_factor_left', 'scale_factor_right')
 def with_slip(made, extra_m):
     """Return the leg, extra_m(t, way) more metres counted by the right wheel; way from 0 to 1."""
     leg, count = made.leg(), made.odometer_right.value
-    way = (count - count[0]) / (count[-1] - count[0])
-    more = extra_m(seconds(leg, leg.odometer_right), way) / made.truth.wheel_scales[1]
+    direction = (count - count[0]) / (count[-1] - count[0])
+    more = extra_m(seconds(leg, leg.odometer_right), direction) / made.truth.wheel_scales[1]
     return spoilt(leg, 'odometer_right', value=lambda n: n + np.round(more).astype(np.int64))
 
 
 def slow(made):
     """One per cent from half of the way on."""
-    return with_slip(made, lambda t, way: 0.01 * made.truth.distance * np.clip(way - 0.5, 0, None))
+    return with_slip(made, lambda t,
+                     direction: 0.01 * made.truth.distance * np.clip(direction - 0.5, 0, None))
 
 
 def drawn_out(made):
     """Twenty metres within forty seconds about the middle."""
-    return with_slip(made, lambda t, way: SLIP_M * np.clip(
-        (t - np.interp(0.5, way, t)) / 40.0 + 0.5, 0.0, 1.0))
+    return with_slip(made, lambda t, direction: SLIP_M * np.clip(
+        (t - np.interp(0.5, direction, t)) / 40.0 + 0.5, 0.0, 1.0))
 
 
 @pytest.fixture(scope='module', params=[slow, drawn_out], ids=['slow', 'drawn out'])

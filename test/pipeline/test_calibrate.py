@@ -58,11 +58,12 @@ def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
     result = calibrate(leg, drives.settings(town, heading_sigma=None, method='smoother',
                                             leg__min_speed=50.0, gnss__max_sigma=0.0))
     text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
-    said = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
+    highest_speed = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
     t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
-    way = town.odometer.value * town.truth.scale
-    fastest = (np.interp(t + 0.5, t, way) - np.interp(t - 0.5, t, way))[20:-20].max()
-    assert said == pytest.approx(fastest, rel=2e-3)
+    path_length = town.odometer.value * town.truth.scale
+    fastest = (np.interp(t + 0.5, t, path_length) - np.interp(t - 0.5, t,
+                                                              path_length))[20:-20].max()
+    assert highest_speed == pytest.approx(fastest, rel=2e-3)
 
 
 def test_notes_of_the_door_are_kept_and_weigh(made):

@@ -123,8 +123,8 @@ def test_the_leg_is_placed_in_the_frame_as_sent(made, latitude_deg):
     sent = made.positions()[:len(there.fixes_n)]
     off = there.fixes_n - there.fixes_n[0] - (sent - sent[0])
     assert np.abs(off).max() < 0.2       # m: frames at places 300 m apart differ by 5e-5 rad
-    apart, as_sent = (np.linalg.norm(x - x[0], axis=1) for x in (there.fixes_n, sent))
-    np.testing.assert_allclose(apart, as_sent, atol=1e-4)
+    distances, as_sent = (np.linalg.norm(x - x[0], axis=1) for x in (there.fixes_n, sent))
+    np.testing.assert_allclose(distances, as_sent, atol=1e-4)
 
 
 def test_what_refers_to_north_is_not_used_and_said():
@@ -133,15 +133,15 @@ def test_what_refers_to_north_is_not_used_and_said():
     inputs, found = screen(leg, config)
     assert not len(inputs.outside['heading'].t)
     assert not len(inputs.outside['fix_velocity'].t)
-    said = {r.code: r.text for r in found}
-    assert Code.VELOCITY_UNUSABLE not in said
-    assert said[Code.LOCAL_FRAME] == (
+    texts = {r.code: r.text for r in found}
+    assert Code.VELOCITY_UNUSABLE not in texts
+    assert texts[Code.LOCAL_FRAME] == (
         'positions are in a local frame, so north is unknown: up to 15.0 deg/h of the Earth rate '
         'are estimated as gyro bias; GNSS velocities and external headings are not used')
     assert Code.LOCAL_FRAME not in {r.code for r in screen(made.leg(), config)[1]}
     # who asks for a heading topic has one in the frame of the positions
-    asked = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
-    assert len(screen(leg, asked)[0].outside['heading'].t)
+    heading_config = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
+    assert len(screen(leg, heading_config)[0].outside['heading'].t)
     text = {r.text for r in screen(leg, settings(made, reference__latitude_deg=40.0))[1]
             if r.code is Code.LOCAL_FRAME}
     assert f'up to {15.041 * math.cos(math.radians(40.0)):.1f} deg/h' in text.pop()
@@ -155,8 +155,9 @@ def test_a_gyro_is_no_compass_in_a_local_frame():
         'yaw_mounting_angle'].value is not None
     result = calibrate(posed(made), config)
     assert Code.YAW_NOT_SEPARABLE in everything_said(result)
-    asked = settings(made, heading_sigma=None, alignment__heading_source='gyrocompass')
-    assert 'y axis does not point to north' in everything_said(calibrate(posed(made), asked))[
+    heading_config = settings(made, heading_sigma=None, alignment__heading_source='gyrocompass')
+    assert 'y axis does not point to north' in everything_said(calibrate(posed(made),
+                                                                         heading_config))[
         Code.GYROCOMPASS_REFUSED]
 
 
@@ -164,8 +165,8 @@ def test_an_orientation_is_a_heading_in_the_frame_only_if_asked_for():
     made = drive(**CAR, orientation_sigma=0.001)
     for source in ('auto', 'imu_orientation'):
         config = settings(made, heading_sigma=None, alignment__heading_source=source)
-        said = everything_said(calibrate(posed(made), config))
-        assert (Code.YAW_NOT_SEPARABLE in said) == (source == 'auto')
+        texts = everything_said(calibrate(posed(made), config))
+        assert (Code.YAW_NOT_SEPARABLE in texts) == (source == 'auto')
 
 
 def test_surveyed_points_are_not_in_the_frame(made):
@@ -199,15 +200,15 @@ def test_a_pose_that_contains_the_wheels_is_reported():
                  real=Real(receiver_odometer=-0.03))
     config = settings(made, **SMOOTHER, leg__min_distance=20.0)
     result = calibrate(posed(made), config).methods['smoother']
-    said, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)
-    assert 'with an uncertainty of the scale of' in said.text
-    doubt, = (s.effects for s in result.sources if s.name == 'wheels_in_positions')
+    texts, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)
+    assert 'with an uncertainty of the scale of' in texts.text
+    position_effects, = (s.effects for s in result.sources if s.name == 'wheels_in_positions')
     scale = result.estimates['scale_factor']
     # 3 % wrong, known as from 300 s / 20 s samples, within a factor of two
-    assert 0.5 < doubt[0, 0] / (0.03 * (20 / 300)**0.5) < 2.0
-    assert scale.sigma > doubt[0, 0] * scale.value
-    assert 'positions fused with a wheel speed' in said.text
-    assert all(word in said.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
+    assert 0.5 < position_effects[0, 0] / (0.03 * (20 / 300)**0.5) < 2.0
+    assert scale.sigma > position_effects[0, 0] * scale.value
+    assert 'positions fused with a wheel speed' in texts.text
+    assert all(word in texts.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
     plain = calibrate(posed(drive(**CAR)), settings(drive(**CAR), **SMOOTHER))
     assert Code.FIXES_FOLLOW_ODOMETER not in everything_said(plain)
 

@@ -70,10 +70,10 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     cut = silent(leg, GAP)
     alone = calibrate(cut, config)
     assert Code.IMU_GAP in {r.code for r in alone.reasons}
-    told = []
-    results = calibrate_parts(cut, config, progress=lambda stage: told.append(stage.done))
+    stages = []
+    results = calibrate_parts(cut, config, progress=lambda stage: stages.append(stage.done))
     assert len(results) == 2
-    assert told == sorted(told)
+    assert stages == sorted(stages)
     whole = combine(results, config)
     assert whole.verdict is Verdict.ACCEPTED
     assert [r.text for r in whole.reasons if r.code is Code.LEG_CUT][0].startswith(
@@ -115,10 +115,10 @@ def ferried(leg, at_s, wait_s, metres):
         return replace(out, stamp_ns=out.stamp_ns + shift_ns,
                        received_ns=out.received_ns + shift_ns)
     fix = later(leg.fix)
-    gone = np.clip((seconds(leg, fix) - at_s - 20.0) / (wait_s - 40.0), 0.0, 1.0)
+    share = np.clip((seconds(leg, fix) - at_s - 20.0) / (wait_s - 40.0), 0.0, 1.0)
     return replace(leg, stop_ns=leg.stop_ns + wait_ns, imu=later(leg.imu),
                    odometer=later(leg.odometer), fix=replace(
-                       fix, latitude=fix.latitude + gone * metres / 6.37e6))
+                       fix, latitude=fix.latitude + share * metres / 6.37e6))
 
 
 @pytest.mark.parametrize('metres', [2000.0, 60.0])      # at sea, and across a canal

@@ -169,11 +169,11 @@ def test_two_legs_are_combined():
 
 def heights(height, sigma=0.02, noise=0.0):
     """Return fixes on a straight of 2 km, m by m, with heights of the distance."""
-    way = np.arange(0.0, 2000.0)
-    up = height(way) + noise * np.random.default_rng(0).standard_normal(len(way))
-    geodetic = np.column_stack([0.8 + way / 6.36e6, np.full(len(way), 0.2), up])
-    return SimpleNamespace(t_fix=way, geodetic=geodetic, covariance_n=np.tile(
-        np.diag([1e-4, 1e-4, sigma**2]), (len(way), 1, 1)))
+    path_length = np.arange(0.0, 2000.0)
+    up = height(path_length) + noise * np.random.default_rng(0).standard_normal(len(path_length))
+    geodetic = np.column_stack([0.8 + path_length / 6.36e6, np.full(len(path_length), 0.2), up])
+    return SimpleNamespace(t_fix=path_length, geodetic=geodetic, covariance_n=np.tile(
+        np.diag([1e-4, 1e-4, sigma**2]), (len(path_length), 1, 1)))
 
 
 def test_slopes_shorten_the_path_by_half_their_square():
@@ -207,9 +207,9 @@ def test_a_result_is_the_same_for_any_number_of_threads():
                'made, config = t.driven("skid", imu=True, imu_grade="industrial", duration=80.0)\n'
                'found = t.calibrate(made.leg(), config).methods["planar"].estimates\n'
                'print([(e.value, e.sigma) for e in found.values()])')
-    said = {subprocess.run([sys.executable, '-c', program], check=True, capture_output=True,
-                           cwd=ROOT, text=True, env=os.environ | {
-                               'OPENBLAS_NUM_THREADS': threads, 'PYTHONPATH': f'{ROOT}:{TEST}'}
-                           ).stdout for threads in ('1', '2')}
-    assert len(said) == 1
-    assert 'nan' not in said.pop()
+    outputs = {subprocess.run([sys.executable, '-c', program], check=True, capture_output=True,
+                              cwd=ROOT, text=True, env=os.environ | {
+                                  'OPENBLAS_NUM_THREADS': threads, 'PYTHONPATH': f'{ROOT}:{TEST}'}
+                              ).stdout for threads in ('1', '2')}
+    assert len(outputs) == 1
+    assert 'nan' not in outputs.pop()

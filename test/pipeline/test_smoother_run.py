@@ -141,16 +141,16 @@ def test_a_stage_says_passes_and_change_and_no_share(stage, words):
 
 
 def test_auto_takes_it_and_computes_two_point_beside_it(made):
-    told = []
+    stages = []
     leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None),
-                    progress=told.append)
+                    progress=stages.append)
     # how far it is, pass by pass, and never all before the end
-    shares = [stage.done for stage in told]
+    shares = [stage.done for stage in stages]
     assert shares == sorted(shares)
     assert shares[0] == 0
     assert 0.8 < shares[-1] < 1
-    assert list(dict.fromkeys(s.name for s in told)) == ['two_point', 'smoother', 'tracks']
-    passes = [stage for stage in told if stage.passes]
+    assert list(dict.fromkeys(s.name for s in stages)) == ['two_point', 'smoother', 'tracks']
+    passes = [stage for stage in stages if stage.passes]
     assert [stage.passes for stage in passes] == list(range(1, len(passes) + 1))
     assert {(stage.name, stage.done) for stage in passes} == {('smoother', shares[1])}
     # the change that is left falls from a first guess some sigmas off to what may be left
@@ -250,8 +250,8 @@ def room(rng):
 
 
 def test_the_rough_scale_of_a_room_is_that_of_its_straights():
-    t, fixes, way, _ = room(np.random.default_rng(1))
-    travel = Travel(t, way / 1e-4, 1.0)
+    t, fixes, route, _ = room(np.random.default_rng(1))
+    travel = Travel(t, route / 1e-4, 1.0)
     assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
     assert not motion_reasons(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
     assert motion_reasons(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
@@ -269,10 +269,11 @@ def test_turns_on_the_spot_are_no_turns_of_the_course():
 
 def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
     t = np.arange(0.0, 11.0)
-    way = np.interp(t, [0.0, 4.0, 6.0, 10.0], [0.0, 0.0, 3.0, 3.0])
+    route = np.interp(t, [0.0, 4.0, 6.0, 10.0], [0.0, 0.0, 3.0, 3.0])
     leg = object.__new__(SmootherLeg)
     turning = Travel(t, np.interp(t, [0.0, 6.0, 8.0, 10.0], [0.0, 0.0, 1.0, 1.0]), 0.0)
-    for name, value in {'travel': Travel(t, way, 0.0), 'wheels': (Travel(t, way, 0.0), turning),
+    for name, value in {'travel': Travel(t, route, 0.0),
+                        'wheels': (Travel(t, route, 0.0), turning),
                         'origin': origin(True), 'rough_scale': 1.0}.items():
         object.__setattr__(leg, name, value)
     # 3 m, then 1 m of one wheel; at rest a hundredth

@@ -107,14 +107,14 @@ def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made, result):
 
 def test_what_the_search_found_is_in_the_details_where_it_is_asked_for(made, result):
     assert 'search' not in result.methods['smoother'].details
-    asked = calibrate(made.leg(), settings(made, method='patent'))
-    assert set(asked.methods) == {'two_point', 'smoother'}
+    patent_result = calibrate(made.leg(), settings(made, method='patent'))
+    assert set(patent_result.methods) == {'two_point', 'smoother'}
     # it stands beside the values and moves none of them
-    assert asked.methods['smoother'].estimates == result.methods['smoother'].estimates
-    search = asked.methods['smoother'].details['search']
+    assert patent_result.methods['smoother'].estimates == result.methods['smoother'].estimates
+    search = patent_result.methods['smoother'].details['search']
     assert search['array']['name'].startswith('L49')
     assert search['before']['rms'] > search['after']['rms']
-    shown = screen_text(combine([asked], settings(made, method='patent')))
+    shown = screen_text(combine([patent_result], settings(made, method='patent')))
     assert f'response surface{search["response_surface"]["scale_left"]:20.6g}' in shown
     assert 'CN104359492A' not in screen_text(combine([result], settings(made)))
     surface, direct = search['response_surface'], search['least_squares']
