@@ -157,10 +157,11 @@ class RowTimes:
         """
         expected = max(abs(speed) * self._interval, self._step) if speed else 0.0
         step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
-        sure = expected > max(SURE_STEP * quantum, SURE_SPEED * self._interval)
-        if not sure and t - self._line > LONG_GAP and not 0 < step <= 2 * SURE_STEP * quantum:
+        is_reliable = expected > max(SURE_STEP * quantum, SURE_SPEED * self._interval)
+        moves = 0 < step <= 2 * SURE_STEP * quantum
+        if not is_reliable and t - self._line > LONG_GAP and not moves:
             self._restart()      # lost rows; late ones arrive one after the other
-        self._advance_line(t, step, expected if sure else 0.0)
+        self._advance_line(t, step, expected if is_reliable else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
             self._test(quantum)

@@ -127,8 +127,8 @@ class SpikeScreen:
                  for one, other in pairwise((*kept, *rows))]
         own = steps.pop(ROWS_BESIDE)
         least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
-        return tuple(size > max(least, SINGLE_TIMES * max(beside))
-                     for size, *beside in zip(own, *steps, strict=True))
+        return tuple(size > max(least, SINGLE_TIMES * max(other_steps))
+                     for size, *other_steps in zip(own, *steps, strict=True))
 
     def _is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
@@ -144,8 +144,8 @@ class SpikeScreen:
             limit = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
             if any(isolated) or _largest(last.w_b, row.w_b) > limit:
                 steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
-                x, y, z = (size if odd or size > limit else 0.0
-                           for size, odd in zip(steps, isolated or ZERO, strict=True))
+                x, y, z = (size if is_isolated or size > limit else 0.0
+                           for size, is_isolated in zip(steps, isolated or ZERO, strict=True))
                 self._step_size, self._before = (x, y, z), last.w_b
                 self._until = row.t + STRANGE_TURN_TIME
         return self._step_size
@@ -260,9 +260,9 @@ class ImuStream:
             steps = sorted(b.t - a.t for a, b in pairwise(self.rows[-INTERVAL_ROWS:]))
             self.median_interval, self._unmeasured = steps[len(steps) // 2], 0
 
-    def _note_dropped(self, rows: int, why: str) -> None:
+    def _note_dropped(self, rows: int, cause: str) -> None:
         if rows:
-            self._notes.append(f'{rows} IMU messages dropped and interpolated: they {why}')
+            self._notes.append(f'{rows} IMU messages dropped and interpolated: they {cause}')
 
     def forget(self, seconds: float) -> None:
         """Drop rows more than ``seconds`` older than the newest; for use before a path exists."""

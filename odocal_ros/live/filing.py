@@ -166,7 +166,8 @@ class Filing:
         """
         Write the result files in the worker; the future has (success, text).
 
-        asked : by the operator; ``latest`` moves to a worse result only at the second request.
+        by_operator : requested by the operator; ``latest`` moves to a worse result only at the
+        second request.
         """
         future = Future()
         self._saves_running += 1
@@ -227,10 +228,10 @@ class Filing:
             self._report_worker.submit(results.draw, self._drawn)
         return folder, unchanged_reason
 
-    def _drawn(self, why: str, error: Exception | None) -> None:
-        if error is not None or why:
+    def _drawn(self, drawing_error: str, error: Exception | None) -> None:
+        if error is not None or drawing_error:
             self._log.warning('the report could not be drawn: '
-                              f'{answers.error_line(error) if error else why}')
+                              f'{answers.error_line(error) if error else drawing_error}')
 
     def poll(self) -> None:
         """Log reports that could not be drawn."""

@@ -243,9 +243,9 @@ class LegCompletion:
         leg_id, self._snapshot, self._view_at_stop = self.session.leg_id, None, None
         self._distance_m = sum(one.distance for one in done.results)
         if isinstance(done, worker.UnusedLeg):
-            self.session.drop_unusable(done.why)
+            self.session.drop_unusable(done.reason)
             text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
-                    f'{done.why.code.name}: {done.why.text}')
+                    f'{done.reason.code.name}: {done.reason.text}')
             self._log.info(text)
             self._computing.answer(False, text)
             return

@@ -98,16 +98,16 @@ class Calibrator(SettledNode):
         """Refuse parameters that cannot be set now; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
-        why = params.refused(self.config, self.publishing.results(), parameters)
+        refusal = params.refused(self.config, self.publishing.results(), parameters)
         session = self.operation.session
-        if not why and session.busy:
-            why = (f'leg {session.leg_id} is {session.state.value}: its configuration is fixed; '
-                   'end it with ~/stop_leg or ~/cancel_leg first')
+        if not refusal and session.busy:
+            refusal = (f'leg {session.leg_id} is {session.state.value}: its configuration is '
+                       'fixed; end it with ~/stop_leg or ~/cancel_leg first')
         try:
             params.changed(self.config, parameters)
         except OdocalError as error:
-            why = why or str(error)
-        return SetParametersResult(successful=not why, reason=why)
+            refusal = refusal or str(error)
+        return SetParametersResult(successful=not refusal, reason=refusal)
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.changed(self.config, parameters)

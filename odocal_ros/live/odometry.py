@@ -83,10 +83,10 @@ class OdometryNode(SettledNode):
         self.config = params.declare(self, ApplyConfig)
         calibration = params.declare_results(self, params.APPLIED)
         if calibration is None or not calibration.valid:
-            why = 'no calibration is given' if calibration is None else (
+            refusal = 'no calibration is given' if calibration is None else (
                 f'the calibration of {calibration.stamp} was rejected')
-            raise BadConfig(f'{why}: start with --ros-args --params-file FILE, a calibration.yaml '
-                            'that odocal replay or the calibrator wrote')
+            raise BadConfig(f'{refusal}: start with --ros-args --params-file FILE, a '
+                            'calibration.yaml that odocal replay or the calibrator wrote')
         vehicle = vehicle_of(calibration.estimates, self.config)
         for text in vehicle.assumptions:
             self.get_logger().warning(text)

@@ -52,7 +52,6 @@ VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
 def calibration_status(now: SessionView) -> DiagnosticStatus:
     session, results = now.session, now.results
     text, ok = answers.hint(now), answers.quantities_ok(now)
-    legs = results['result.legs'] if now.restored else len(session.legs)
     keys = {
         'state': now.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
         'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
@@ -62,10 +61,10 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': now.rates_hz.get('fix', 0.0),
     } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(now) | {
-        'verdict': session.verdict(), 'hint': text, 'legs': legs,
+        'verdict': session.verdict(), 'hint': text,
+        'legs': results['result.legs'] if now.restored else len(session.legs),
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
-        'restored': now.restored,
-        'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
+        'restored': now.restored, 'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
         'distance_to_minimum_m': answers.metres_to_go(now),
         'seconds_to_stand': answers.seconds_to_stand(now),
         'required_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
@@ -113,12 +112,12 @@ def level(now: SessionView) -> Any:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not now.received:
         return DiagnosticStatus.STALE
-    has_warning = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
-    has_warning = has_warning or bool(now.missing or now.clocks or now.journal_trouble
-                                      or now.save_trouble or now.lost or now.faults
-                                      or now.duplicate_publishers or _changes(now.session)
-                                      or now.session.unused
-                                      and now.session.unused.code not in SHORT)
+    unused = now.session.unused
+    has_warning = (
+        state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
+        or now.missing or now.clocks or now.journal_trouble or now.save_trouble or now.lost
+        or now.faults or now.duplicate_publishers or _changes(now.session)
+        or unused and unused.code not in SHORT)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
@@ -239,8 +238,7 @@ class Publishing:
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
-        # published without kept legs: the restored result, or none
-        self._restored_results = self.results()
+        self._restored_results = self.results()      # published while no leg is kept
 
     def results(self) -> dict[str, Any]:
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}

@@ -65,9 +65,9 @@ class Restored:
         estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
                      for name, e in self.estimates.items()}
         use = '' if self.valid else ', which was rejected'
-        whose = f' of vehicle {one_line(self.vehicle)}' if self.vehicle else ''
-        return (f'restored result of {self.stamp}{whose}{use}: {values_in_words(estimates)}; from '
-                f'{self.legs} leg{"s" * (self.legs != 1)}')
+        vehicle_text = f' of vehicle {one_line(self.vehicle)}' if self.vehicle else ''
+        return (f'restored result of {self.stamp}{vehicle_text}{use}: '
+                f'{values_in_words(estimates)}; from {self.legs} leg{"s" * (self.legs != 1)}')
 
 
 class Session:
@@ -103,8 +103,8 @@ class Session:
     @property
     def open_leg(self) -> bool:
         """Return True if there is a leg that is neither kept nor dropped."""
-        closed = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
-        return self.state is State.RECORDING or closed
+        is_stopped = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
+        return self.state is State.RECORDING or is_stopped
 
     def start(self, mark_ns: int, config: Config, is_automatic: bool = False) -> None:
         """Open a leg at a mark, under the configuration in force."""
@@ -155,9 +155,9 @@ class Session:
         self.unused = None
         self.settle(calibration)
 
-    def drop_unusable(self, why: Reason) -> None:
+    def drop_unusable(self, reason: Reason) -> None:
         """Drop the computed automatic leg, which is not usable."""
-        self.event, self.unused = 'cancelled', why
+        self.event, self.unused = 'cancelled', reason
         self.settle(self.calibration)
 
     def set_carried(self, carried: Carried | None, legs: int) -> None:

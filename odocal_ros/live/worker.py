@@ -69,7 +69,7 @@ class UnusedLeg:
     """Result of an unused automatic leg, and the cause."""
 
     results: tuple[LegResult, ...]
-    why: Reason
+    reason: Reason
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
@@ -79,8 +79,8 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     """Return a leg's result, its combination with the kept legs, and the paths to publish."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
-    if is_automatic and (why := refusal(results[0])):
-        return UnusedLeg(results, why)
+    if is_automatic and (reason := refusal(results[0])):
+        return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
     folded = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
     carried_before, carried = carried, fold([result for leg in kept[:folded] for result in leg],

@@ -143,11 +143,11 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
 def _make_samples(bag: Bag, config: Config,
                   overrides: dict[str, str]) -> tuple[dict[str, _TopicSamples], dict[Any, Any]]:
     """Return topic -> tap of every possible input, and topic -> error of unreadable ones."""
-    asked = {topic: slot for slot, topic in overrides.items()}
+    slot_by_topic = {topic: slot for slot, topic in overrides.items()}
     samples_by_topic: dict[str, _TopicSamples] = {}
     refused: dict[str, str] = {}
     for name, info in bag.topics.items():
-        slot = asked.get(name) or ('imu' if info.msgtype == IMU else '') or (
+        slot = slot_by_topic.get(name) or ('imu' if info.msgtype == IMU else '') or (
             'fix' if info.msgtype in REFERENCES else '') or (
             'odometer' if info.msgtype in (*ODOMETERS, config.odometer.type) else '')
         if not slot or not info.count:

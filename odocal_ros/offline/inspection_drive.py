@@ -267,13 +267,13 @@ def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> 
         return []
     facts = next(t for t in found['topics'] if t['name'] == mapping['imu'])['imu']
     if not facts['orientation']:
-        why = 'no heading topic, and the IMU publishes no orientation'
+        cause = 'no heading topic, and the IMU publishes no orientation'
     elif facts['yaw_sigma'] is None:
-        why = 'no heading topic, and the IMU orientation has no covariance'
+        cause = 'no heading topic, and the IMU orientation has no covariance'
     elif facts['yaw_sigma'] > config.verdict.max_yaw_sigma:
-        why = ('the only heading is the IMU orientation with an uncertainty of '
-               f'{math.degrees(facts["yaw_sigma"]):.1f} deg; the limit is '
-               f'{math.degrees(config.verdict.max_yaw_sigma):.2g} deg')
+        cause = ('the only heading is the IMU orientation with an uncertainty of '
+                 f'{math.degrees(facts["yaw_sigma"]):.1f} deg; the limit is '
+                 f'{math.degrees(config.verdict.max_yaw_sigma):.2g} deg')
     else:
         return []
-    return [Reason(Code.YAW_NOT_SEPARABLE, why)]
+    return [Reason(Code.YAW_NOT_SEPARABLE, cause)]

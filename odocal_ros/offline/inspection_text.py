@@ -158,11 +158,11 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         where = 'after' if late > 0 else 'before'
         yield (f'messages are recorded {abs(late):.3f} s {where} the time in their header '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
-    odd = [f'{timing[key]} {what}' for key, what in (
+    stamp_faults = [f'{timing[key]} {what}' for key, what in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
         ('backward_steps', 'with a stamp before the previous one')) if timing[key]]
-    if odd:
-        yield f'warning: of {topic["count"]} messages, {", ".join(odd)}'
+    if stamp_faults:
+        yield f'warning: of {topic["count"]} messages, {", ".join(stamp_faults)}'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
         yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
@@ -196,11 +196,11 @@ def _legs(legs: list[dict[str, Any]]) -> list[str]:
     """Return a line for each leg, or a table of many legs."""
     if not legs:
         return []
-    whose = 'marked by the node' if legs[0]['marked'] else 'used by replay'
+    origin = 'marked by the node' if legs[0]['marked'] else 'used by replay'
     few = 3    # legs listed in a line each
     if len(legs) <= few:
-        return [f'  leg {whose}: {_leg(leg)}' for leg in legs]
-    return [f'  {len(legs)} legs {whose}, s and m', '    '
+        return [f'  leg {origin}: {_leg(leg)}' for leg in legs]
+    return [f'  {len(legs)} legs {origin}, s and m', '    '
             f'{"leg":>3}{"from":>10}{"to":>10}{"length":>8}{"start to end":>14}'] + [
         f'    {i:>3}{leg["start"]:>10.1f}{leg["stop"]:>10.1f}{leg["distance"]:>8.0f}'
         f'{leg["chord"]:>14.0f}' for i, leg in enumerate(legs, 1)]
@@ -220,14 +220,15 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
     rpy = ', '.join(f'{x:.10g}' for x in mounting['rpy'])
     degrees = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
     if mounting['assumed_forward']:
-        how = 'level from gravity; the drive does not determine forward, x is assumed'
+        source = 'level from gravity; the drive does not determine forward, x is assumed'
     else:
-        sure = whole_degrees(mounting['forward_sigma'])
-        how = (f'forward direction from accelerations and turns, uncertainty {sure} deg (1 '
-               f'sigma); the measured mounting differs by {math.degrees(mounting["off"]):.1f} deg')
+        uncertainty = whole_degrees(mounting['forward_sigma'])
+        source = ('forward direction from accelerations and turns, uncertainty '
+                  f'{uncertainty} deg (1 sigma); the measured mounting differs by '
+                  f'{math.degrees(mounting["off"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else \
         'imu.mounting_rpy is correct to the nearest quarter turn:'
-    return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {how})')
+    return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {source})')
 
 
 def whole_degrees(angle: float) -> str:

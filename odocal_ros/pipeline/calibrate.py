@@ -143,10 +143,10 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return the parts of a leg between IMU gaps over ``limit_s``; the leg if none or many."""
-    return _beside(leg, _gaps(leg, limit_s))
+    return _between_gaps(leg, _gaps(leg, limit_s))
 
 
-def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
+def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
     """Return the parts of a leg between gaps, (k, 2) ns; the leg itself if none or many."""
     most_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < most_parts:
@@ -199,23 +199,24 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [one for one in results if one.verdict is not Verdict.REJECTED]
 
-    good, why = good_of(parts_of(leg, config.leg.max_gap)), None
+    good, carried_reason = good_of(parts_of(leg, config.leg.max_gap)), None
     if not good:
         whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
-        why = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
-        good = good_of(_beside(leg, _carried(leg, config))) if why else []
+        carried_reason = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
+        good = good_of(_between_gaps(leg, _carried(leg, config))) if carried_reason else []
         if not good:
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
         return good      # the gap is before the mark
-    cause, do = (why.text, 'If the vehicle was carried (ferry, train), ignore. Otherwise check '
-                 'the wheel sensor and the odometer topic.') if why else (
+    cause, do = (carried_reason.text,
+                 'If the vehicle was carried (ferry, train), ignore. Otherwise check '
+                 'the wheel sensor and the odometer topic.') if carried_reason else (
         f'no IMU data for more than {config.leg.max_gap:g} s', '')
     return [replace(one, cut_from_ns=leg.start_ns, reasons=(*one.reasons, Reason(
-        Code.LEG_CUT, f'{cause}; {_section(leg, one, len(good))}', do))) for one in good]
+        Code.LEG_CUT, f'{cause}; {_section_text(leg, one, len(good))}', do))) for one in good]
 
 
-def _section(leg: Leg, one: LegResult, count: int) -> str:
+def _section_text(leg: Leg, one: LegResult, count: int) -> str:
     """Return the span of one of ``count`` sections within its leg, as text."""
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
     return (f'this section covers {begin:.1f} to {end:.1f} s of the '

@@ -135,9 +135,9 @@ def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config
                             carried if usable else None)
     if usable or len(results) == 1:
         return whole
-    why = dict.fromkeys(r for one in results for r in one.reasons
-                        if r.code.severity is Verdict.REJECTED)
-    return replace(whole, reasons=(*whole.reasons, *why))
+    rejections = dict.fromkeys(r for one in results for r in one.reasons
+                               if r.code.severity is Verdict.REJECTED)
+    return replace(whole, reasons=(*whole.reasons, *rejections))
 
 
 def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],

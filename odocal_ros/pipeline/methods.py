@@ -47,9 +47,9 @@ def _smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     return smoother(prepared, report_pass)
 
 
-def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
+def _no_smoother(inputs: Inputs, reason: Reason) -> MethodResult:
     from odocal_ros.estimator.result.estimates import refused_result
-    return refused_result((why,), inputs.scale_unit, inputs.travels)
+    return refused_result((reason,), inputs.scale_unit, inputs.travels)
 
 
 # in the order of the output; two_point, by the operator's own marks, is always computed
@@ -57,7 +57,7 @@ METHODS: dict[str, Callable[[PreparedLeg, PassCallback], MethodRun]] = {
     'two_point': two_point, 'smoother': _smoother}
 # the result of a method that cannot estimate: (inputs, reason) to MethodResult
 REFUSED_RESULTS: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
-           'two_point': lambda inputs, why: refused_result((why,), inputs.scale_unit),
+           'two_point': lambda inputs, reason: refused_result((reason,), inputs.scale_unit),
            'smoother': _no_smoother}
 
 
@@ -117,7 +117,7 @@ def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]
             Code.NOT_CONVERGED, f'{name} did not converge: an estimate became infinite or '
             'NaN. Likely cause: invalid or missing samples')))
     except Exception as error:      # its reasons may be wrong too and are dropped
-        return MethodRun(failed(lambda why: REFUSED_RESULTS[name](inputs, why), name, error))
+        return MethodRun(failed(lambda reason: REFUSED_RESULTS[name](inputs, reason), name, error))
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],

@@ -63,8 +63,8 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
     from odocal_ros.calib.planar.fit import fit
     unit = inputs.scale_unit
 
-    def unknown(why: Reason) -> MethodResult:
-        return refused([why], unit)
+    def unknown(reason: Reason) -> MethodResult:
+        return refused([reason], unit)
     try:
         with raised_if_wild():
             found = fit(run, known_of(run, config), lambda passes, change: progress(
