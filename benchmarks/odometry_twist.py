@@ -91,7 +91,7 @@ def relay(args) -> None:
     from std_msgs.msg import Int64
 
     from odocal_ros.live.messages import WaitingMessages
-    from odocal_ros.live.odometry import LOOK_S, NumbersPublisher, SERVE_S
+    from odocal_ros.live.odometry import CHECK_PERIOD_S, EXECUTOR_PERIOD_S, NumbersPublisher
     rclpy.init()
     node = rclpy.create_node(args.role)
     publishers = [(NumbersPublisher(node, f'{args.role}/{name}', kind()), bytes(8 * size))
@@ -119,12 +119,12 @@ def relay(args) -> None:
     executor, serve_at = rclpy.executors.SingleThreadedExecutor(), 0.0
     executor.add_node(node)
     while rclpy.ok():
-        until = time.monotonic() + LOOK_S
+        until = time.monotonic() + CHECK_PERIOD_S
         for messages, callback in waiting:
             for raw in messages.take()[0]:
                 callback(raw)
         if until > serve_at:
-            serve_at = until + SERVE_S
+            serve_at = until + EXECUTOR_PERIOD_S
             executor.spin_once(timeout_sec=0.0)
         time.sleep(max(0.0, until - time.monotonic()))
 

@@ -173,7 +173,7 @@ def received(drive, rows, config):
                 continue
             pairs = reader.rows([d for _, d in part], [t for t, _ in part], _no_other)
             for slot, block in pairs:
-                sound = np.array(health[kind].decoded(
+                sound = np.array(health[kind].check_stamps(
                     block.stamp_ns.tolist(), block.received_ns), bool) if (
                     slot == reader.slot) else None
                 recorder.feed(slot, block)
@@ -187,7 +187,7 @@ def received(drive, rows, config):
             start_ns = newest
             watch.begin(_snapshot(recorder, readers), start_ns, config)
         if start_ns:
-            watch.look(newest)
+            watch.update(newest)
             watch.faults()
         progress.distance_m()
     return _snapshot(recorder, readers), start_ns, health[IMU].newest_ns, worker.raised
