@@ -151,10 +151,6 @@ def trace_file(text: str) -> str:
     return f.name
 
 
-if __name__ == '__main__':
-    sys.exit(main())
-
-
 BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'
 
@@ -216,3 +212,7 @@ class Phase:
         tick_s = 0.5    # the clock of a phase runs without reports
         while not self._over.wait(tick_s):
             self._bar.refresh()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

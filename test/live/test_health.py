@@ -68,7 +68,7 @@ def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
     assert not health.jumped_back
     decoded(health, rows([2.0, 2.1]))
     assert health.jumped_back
-    health.forget()
+    health.reset_times()
     decoded(health, rows([2.2]))
     assert (health.jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
 
@@ -125,7 +125,7 @@ def test_after_a_jump_of_time_no_stamp_is_called_zero():
     assert not Health().stampless
     assert health_of([0.0, 0.0]).stampless
     health = health_of([0.0, 0.0], [5.0, 5.1])
-    health.forget()
+    health.reset_times()
     assert (health.newest_ns, health.stampless) == (0, False)
 
 

@@ -184,8 +184,8 @@ def test_each_thing_is_said_once_or_seldom():
     assert report(302, **nothing) == [('warning', 'no IMU on /imu/data')]       # at once now
     assert report(303, **nothing) == []
     assert report(304) == [('info', 'all inputs are available again')]
-    two = {'doubled': ['/ticks has 2 publishers (/a, /b)']}
-    assert report(305, **two) == [('warning', two['doubled'][0])]
+    two = {'duplicate_publishers': ['/ticks has 2 publishers (/a, /b)']}
+    assert report(305, **two) == [('warning', two['duplicate_publishers'][0])]
     assert report(306, **two) == []
     for lost, new in ((0, False), (3, True), (29, False), (31, True), (32, False), (0, False),
                       (1, True)):       # of the next leg
