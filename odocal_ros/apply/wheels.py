@@ -21,6 +21,14 @@ from odocal_ros.settings.node_configs import ApplyConfig
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, Sequence[Reading], OdometerForm]
+# judgement: least and largest number of rows, one per second; s, correlation of residuals
+LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
+# judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
+# up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
+LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
+# judgement: ratio of the change of acceleration within a second to the central difference over
+# two, in simulated town drives
+CHANGE_SMOOTHED = 1.2
 
 
 class Wheels:
@@ -106,16 +114,6 @@ class Wheels:
     def forget(self, t: float) -> None:
         for wheel in self._wheels.values():
             wheel.forget(t)
-
-
-# judgement: least and largest number of rows, one per second; s, correlation of residuals
-LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
-# judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
-# up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
-LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
-# judgement: ratio of the change of acceleration within a second to the central difference over
-# two, in simulated town drives
-CHANGE_SMOOTHED = 1.2
 
 
 class DelaySearch:

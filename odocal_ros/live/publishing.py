@@ -47,6 +47,8 @@ UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle
          'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
 VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
           for name, unit in UNITS.items() for end in ('', '_sigma')}
+PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
+PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 
 def calibration_status(now: SessionView) -> DiagnosticStatus:
@@ -216,10 +218,6 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
     return DiagnosticStatus(
         level=status, name=name, message=message, hardware_id='odocal',
         values=[KeyValue(key=k, value=_value_text(v)) for k, v in values.items()])
-
-
-PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
-PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 
 class Publishing:

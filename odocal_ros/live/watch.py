@@ -28,6 +28,8 @@ from odocal_ros.output.figures import with_sigma
 from odocal_ros.safe_io.text_formats import brief_line
 
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
+MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
+HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arrives
 
 
 def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
@@ -100,10 +102,6 @@ def _values(status: dict[str, str]) -> str:
              if (bars := number(status, prefix + value))]
     provisional = 'provisional: ' if state == 'computing' and texts else ''
     return provisional + ('   '.join(texts) or 'no value yet')
-
-
-MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
-HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arrives
 
 
 class StatusListener:

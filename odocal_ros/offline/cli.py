@@ -35,6 +35,8 @@ COMMANDS = {
     'patent': ('odocal_reproductions', 'compute the embodiment of CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
+BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
+CLOCK = '{desc:<26} {elapsed}'
 
 
 class OdocalCommand:
@@ -149,10 +151,6 @@ def trace_file(text: str) -> str:
                                      encoding='utf-8', errors='backslashreplace') as f:
         f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n{text}')
     return f.name
-
-
-BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
-CLOCK = '{desc:<26} {elapsed}'
 
 
 def print_text(text: str, end: str = '\n') -> None:

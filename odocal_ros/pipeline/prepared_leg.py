@@ -42,9 +42,10 @@ from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 
-PassCallback = Callable[[int, float],
-                        None]      # called with the number of passes, and Stage.change
+# called with the number of passes, and Stage.change
+PassCallback = Callable[[int, float], None]
 WHOLE_FROM = 10.0     # judgement: sigmas, larger ones are shown without decimals
+FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
 class Paths(NamedTuple):
@@ -179,9 +180,6 @@ def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
     epoch_rate = 50.0    # Hz, least rate of attitude epochs
     return attitude(t, inputs.w_b[rows], q_nb, origin.earth_rate_n,
                     max(1, int(rate / epoch_rate)), gyro_bias)
-
-
-FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
 def configured_forward(prepared: PreparedLeg, f: Floats,

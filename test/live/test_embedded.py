@@ -103,7 +103,8 @@ def test_turns_are_long_unless_somebody_waits(embedded):
     node, client = embedded
     wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns')
     gate = threading.Event()
-    node.operation._filing._report_worker.submit(gate.wait, lambda *_: None)      # a report to be drawn
+    report_worker = node.operation._filing._report_worker
+    report_worker.submit(gate.wait, lambda *_: None)      # a report to be drawn
     wait_for(lambda: node._timer.timer_period_ns == round(AWAITED_TURN_S * 1e9), 'short turns')
     gate.set()
     wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns again')
