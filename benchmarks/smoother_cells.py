@@ -97,21 +97,21 @@ def true_levels(problem, drive):
               'fix_up': 1.0, 'gyro_walk': grade.gyro_bias_walk**2,
               'accel_walk': grade.accel_bias_walk**2}
     least = {name: max(value, problem.least[name]) for name, value in road.items()}
-    return problem.first_levels.but(correlation_time=0.0, **values, **least)
+    return problem.first_levels.replaced(correlation_time=0.0, **values, **least)
 
 
 def bounds(drive, config, leg, result):
     """Return sigmas of ln K and yaw at the truth, with the fit's levels and with the true ones."""
     from smoother_legs import truth
 
-    from odocal_ros.estimator import bound
+    from odocal_ros.estimator import cramer_rao_bound
     from odocal_ros.estimator.levels import Levels
-    from odocal_ros.estimator.prepare import problem_of
-    state, problem = truth(drive, config, leg), problem_of(leg, config)
+    from odocal_ros.estimator.prepare import make_problem
+    state, problem = truth(drive, config, leg), make_problem(leg, config)
     out = {}
-    for name, levels in (('fit', Levels.of_roots(result.details['noise'])),
+    for name, levels in (('fit', Levels.from_sigmas(result.details['noise'])),
                          ('true', true_levels(problem, drive))):
-        sigma = np.sqrt(np.diag(bound(leg, config, state, levels)))
+        sigma = np.sqrt(np.diag(cramer_rao_bound(leg, config, state, levels)))
         out |= {f'scale_{name}': float(sigma[0]), f'yaw_{name}': float(sigma[1])}
     return out
 

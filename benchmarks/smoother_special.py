@@ -9,9 +9,9 @@ import math
 import numpy as np
 from smoother_legs import leg_of, truth
 
-from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator import cramer_rao_bound, smooth
 from odocal_ros.estimator.fit import fit
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.settings.config import with_settings
 
@@ -62,10 +62,11 @@ def _dull(simulated, true_levels, seeds, options, promise):
         leg = leg_of(drive.leg(), config)
         result = smooth(leg, config)
         yaw, scale = (result.estimates[n] for n in ('yaw_mounting_angle', 'scale_factor'))
-        problem, state = problem_of(leg, config), truth(drive, config, leg)
+        problem, state = make_problem(leg, config), truth(drive, config, leg)
         levels = true_levels(problem, drive)
-        slides = levels.but(**dict.fromkeys(('side', 'side_turn', 'up'), ROAD))
-        least, sliding = (math.sqrt(bound(leg, config, state, x)[1, 1]) for x in (levels, slides))
+        slides = levels.replaced(**dict.fromkeys(('side', 'side_turn', 'up'), ROAD))
+        least, sliding = (math.sqrt(cramer_rao_bound(leg, config, state, x)[1, 1])
+                          for x in (levels, slides))
         if yaw.value is None:
             refused += 1
             print(f'    seed {seed}: {[r.text for r in result.reasons]}')
@@ -103,11 +104,11 @@ def _starts(simulated, seed, grade, noise, worst):
         _note(worst, f'IMU turned by {angle:g} deg, {grade} {noise}', usual, turned, turn)
     moving, state = _in_motion(drive, config)
     late = smooth(moving, config)
-    problem = problem_of(moving, config)
+    problem = make_problem(moving, config)
     noise_found = dict(late.details['noise'])
     tau = noise_found.pop('correlation_time')
-    levels = problem.first_levels.but(correlation_time=tau,
-                                      **{k: v**2 for k, v in noise_found.items()})
+    levels = problem.first_levels.replaced(correlation_time=tau,
+                                           **{k: v**2 for k, v in noise_found.items()})
     best = fit(problem, state, levels)
     change = [(math.log(late.estimates[NAMES[0]].value) - best.state.constants[0]),
               *(late.estimates[n].value - best.state.constants[i]

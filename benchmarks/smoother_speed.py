@@ -32,7 +32,7 @@ CELLS = {
 
 def run(name, options, seed):
     """Print one line of figures."""
-    from odocal_ros.estimator import smooth, smoother_leg
+    from odocal_ros.estimator import make_smoother_leg, smooth
     from odocal_ros.nav.standstill import standstills
     from odocal_ros.screening.inputs import place
     from odocal_ros.screening.screen import screen
@@ -47,7 +47,7 @@ def run(name, options, seed):
     placed = place(inputs, config)
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                         config.leg.standstill)
-    ready = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
+    ready = make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
     t2, cpu = time.perf_counter(), time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result = smooth(ready, config)

@@ -29,7 +29,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, wrap
 
 # s each side, for the mean of a speed: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
-START_PART = 600.0      # s, judgement: in which one bias levels a gyro that warms up
+SECTION_LENGTH = 600.0      # s, judgement: in which one bias levels a gyro that warms up
 
 
 class FittedTrack:
@@ -64,7 +64,7 @@ class FittedTrack:
                 break
             centre = float(np.angle(np.exp(1j * off).sum()))
             off = np.unwrap(centre + wrap(off - centre)) if len(off) > 1 else off
-            self.chi, self.slope = _line(middle, off)
+            self.chi, self.slope = _fit_line(middle, off)
             at_mid = np.interp(middle, t_fix, np.arange(len(t_fix)))
             k = np.unique(np.round(at_mid).astype(int))
             run = np.abs(np.diff(at[k]))
@@ -74,7 +74,7 @@ class FittedTrack:
         self.bend = 0.0 if self.slope is None else self.slope
         self.chi_at = self.chi + self.bend * (t - t[0])
         self.place = self._place(t, t_fix, z)
-        self.height = _smooth(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
+        self.height = _window_medians(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
         laid = np.interp(t_fix, t, self.place)
         self.spread = max(float(np.median(np.abs(laid - z))) / 1.18, 1e-3)
 
@@ -83,10 +83,11 @@ class FittedTrack:
         steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
         off = z - np.interp(t_fix, t, path)
-        return path + _smooth(t, t_fix, off.real) + 1j * _smooth(t, t_fix, off.imag)
+        return path + _window_medians(t, t_fix, off.real) + 1j * _window_medians(t, t_fix,
+                                                                                 off.imag)
 
 
-def _line(t: Floats, y: Floats) -> tuple[float, float]:
+def _fit_line(t: Floats, y: Floats) -> tuple[float, float]:
     """Return value at the first time and slope of a line through points, by medians."""
     if len(t) < 3:
         return float(np.median(y)), 0.0
@@ -98,7 +99,7 @@ def _line(t: Floats, y: Floats) -> tuple[float, float]:
     return float(np.median(y - slope * (t - t[0]))), slope
 
 
-def _smooth(t: Floats, t_fix: Floats, y: Floats) -> Floats:
+def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
     """Return medians over windows of 20 s, interpolated to t, without the effect of outliers."""
     if not len(y):
         return np.zeros(len(t))
@@ -117,7 +118,7 @@ class Start:
     yaw_sigma: float        # rad, of the heading by acceleration
     fix_spread: float       # m, scatter of the fixes about the track
     leg: SmootherLeg
-    parts: 'list[_Part]'
+    parts: 'list[_Section]'
     scale: float            # metres per unit of travel
 
     def with_yaw(self, yaw: float) -> 'Start':
@@ -125,15 +126,15 @@ class Start:
         return replace(self, state=_state_of_parts(self.leg, self.parts, self.scale, yaw))
 
 
-def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
-                yaw: float | None = None) -> Start:
+def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
+               yaw: float | None = None) -> Start:
     """
     Return the first state of a cold start.
 
     leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
     initial yaw mounting, rad, instead of the one estimated from accelerations.
     """
-    parts = _parts(leg, imu, priors)
+    parts = _estimate_sections(leg, imu, priors)
     K = float(np.average([part.track.K for part in parts],
                          weights=[np.abs(np.diff(part.track.X)).sum() + 1e-9 for part in parts]))
     weight = np.array([1 / part.sigma**2 for part in parts])
@@ -146,7 +147,7 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _Section:
     """Part of a leg."""
 
     t: Floats           # (n,) s, of its keyframes
@@ -157,16 +158,16 @@ class _Part:
     sigma: float        # rad
 
 
-def _parts(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Part]:
+def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
     """Return the parts of a leg, of about START_PART each, with biases of their own."""
     # one whose heading no fixes determine is joined with the next, at the end with the one before
-    count = max(1, round(float(np.ptp(imu.t[imu.key])) / START_PART))
+    count = max(1, round(float(np.ptp(imu.t[imu.key])) / SECTION_LENGTH))
     ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
-    parts, firsts = list[_Part](), [0]
+    parts, firsts = list[_Section](), [0]
 
-    def between(first: int, last: int) -> _Part:
+    def between(first: int, last: int) -> _Section:
         before = parts[-1].bias if parts else np.zeros(3)
-        return _part(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
+        return _estimate_section(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
 
     for last in ends[1:]:
         begin, end = imu.t[imu.key[[firsts[-1], last]]]
@@ -182,7 +183,7 @@ def _parts(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Part]:
     return parts
 
 
-def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Part:
+def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Section:
     """Return a part; before : (3,) gyro bias of the part before it."""
     rest = gyro_bias_at_rest(leg, imu)
     bias = before if rest is None else rest
@@ -190,11 +191,11 @@ def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _P
     K, change = len(imu.key) - 1, np.zeros(3)
     found, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                             np.array([1.0, 0.0, 0.0]), np.empty(0))
-    sums, C_0k = with_bias(found, change)
+    sums, C_0k = change_gyro_bias(found, change)
     for _ in range(2):
-        up, more = _level(leg, sums, C_0k, sigma)
+        up, more = _find_level(leg, sums, C_0k, sigma)
         change = change + more
-        sums, C_0k = with_bias(found, change)
+        sums, C_0k = change_gyro_bias(found, change)
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
     t = imu.t[imu.key]
@@ -202,13 +203,13 @@ def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _P
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
         change = change - track.slope * up_b / np.linalg.norm(up_b)
-        sums, C_0k = with_bias(found, change)
+        sums, C_0k = change_gyro_bias(found, change)
         C_Lk = level_frame(up) @ C_0k
         track = FittedTrack(leg, t, C_Lk, sums)
-    return _Part(t, C_Lk, bias + change, track, *_heading(leg, t, C_Lk, sums, track))
+    return _Section(t, C_Lk, bias + change, track, *_find_heading(leg, t, C_Lk, sums, track))
 
 
-def with_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
+def change_gyro_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
     """Return sums for a gyro bias changed by (3,), to first order, and the attitudes C_0k."""
     by = slice(0, 3)
     S = sums.S.copy()
@@ -222,8 +223,8 @@ def with_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
     return sums, C
 
 
-def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
-           bias_sigma: Floats) -> tuple[Floats, Floats]:
+def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
+                bias_sigma: Floats) -> tuple[Floats, Floats]:
     """Return up in the frame of the first keyframe and the change of the gyro bias: (3,) each."""
     C, T = C_0k[:-1], sums.T
     force = np.einsum('kij,kj->ki', C, sums.dv) / T[:, None]
@@ -247,19 +248,19 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     return up, change
 
 
-def speed_at(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
+def odometer_speed(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
     """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
     return (travel(t + SPEED_WINDOW) - travel(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
 
 
-def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
-             track: FittedTrack) -> tuple[float, float]:
+def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
+                  track: FittedTrack) -> tuple[float, float]:
     """Return the rotation from the level frame to n from accelerations, rad, and its sigma."""
     # change of velocity along the track = a times the integral of specific force in the level
     # frame, plus a tilt (constant in that frame) and an accelerometer bias (constant in b)
     direction = C_Lk[:, 0, 0] + 1j * C_Lk[:, 1, 0]
     direction = direction / np.maximum(np.abs(direction), 1e-9)
-    v = track.K * speed_at(leg.travel.at, t) * direction * np.exp(1j * track.chi_at)
+    v = track.K * odometer_speed(leg.travel.at, t) * direction * np.exp(1j * track.chi_at)
     F = (C_Lk[:-1] @ sums.dv[:, :, None])[:, :, 0]
     F = F[:, 0] + 1j * F[:, 1]
     bend = np.exp(1j * (track.chi_at[:-1] - track.chi))
@@ -285,7 +286,7 @@ def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
     return float(np.angle(x[0])), float(sigma)
 
 
-def _state(leg: SmootherLeg, part: _Part, K: float, yaw: float) -> State:
+def _state(leg: SmootherLeg, part: _Section, K: float, yaw: float) -> State:
     """Return the state of a part with scale and yaw mounting of the leg."""
     t, track, N = part.t, part.track, len(part.t)
     turned = np.exp(1j * (track.chi_at + yaw))
@@ -296,14 +297,14 @@ def _state(leg: SmootherLeg, part: _Part, K: float, yaw: float) -> State:
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     ahead = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
-    v_n = (C_nb @ ahead) * (K * speed_at(leg.travel.at, t))[:, None]
+    v_n = (C_nb @ ahead) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
     return State(t, p_n, v_n, C_nb, np.tile(part.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
                  np.zeros((N, 3)), constants)
 
 
-def _state_of_parts(leg: SmootherLeg, parts: 'Sequence[_Part]', K: float, yaw: float) -> State:
+def _state_of_parts(leg: SmootherLeg, parts: 'Sequence[_Section]', K: float, yaw: float) -> State:
     """Return the states of adjacent parts as one; each begins where the one before ends."""
     states = [_state(leg, part, K, yaw) for part in parts]
     columns = [one.of_keyframes() for one in states]

@@ -27,7 +27,7 @@ from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows
 from odocal_ros.estimator.factors.pressure import PressureRows
 from odocal_ros.estimator.factors.pseudo_observations import PriorRows, Rests, SIZES
 from odocal_ros.estimator.factors.slow_error import SlowError
-from odocal_ros.estimator.levels import LevelInformation, Levels, LevelSides
+from odocal_ros.estimator.levels import LevelInformation, LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, LN_K, PITCH, Priors, State, WITH_SLOW, YAW
@@ -43,7 +43,7 @@ def preintegrate_at(problem: Problem, state: State) -> tuple[Intervals, dict[str
     """Return the sums over all intervals, and to the times of rows by their part."""
     leg, c = problem.leg, state.constants
     times = {part.name: part.times(problem, c) for part in FACTORS
-             if issubclass(part, PointRows) and part.there(problem)}
+             if issubclass(part, PointRows) and part.is_present(problem)}
     all_t = np.concatenate(list(times.values()))
     order = np.argsort(all_t, kind='stable')
     intervals, points = preintegrate(
@@ -59,13 +59,14 @@ class Equations:
     """The factors at one linearisation point, without weights."""
 
     def __init__(self, problem: Problem, state: State,
-                 priors: Priors | None = None, spread: Floats | None = None,
+                 priors: Priors | None = None, variance_factors: Floats | None = None,
                  fitted: bool = False) -> None:
         self.state = state
         point = LinearisationPoint(state, *preintegrate_at(problem, state),
-                                   priors or problem.priors, spread, fitted)
-        self.constants_in_use = point.priors.in_use
-        self.parts = {kind.name: kind(problem, point) for kind in FACTORS if kind.there(problem)}
+                                   priors or problem.priors, variance_factors, fitted)
+        self.constants_in_use = point.priors.used_count
+        self.parts = {kind.name: kind(problem, point) for kind in FACTORS
+                      if kind.is_present(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
         """Return the equations weighted by levels."""
@@ -76,16 +77,17 @@ class Weighted:
     """
     The factors at given levels.
 
-    ``after`` applies a step; cost and components then refer to the new state. ``marginals`` are
-    those of ``Solved``.
+    After ``apply_step``, cost and components refer to the new state. ``marginals`` are those of
+    ``Solved``.
     """
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
         self.n = WITH_SLOW if levels.correlation_time else BARE
         self.m = equations.constants_in_use
-        self.parts = {name: part.weighed(levels, self.m) for name, part in equations.parts.items()
-                      if part.in_use(levels)}
+        self.parts = {name: part.weighted_copy(levels, self.m) for name,
+                      part in equations.parts.items()
+                      if part.is_used(levels)}
 
     def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
         return next(part for part in self.parts.values() if isinstance(part, kind))
@@ -107,18 +109,18 @@ class Weighted:
             raise NotPositive('the data do not determine the motion at t = '
                               f'{self.state.t[error.block]:.1f} s') from None
 
-    def after(self, solved: Solved) -> 'Weighted':
+    def apply_step(self, solved: Solved) -> 'Weighted':
         """Apply the step to the residuals, to first order; return self."""
         step, constants = solved.step, solved.step_border
         reached = self.state.moved(step, constants)
         for part in self.parts.values():
-            part.after(step, constants, reached)
+            part.apply_step(step, constants, reached)
         return self
 
     def information(self, solved: Solved) -> LevelInformation:
         """Return the information on the levels, sizes last; call before ``solved.marginals``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
-        sides = LevelSides(len(self.state.t), self.n, self.m, names)
+        sides = LevelRightHandSides(len(self.state.t), self.n, self.m, names)
         for part in self.parts.values():
             part.add_levels(sides)
         taken, moves = solved.products(sides.chain, sides.border)

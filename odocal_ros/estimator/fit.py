@@ -23,9 +23,13 @@ from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import SpeedSteps
-from odocal_ros.estimator.factors.point_rows import PointRows, rows_per_effective, TAIL_SIGMAS
+from odocal_ros.estimator.factors.point_rows import (
+    count_rows_per_independent,
+    PointRows,
+    TAIL_SIGMAS,
+)
 from odocal_ros.estimator.factors.slow_error import SlowError
-from odocal_ros.estimator.level_steps import prior_information, update
+from odocal_ros.estimator.level_steps import prior_information, update_levels
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import Priors, State
@@ -33,7 +37,7 @@ from odocal_ros.estimator.state import Priors, State
 # called after each pass; the last argument is the largest step of a constant, in sigmas
 Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
 # sigmas of a prior beyond which it is relaxed. Statistical: one sound prior in 22
-RELAXED_BEYOND = 2.0
+RELAXATION_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -66,19 +70,19 @@ class Convergence:
 
 CONVERGENCE = Convergence()
 # definition: weights of steps of the constants, and sigmas from which they do not count
-OF_ALL = np.where(np.arange(layout.M) < factor.WANTED, 1.0, CONVERGENCE.others)
-FLAT = np.full(layout.M, np.inf)
-FLAT[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
+STEP_WEIGHTS = np.where(np.arange(layout.M) < factor.PARAMETER_COUNT, 1.0, CONVERGENCE.others)
+FLAT_SIGMAS = np.full(layout.M, np.inf)
+FLAT_SIGMAS[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
 # share of the last step from which on a step that turns back is shortened. Judgement: smaller
 # reversals converge without it
 TURNS_BACK = -0.5
 # statistical: squares of noises, in sigmas, beyond which an interval is an outlier; chi2 of the
 # six of a sensor (two times, three axes) is as seldom above its limit
-TAILS = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU), 20.06, TAIL_SIGMAS**2)
+TAIL_LIMITS = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU), 20.06, TAIL_SIGMAS**2)
 # tuned: least observable share of a noise; with 0 for all, one scale sigma of 60 is doubled
 # (docs/decisions/0016). A bias that steps is observed by the intervals after it, and has none
-SEEN = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
-AGAIN_PASSES = 6    # judgement: of a fit that starts from a converged one
+LEAST_OBSERVED = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
+WARM_START_PASSES = 6    # judgement: of a fit that starts from a converged one
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,8 @@ class WarmStart:
     levels: Levels
     priors: Priors           # as relaxed by the data
     first: Priors            # before any was relaxed
-    spread: Floats           # (K, SPREAD) factors on variances: slips, jumps of slow fix errors
+    # (K, VARIANCE_FACTOR_COUNT) factors on variances: slips, jumps of slow fix errors
+    variance_factors: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +123,7 @@ class Fit(FitSummary):
 
     def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
-        return FitSummary(self.state, self.levels, self.priors, self.first, self.spread,
+        return FitSummary(self.state, self.levels, self.priors, self.first, self.variance_factors,
                           self.settled, self.creeping, self.iterations, self.likelihood)
 
 
@@ -130,17 +135,17 @@ class _Progress:
         self.fitted = self.was_fitted = fitted      # in the next pass, in the last
         self.frozen, self.fewest, self.settled = frozen, fewest, False
         # of scale and mounting: sigmas, their relative change, the larger of it and the last step
-        self.sigma, self.change, self.last = np.ones(factor.WANTED), np.inf, np.inf
+        self.sigma, self.change, self.last = np.ones(factor.PARAMETER_COUNT), np.inf, np.inf
         self.move, self.taken = np.inf, np.zeros(layout.M)     # largest step in sigmas, all steps
 
     def take(self, count: int, solved: Solved) -> None:
         """Take the steps and sigmas of a pass."""
         sigma = np.sqrt(np.diag(solved.covariance))
         step = np.abs(solved.step_border / sigma)
-        self.move = float((step * np.where(sigma < FLAT, OF_ALL, 0.0)).max())
-        before, self.sigma, last_change = self.sigma, sigma[:factor.WANTED], self.change
+        self.move = float((step * np.where(sigma < FLAT_SIGMAS, STEP_WEIGHTS, 0.0)).max())
+        before, self.sigma, last_change = self.sigma, sigma[:factor.PARAMETER_COUNT], self.change
         self.change = np.abs(np.log(self.sigma / before)).max()
-        self.last = max(step[:factor.WANTED].max(), self.change)
+        self.last = max(step[:factor.PARAMETER_COUNT].max(), self.change)
         steady = count > self.fewest and last_change < CONVERGENCE.last_sigmas \
             and self.change < min(CONVERGENCE.sigmas, last_change)
         self.settled = bool(self.fitted and self.move < CONVERGENCE.moves
@@ -163,47 +168,50 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     trace : called after each pass, for progress and benchmarks.
     """
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
-    spread = about.spread if about else np.ones((len(state.t) - 1, factor.SPREAD))
+    variance_factors = about.variance_factors if about else np.ones((len(state.t) - 1,
+                                                                     factor.VARIANCE_FACTOR_COUNT))
     # passes in which heavy tails are updated: earlier, the residuals contain the start; later,
     # the tails are constant
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
-    judged = 3 if about is None else 0 if problem.per_effective else 1
+    judged = 3 if about is None else 0 if problem.rows_per_independent else 1
     pace: dict[str, tuple[float, float]] = {}
     progress = _Progress(about is not None, frozen, tails + 2)
     count, state = 0, state.level()
     while True:
         count += 1
-        weighted = Equations(problem, state, priors, spread, progress.fitted).at(levels)
-        solved = damped(weighted.solved(), progress.taken)
+        weighted = Equations(problem, state, priors, variance_factors, progress.fitted).at(levels)
+        solved = damp_step(weighted.solved(), progress.taken)
         progress.take(count, solved)
         state = state.moved(solved.step, solved.step_border)
-        weighted.after(solved)
+        weighted.apply_step(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved, progress.move)
         if progress.settled or count >= most:
             break
         if count == judged:
-            problem.per_effective = per_effective(problem, weighted)
+            problem.rows_per_independent = find_rows_per_independent(problem, weighted)
         if not frozen:
             marginals = solved.marginals()
             tail, before_levels = tails <= count <= last_tails, levels
-            levels = update(weighted, marginals, levels, problem, pace, progress.was_fitted)
+            levels = update_levels(weighted, marginals, levels, problem, pace, progress.was_fitted)
             # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
-                spread = slips(weighted, marginals, spread, before_levels, levels)
-                priors = relaxed(first, priors, state, solved, marginals)
+                variance_factors = update_variance_factors(weighted, marginals, variance_factors,
+                                                           before_levels, levels)
+                priors = relax_priors(first, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # the largest memory of a long leg
     settled = progress.settled or bool(progress.last < CONVERGENCE.nearly)
     creeping = not settled and bool(progress.last < CONVERGENCE.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
-    return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
+    return Fit(state, levels, priors, first, variance_factors, settled or creeping, creeping,
+               count,
                likelihood, weighted, solved, by_levels, find_constant_steps(weighted, solved))
 
 
-def damped(solved: Solved, taken: Floats) -> Solved:
+def damp_step(solved: Solved, taken: Floats) -> Solved:
     """
     Return the step, shortened if it reverses the previous step, docs/method.md (S27a).
 
@@ -217,15 +225,16 @@ def damped(solved: Solved, taken: Floats) -> Solved:
     return replace(solved, step=by * solved.step, step_border=by * solved.step_border, taken=by)
 
 
-def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels: Levels,
-          onward: Levels) -> Floats:
+def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
+                            variance_factors: Floats, levels: Levels,
+                            onward: Levels) -> Floats:
     """
-    Return the variance factors of outlier intervals: (K, SPREAD).
+    Return the variance factors of outlier intervals: (K, VARIANCE_FACTOR_COUNT).
 
     levels, onward : of this pass and of the next; outliers are evaluated at the next.
     """
     rows = weighted[MotionRows]
-    jumps = np.zeros((2, len(spread), 1))
+    jumps = np.zeros((2, len(variance_factors), 1))
     if 'slow' in weighted.parts:
         jumps = weighted[SlowError].jumps(marginals)
     noise, found = (np.concatenate(x, axis=1) for x in zip(
@@ -234,42 +243,42 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
     jumped = onward['slow'] / levels['slow'] if 'slow' in weighted.parts else 1.0
     grown = np.concatenate([grown, np.full((len(grown), 1), jumped)], axis=1)
     z2 = noise**2 / np.maximum(found, 1e-12) / grown
-    z2[found < SEEN] = 0.0          # not observable in this interval
-    wanted = np.clip(spread * z2 / TAILS, 1.0, 1e6)
+    z2[found < LEAST_OBSERVED] = 0.0          # not observable in this interval
+    wanted = np.clip(variance_factors * z2 / TAIL_LIMITS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
-    wanted[:, :factor.JUMP] = np.sqrt(spread * wanted)[:, :factor.JUMP]
+    wanted[:, :factor.JUMP] = np.sqrt(variance_factors * wanted)[:, :factor.JUMP]
     return wanted
 
 
-def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
+def find_rows_per_independent(problem: Problem, weighted: Weighted) -> dict[str, float]:
     """Return rows per independent row, by residuals of other sensors and of speed steps."""
     # at constant acceleration errors of speed steps repeat
-    return {name: rows_per_effective(part) for name, part in weighted.parts.items()
+    return {name: count_rows_per_independent(part) for name, part in weighted.parts.items()
             if name in (*problem.external, SpeedSteps.name) and isinstance(part, PointRows)}
 
 
-def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
-            marginals: JointMarginals) -> Priors:
+def relax_priors(first: Priors, now: Priors, state: State, solved: Solved,
+                 marginals: JointMarginals) -> Priors:
     """Return priors widened where the data are far from their centre, docs/method.md (S30)."""
     n = solved.step.shape[1]
     P0 = np.diagonal(marginals[0])[:n]
     variance = np.diag(solved.covariance)
-    constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
+    constants = _widen(first.constants, now.constants, state.constants - first.centre, variance)
     # sizes of imperfections are levels; the grid holds that offset; times are of receivers as made
     for held in (layout.IMPERFECT, layout.SPEED_OFFSET, layout.FIX_TIME):
         constants[held] = now.constants[held]
     return replace(
         now,
-        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[layout.BG]),
-        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[layout.BA]),
+        gyro_bias=_widen(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[layout.BG]),
+        accel_bias=_widen(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[layout.BA]),
         constants=constants)
 
 
-def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
+def _widen(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
     """Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first."""
     # at most 30 times the first: a larger difference is a wrong setting, which is reported
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
     z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)
-    wide = np.clip(now_ * np.sqrt(z2) / RELAXED_BEYOND, first_, 30 * first_)
+    wide = np.clip(now_ * np.sqrt(z2) / RELAXATION_SIGMAS, first_, 30 * first_)
     return np.where(held, wide, np.inf)

@@ -22,15 +22,15 @@ from odocal_ros.calib.result import MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive
-from odocal_ros.estimator.cold_start import speed_at, SPEED_WINDOW
-from odocal_ros.estimator.factors.factor import SPREAD, WANTED
+from odocal_ros.estimator.cold_start import odometer_speed, SPEED_WINDOW
+from odocal_ros.estimator.factors.factor import PARAMETER_COUNT, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.odometer import as_rolled
-from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace, WarmStart
+from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES, WarmStart
 from odocal_ros.estimator.imu import imu_rows, ImuSteps, nearest_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import preintegrate
-from odocal_ros.estimator.prepare import problem_of, SPACING
+from odocal_ros.estimator.prepare import make_problem, SPACING
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
@@ -42,13 +42,13 @@ from odocal_ros.settings.config import Config
 
 # s, judgement: length from which a window is finished, once the next has this length
 LONG_WINDOW, NEXT_WINDOW = 600.0, 120.0
-LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
-ANEW_GROWTH = 1.5       # judgement: growth of the window after which a fit is a cold start
+UPDATE_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
+COLD_START_GROWTH = 1.5       # judgement: growth of the window after which a fit is a cold start
 DRIVING_SPEED = 0.5     # m/s; judgement: slower motion does not count as driving
 
 
 @dataclass(frozen=True, eq=False)
-class Running:
+class RunningEstimate:
     """The running estimate."""
 
     method: MethodResult  # result if the leg ended here
@@ -73,14 +73,14 @@ class GrowingFit:
         self._per_effective: dict[str, float] = {}
         self._cold_at = 0.0      # s, length of the window at its last cold start
         # the finished windows, and with the one in progress, and where they end, s
-        self._past: tuple[Running, float] | None = None
-        self._next: tuple[Running, float] | None = None
+        self._past: tuple[RunningEstimate, float] | None = None
+        self._next: tuple[RunningEstimate, float] | None = None
 
     def forget(self) -> None:
         """Make the next fit a cold start."""
         self._last, self.cold_start_cpu_s = None, 0.0
 
-    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> Running:
+    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> RunningEstimate:
         """
         Return the running estimate.
 
@@ -101,17 +101,17 @@ class GrowingFit:
                 raise
             return self._past[0]
         if self._past is not None:
-            now = _joined(self._past[0], now, config)
+            now = _join_windows(self._past[0], now, config)
         if (self._next is None and view.t_stop - view.t_begin > LONG_WINDOW
                 and now.method.verdict is not Verdict.REJECTED):
             self._next = now, view.t_stop
         return now
 
     def _window(self, last: WarmStart | None, view: SmootherLeg, config: Config,
-                trace: Trace) -> Running:
+                trace: Trace) -> RunningEstimate:
         try:
             with raised_if_wild():
-                problem = problem_of(view, config, steps_of(view, SPACING))
+                problem = make_problem(view, config, make_imu_steps(view, SPACING))
                 best = self._fit(last, problem, config, trace)
                 if not best.settled:
                     raise BadData('the smoother has not converged on the data so far')
@@ -119,14 +119,14 @@ class GrowingFit:
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = best.summary()
-        self._per_effective = problem.per_effective
-        return Running(method, _sigmas(method), *_driven(best.state))
+        self._per_effective = problem.rows_per_independent
+        return RunningEstimate(method, _parameter_sigmas(method), *_motion_summary(best.state))
 
     def _fit(self, last: WarmStart | None, problem: Problem, config: Config, trace: Trace) -> Fit:
-        problem.per_effective = self._per_effective
+        problem.rows_per_independent = self._per_effective
         duration = problem.leg.t_stop - problem.leg.t_begin
-        grown = duration > ANEW_GROWTH * self._cold_at
-        begun = None if last is None or grown else carried(last, problem)
+        grown = duration > COLD_START_GROWTH * self._cold_at
+        begun = None if last is None or grown else extend_warm_start(last, problem)
         if begun is None:
             begin, self._cold_at = self._cpu_s(), duration
             best = best_fit(problem, config, trace)
@@ -135,19 +135,20 @@ class GrowingFit:
         # the levels are kept until the state of the new section is estimated as well
         near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
                    trace=trace).summary()
-        best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
+        best = fit(problem, near.state, near.levels, UPDATE_PASSES, about=near, trace=trace)
         if not best.settled or best.creeping:
-            best = fit(problem, best.state, best.levels, AGAIN_PASSES, about=best, trace=trace)
+            best = fit(problem, best.state, best.levels, WARM_START_PASSES, about=best,
+                       trace=trace)
         return best
 
 
-def _joined(past: Running, now: Running, config: Config) -> Running:
+def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
     # tyres warm up from the begin of a leg: each window has its own rate
     legs = [replace(one.method, border=_border(one.method).loosened({CONSTANTS[BY_TIME]: np.inf}))
             for one in (past, now)]
     whole = combine_legs(legs, [0] * len(legs), config)
-    sigmas = _sigmas(whole)
+    sigmas = _parameter_sigmas(whole)
     # the largest sources are those of the window in progress
     smaller = np.where(np.isfinite(now.sigmas), sigmas / now.sigmas, 1.0)[:, None]
     reasons = {(r.code, r.text): r for r in (*now.method.reasons, *whole.reasons)}
@@ -155,17 +156,18 @@ def _joined(past: Running, now: Running, config: Config) -> Running:
         now.method, estimates=now.method.estimates | whole.estimates, border=whole.border,
         reasons=tuple(reasons.values()),
         sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
-    return Running(method, sigmas, past.distance + now.distance, past.agility + now.agility,
-                   now.speed)
+    return RunningEstimate(method, sigmas, past.distance + now.distance, past.agility
+                           + now.agility,
+                           now.speed)
 
 
-def _sigmas(method: MethodResult) -> Floats:
+def _parameter_sigmas(method: MethodResult) -> Floats:
     """Return the sigmas of ln scale, yaw and pitch, also of undetermined ones: (3,)."""
     border = _border(method)
     legs = LinkedLegs([border], CONSTANTS[LN_K], np.empty(0))
-    at = legs.place(0)[:WANTED]
+    at = legs.place(0)[:PARAMETER_COUNT]
     sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[at]), MODEL_FLOOR)
-    sigmas[border.sigma[:WANTED] <= NO_ERROR] = np.inf
+    sigmas[border.sigma[:PARAMETER_COUNT] <= NO_ERROR] = np.inf
     for i, name in enumerate(PARAMETERS):
         e = method.estimates[name]
         if e.value is not None and e.sigma is not None:
@@ -178,8 +180,8 @@ def _border(method: MethodResult) -> Border:
     return method.border
 
 
-def _driven(state: State) -> tuple[float, float, float]:
-    """Return distance, agility and speed of a window, as ``Running`` has them."""
+def _motion_summary(state: State) -> tuple[float, float, float]:
+    """Return distance, agility and speed of a window, as ``RunningEstimate`` has them."""
     T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
     moving = steps > DRIVING_SPEED * T
     gained = np.diff(state.v_n[:, :2], axis=0)
@@ -187,7 +189,7 @@ def _driven(state: State) -> tuple[float, float, float]:
             float(np.median((steps / T)[moving])) if moving.any() else 0.0)
 
 
-def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
+def make_imu_steps(view: SmootherLeg, spacing: float) -> ImuSteps:
     """
     Return the steps of a leg whose keyframes keep their times as it grows.
 
@@ -200,7 +202,7 @@ def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
     return ImuSteps.between(view, key + first)
 
 
-def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
+def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
     """
     Return the start from the last fit, extended to new keyframes.
 
@@ -212,19 +214,20 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     same = np.abs(old[at] - t) < rounding
     n = len(t) if same.all() else int(np.argmin(same))
     # s at the end, in which rows may have arrived late
-    if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.in_use != problem.priors.in_use:
+    if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
         return None
     at = at[:n]
     state = replace(last.state, **{
         name: value[at] for name, value in last.state.of_keyframes().items()})
-    slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
-    spread = np.concatenate([slipped, np.ones((len(t) - n, SPREAD))])
-    levels = problem.first_levels.but(**last.levels.values)
-    return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors,
-                     problem.priors, spread)
+    slipped = [last.variance_factors[a:b].mean(axis=0) for a,
+               b in zip(at[:-1], at[1:], strict=True)]
+    variance_factors = np.concatenate([slipped, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
+    levels = problem.first_levels.replaced(**last.levels.values)
+    return WarmStart(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
+                     last.priors, problem.priors, variance_factors)
 
 
-def _reckoned(state: State, problem: Problem) -> State:
+def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     """Return a state extended by dead reckoning with gyro and odometer to the new keyframes."""
     imu, leg, n = problem.imu, problem.leg, len(state.t)
     key = imu.key[n - 1:]
@@ -245,7 +248,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
     steps = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
     on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(steps, axis=0)
-    on['v_n'][n:] = (C[n:] @ f) * speed_at(travel, t[n:])[:, None]
+    on['v_n'][n:] = (C[n:] @ f) * odometer_speed(travel, t[n:])[:, None]
     gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
         on['p_n'][n:], leg.origin)
     for late in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):

@@ -25,7 +25,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 # minimum number of spans in a leg: statistical, their variance is then good to 35 %, with two axes
-FEWEST_SPANS = 8
+LEAST_SPANS = 8
 SLOW_COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
 
 
@@ -44,20 +44,20 @@ class OverRelaxation:
 
 RELAXATION = OverRelaxation()
 # pseudo-observations of the prior of an IMU level. Judgement: equivalent to a few seconds
-PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
+PSEUDO_OBSERVATIONS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 # levels of rows with slips
-SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
+SLIP_LEVELS = ('along', 'along_hard', 'side', 'side_turn', 'up')
 
 
 def prior_information(levels: Levels) -> dict[str, float]:
     """Return the prior information on the logarithm of each level."""
     return {name: SIZE_SPREADS[name]**-2 if name in SIZES
             else TIME_SPREAD**-2 if name == 'correlation_time'
-            else PRIOR_ROWS.get(name, 1.0) / 2 for name in levels.values}
+            else PSEUDO_OBSERVATIONS.get(name, 1.0) / 2 for name in levels.values}
 
 
-def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, problem: Problem,
-           pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
+def update_levels(weighted: Weighted, marginals: JointMarginals, levels: Levels, problem: Problem,
+                  pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
     """
     Return the levels after one step of (S27), docs/method.md.
 
@@ -65,27 +65,31 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
     """
     new, found = {}, weighted.components(marginals)
     if 'slow' in found and 'fix' in found:
-        for name, by in long_run(weighted[Fixes], levels, found).items():
+        for name, by in long_span_factors(weighted[Fixes], levels, found).items():
             found[name] = by * found[name][0], found[name][1]
     for name, (quadratic, expected) in found.items():
         level = levels[name]
         # the others have one pseudo-observation, at their current value: with more, iterations
         # would end at too large a noise
-        pseudo = PRIOR_ROWS.get(name, 1.0)
-        pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
+        pseudo = PSEUDO_OBSERVATIONS.get(name, 1.0)
+        pull = pseudo * (problem.first_levels[name] / level if name in PSEUDO_OBSERVATIONS
+                         else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
-        first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
-        move = np.clip(_paced(pace, name, step, first) * step, np.log(0.03), np.log(30.0))
+        first = RELAXATION.first if name in SLIP_LEVELS or name in PSEUDO_OBSERVATIONS else 1.0
+        move = np.clip(_relaxation_exponent(pace, name, step, first) * step, np.log(0.03),
+                       np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
     # the first steps are not compared: their residuals depend on the initial state
     for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
         step = float(np.log(size / levels[name]))
-        new[name] = levels[name] * float(np.exp(min(_paced(pace, name, step, 1.0), 1.0) * step))
-    return levels.but(**new)
+        new[name] = levels[name] * float(np.exp(min(_relaxation_exponent(pace, name, step, 1.0),
+                                                    1.0) * step))
+    return levels.replaced(**new)
 
 
-def _paced(pace: dict[str, tuple[float, float]], name: str, step: float, first: float) -> float:
+def _relaxation_exponent(pace: dict[str, tuple[float, float]], name: str, step: float,
+                         first: float) -> float:
     """Return the exponent of a step: larger after one in the same direction, else smaller."""
     power, last = pace.get(name, (first, 0.0))
     if step * last < 0:
@@ -96,8 +100,8 @@ def _paced(pace: dict[str, tuple[float, float]], name: str, step: float, first: 
     return pace[name][0]
 
 
-def long_run(fixes: Fixes, levels: Levels,
-             found: dict[str, tuple[float, float]]) -> dict[str, float]:
+def long_span_factors(fixes: Fixes, levels: Levels,
+                      found: dict[str, tuple[float, float]]) -> dict[str, float]:
     """
     Return the factors, 1 or more, by which correlated errors exceed the model of their steps.
 
@@ -111,7 +115,7 @@ def long_run(fixes: Fixes, levels: Levels,
     stated = 1 / np.diagonal(fixes.root, axis1=1, axis2=2)**2
     time, out = levels.correlation_time, dict.fromkeys(SLOW_COLUMNS, 1.0)
     span = max(1.0, 2 * float(np.median(np.diff(t))))
-    while t[-1] - t[0] > FEWEST_SPANS * span:
+    while t[-1] - t[0] > LEAST_SPANS * span:
         end = np.searchsorted(t, t + span)
         a = np.flatnonzero(end < len(t))
         b = end[a]

@@ -19,7 +19,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import room
 
-SLOW_LEVELS = ('slow', 'slow_up')
+CORRELATED_LEVELS = ('slow', 'slow_up')
 
 
 @dataclass(frozen=True)
@@ -64,25 +64,25 @@ class Levels:
         """Return the correlation time of the correlated fix error, s, 0: none."""
         return self.values.get('correlation_time', 0.0)
 
-    def but(self, **values: float) -> 'Levels':
+    def replaced(self, **values: float) -> 'Levels':
         """Return levels with some values replaced."""
         return Levels(self.values | values)
 
-    def roots(self) -> dict[str, float]:
+    def sigmas(self) -> dict[str, float]:
         """Return standard deviations, stationary ones of correlated errors, and the time."""
         time = self.correlation_time
-        return {k: float(np.sqrt(v * (time / 2 if k in SLOW_LEVELS else 1.0)))
+        return {k: float(np.sqrt(v * (time / 2 if k in CORRELATED_LEVELS else 1.0)))
                 for k, v in self.values.items()} | {'correlation_time': time}
 
     @classmethod
-    def of_roots(cls, roots: dict[str, float]) -> 'Levels':
+    def from_sigmas(cls, roots: dict[str, float]) -> 'Levels':
         """Return the levels with these standard deviations."""
         time = roots['correlation_time']
-        return cls({k: v**2 / (time / 2 if time and k in SLOW_LEVELS else 1.0)
+        return cls({k: v**2 / (time / 2 if time and k in CORRELATED_LEVELS else 1.0)
                     for k, v in roots.items()} | {'correlation_time': time})
 
 
-class LevelSides:
+class LevelRightHandSides:
     """
     The right-hand sides of L levels, at first all zero.
 

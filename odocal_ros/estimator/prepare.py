@@ -10,7 +10,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import EXTERNAL_FACTORS, FACTORS
-from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
+from odocal_ros.estimator.factors.axle import mean_rates_at, WARM_TIME
 from odocal_ros.estimator.factors.gnss import whitener
 from odocal_ros.estimator.factors.interval_noise import total_turn
 from odocal_ros.estimator.factors.pseudo_observations import SHARED
@@ -46,8 +46,9 @@ LIFT_SIGMA = 0.02
 HEIGHT_TIME = 900.0     # s, physical: in which ionosphere and orbits change by their size
 
 
-def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats, spans: Floats,
-                 rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
+def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats,
+                      spans: Floats,
+                      rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
     """
     Return the smoother's view of screened inputs.
 
@@ -77,7 +78,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         wheels=inputs.travels)
 
 
-def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
+def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
     """Return the problem of a leg; ``imu``: its steps, if keyframes are given."""
     imu = ImuSteps.of(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
@@ -94,13 +95,13 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     made = Problem(
         leg, imu, grade, _priors(config, grade, leg), use, root, still,
         {name: sent for name, sent in within.items() if len(sent.t)}, own, total_turn(leg, imu),
-        config.gnss.correlation_time, rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
+        config.gnss.correlation_time, mean_rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
         drift_time(leg, t), LEAST.fix if not leg.origin.local
         or config.reference.points else LEAST.pose)     # a robot stands on marks
     for part in FACTORS:
-        if part.there(made):
+        if part.is_present(made):
             first, least = part.first_levels(made)
-            made.first_levels = made.first_levels.but(**first)
+            made.first_levels = made.first_levels.replaced(**first)
             made.least |= least
     # with vibration, most of which cancels within a second: initial levels that decrease
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
@@ -109,7 +110,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     return made
 
 
-def imperfect_sigmas(grade: Grade) -> Floats:
+def imperfection_sigmas(grade: Grade) -> Floats:
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
@@ -146,7 +147,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[layout.ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[layout.GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    sigma[layout.IMPERFECT] = np.maximum(imperfect_sigmas(grade), layout.NO_ERROR)
+    sigma[layout.IMPERFECT] = np.maximum(imperfection_sigmas(grade), layout.NO_ERROR)
     # of IMUs as sold, also for a calibrated one: otherwise a bias would be estimated as an axis
     # error, and change the yaw of a tilted IMU
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))

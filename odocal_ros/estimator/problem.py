@@ -37,7 +37,7 @@ class Problem:
     least: dict[str, float] = field(default_factory=dict)     # levels
     vibrating: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
     # velocity, heading, steps of speed: errors that are one
-    per_effective: dict[str, float] = field(default_factory=dict)
+    rows_per_independent: dict[str, float] = field(default_factory=dict)
 
     @property
     def fix_sigma(self) -> float:

@@ -16,7 +16,7 @@ from odocal_ros.calib.joint import FREE_STEP, Joint, joint, scale_steps, ScaleSt
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.value_limits import cause_of_change, format_change
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.estimator.factors.factor import WANTED
+from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 from odocal_ros.estimator.factors.pseudo_observations import SHARED, SIZE
 from odocal_ros.estimator.result.estimates import (
     estimate_constants,
@@ -36,8 +36,8 @@ from odocal_ros.settings.nominal import grade_of
 # usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
 # by load and the cross slopes of roads. Judgement
 SCATTER = 2e-5, 3.5e-5, 8.7e-5
-DELAY_DIFFERS = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
-                 'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')
+DELAY_REMEDY = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
+                'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')
 
 
 def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
@@ -57,17 +57,19 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
     days = np.diff(np.asarray(times_ns)[order]) / DAY_NS
-    borders = _of_one_vehicle([leg.border for leg in legs])
+    borders = _share_sizes([leg.border for leg in legs])
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
-    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
+    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
-                  dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True)), (days == 0).tolist())
+    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
+                  CONSTANTS[:PARAMETER_COUNT],
+                  dict(zip(CONSTANTS[:PARAMETER_COUNT], SCATTER, strict=True)),
+                  (days == 0).tolist())
     at = [found.names.index(name) for name in CONSTANTS]
     C = with_model_floor(found.covariance[np.ix_(at, at)])
-    common = _common(legs)
-    C[:WANTED, :WANTED] += sum(s.effects @ s.effects.T for s in common)
+    common = _common_sources(legs)
+    C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
     scale = legs[-1].estimates['scale_factor']
@@ -83,18 +85,19 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
         why.append(not_observable_reason(f'these {len(legs)} drives', unsaid))
-    sources = _sources(found.used[at] * found.factor, C, common)
+    sources = _error_sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
-    said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
-    return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
+    said = [_scale_change_reason(change, np.asarray(times_ns)[order], names) for change in changes]
+    return MethodResult('smoother', (*said, *_disagreement_reasons(found, names), *why), estimates,
+                        PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
                         | {'beside': additional_figures(found.value[at], C, grade)}
                         | wheel_details(wheels),
                         found.carried)
 
 
-def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
+def _share_sizes(borders: Sequence[Border]) -> list[Border]:
     """Return borders with the same sizes of imperfections: geometric means by information."""
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
@@ -113,20 +116,20 @@ def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
         border.names, border.used, strict=True)])) for border in borders]
 
 
-def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
+def _scale_change_reason(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
     """Return the reason for a scale that changed between two legs: size, time, likely cause."""
     relative = float(np.expm1(change.change))
     since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
     return Reason(Code.SCALE_CHANGED, f'the scale changed by {format_change(relative)} '
                   f'({abs(change.sigmas):.1f} sigma) since {since.replace("T", " ")} UTC, seen '
-                  f'in {_name(numbers[change.leg])}: {cause_of_change(relative)}')
+                  f'in {_leg_name(numbers[change.leg])}: {cause_of_change(relative)}')
 
 
-def _name(number: int) -> str:
+def _leg_name(number: int) -> str:
     return f'leg {number}' if number else 'the saved result'
 
 
-def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
+def _disagreement_reasons(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
     J, said = len(found.deviation), list[Reason]()
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
@@ -137,30 +140,31 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
-        who = f'; {_name(numbers[k])} differs most ({z[k]:+z.1f} sigma from the others)' * (J > 2)
+        who = f'; {_leg_name(numbers[k])} differs most ({z[k]:+z.1f} sigma from the others)' * (
+            J > 2)
         said.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
-            f'times their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
+            f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
     if found.factor > 1:
         of = ' in all parameters but scale, yaw and pitch' * bool(found.between)
         said.append(Reason(
             Code.LEGS_DISAGREE, f'the scatter of {J} legs{of} is {found.factor:.1f} times their '
-            f'uncertainties; {_largest(found, numbers)}'))
+            f'uncertainties; {_largest_deviation(found, numbers)}'))
     return tuple(said)
 
 
-def _largest(found: Joint, numbers: list[int]) -> str:
+def _largest_deviation(found: Joint, numbers: list[int]) -> str:
     """Return the largest deviation of a constant without scatter between legs, as text."""
     own = [i for i, name in enumerate(found.names) if name not in found.between]
     z = found.deviation[:, own]
     j, i = np.unravel_index(np.argmax(np.abs(z)), z.shape)
     # two legs have the same deviation from each other
-    of_leg = f' of {_name(numbers[j])}' * (len(z) > 2)
+    of_leg = f' of {_leg_name(numbers[j])}' * (len(z) > 2)
     text = f'{found.names[own[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
     return text if abs(z[j, i]) > REMARK_SIGMAS else f'no parameter alone explains it: {text}'
 
 
-def _common(legs: Sequence[MethodResult]) -> list[Source]:
+def _common_sources(legs: Sequence[MethodResult]) -> list[Source]:
     """Return the errors beside those of the fits that are the same in all legs: the largest."""
     of: dict[str, Source] = {}
     for source in (s for leg in legs for s in leg.sources if s.shared and s.name not in SHARED):
@@ -169,15 +173,15 @@ def _common(legs: Sequence[MethodResult]) -> list[Source]:
     return list(of.values())
 
 
-def _sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:
+def _error_sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:
     """Return the budget: shared errors of the vehicle, and the effects of each leg."""
-    sigmas = np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))
-    correlation = np.abs(C[:WANTED] / sigmas).max(axis=0)
-    shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
+    sigmas = np.sqrt(np.outer(np.diag(C)[:PARAMETER_COUNT], np.diag(C)))
+    correlation = np.abs(C[:PARAMETER_COUNT] / sigmas).max(axis=0)
+    shared = [Source(name, C[:PARAMETER_COUNT, i] / used[i], True) for name, i in SHARED.items()
               if correlation[i].max() > 1e-9]      # of a correlation: rounding
     shared += common
     apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
-    return (*shared, Source('legs', root_of(C[:WANTED, :WANTED] - apart)),
+    return (*shared, Source('legs', root_of(C[:PARAMETER_COUNT, :PARAMETER_COUNT] - apart)),
             Source('model', np.diag(MODEL_FLOOR)))
 
 
@@ -187,7 +191,7 @@ def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...]
     return {
         'legs_used': legs, 'widened': found.factor,
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
-        'correlation': correlations(C[:WANTED, :WANTED], PARAMETERS),
+        'correlation': correlations(C[:PARAMETER_COUNT, :PARAMETER_COUNT], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
                          'between_legs': found.between, 'curvature': found.bent.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}

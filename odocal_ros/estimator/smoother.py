@@ -10,14 +10,14 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
-from odocal_ros.estimator.cold_start import first_state, Start
+from odocal_ros.estimator.cold_start import cold_start, Start
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
-from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace
+from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES
 from odocal_ros.estimator.imu import imu_rows
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.estimates import implausible_imu_reasons, refused_result
 from odocal_ros.estimator.result.outcome import make_result
@@ -29,7 +29,7 @@ from odocal_ros.settings.nominal import nominal_yaw
 
 # rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
 # are tried for this number of passes
-TWO_HEADINGS, START_PASSES = 0.1, 3
+AMBIGUOUS_HEADING, TRIAL_PASSES = 0.1, 3
 # initial size of a receiver's own odometer, and s of a leg from which on it is used: ten times the
 # time in which satellites correct it; shorter legs cannot separate it. Tuned: in yards of 300 s
 # with one 5 % off the fit from 0.5 finds a scale and an accelerometer 3 % off instead, 9 to 12
@@ -45,10 +45,10 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     called with each pass of the iteration, for benchmarks. An undetermined value is None with its
     reason.
     """
-    few = too_little_of(leg)
+    few = missing_samples_reason(leg)
     if few:
         return refused_result([few], leg.scale_unit, leg.wheels)
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
@@ -68,10 +68,10 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
     a few passes continues. The offset of a quantised speed is then tested for two usual values.
     """
     # not stored in a variable: one fit in memory at a time
-    return _with_known_offset(problem, _fit(problem, config, trace), trace)
+    return _fix_speed_offset(problem, _fit_from_starts(problem, config, trace), trace)
 
 
-def _with_known_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
+def _fix_speed_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
     """Return a fit with the offset of a coarse speed fixed to that of truncation or rounding."""
     coarse = problem.leg.travel.coarse
     if coarse is None or not coarse.truncation:
@@ -88,37 +88,37 @@ def _with_known_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
     summary = now.summary()
     del now             # the equations of one fit at a time
     sure = 1e-3 * coarse.step       # practically fixed
-    about = replace(summary, priors=_held(summary.priors, known, sure),
-                    first=_held(summary.first, known, sure))
-    last = fit(problem, replace(about.state, constants=constants), about.levels, AGAIN_PASSES,
+    about = replace(summary, priors=_fix_offset_priors(summary.priors, known, sure),
+                    first=_fix_offset_priors(summary.first, known, sure))
+    last = fit(problem, replace(about.state, constants=constants), about.levels, WARM_START_PASSES,
                about=about, frozen=True, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 
 
-def _held(priors: Priors, value: float, sigma: float) -> Priors:
+def _fix_offset_priors(priors: Priors, value: float, sigma: float) -> Priors:
     """Return priors with the offset known."""
     constants, centre = priors.constants.copy(), priors.centre.copy()
     constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value
     return replace(priors, constants=constants, centre=centre)
 
 
-def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
+def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     nominal, level = nominal_yaw(config), problem.leg.has_accelerometer
-    start = first_state(problem.leg, problem.imu, problem.priors, None if level else nominal)
+    start = cold_start(problem.leg, problem.imu, problem.priors, None if level else nominal)
     starts, passes = [start], config.leg.compute_limit
-    if level and start.yaw_sigma > TWO_HEADINGS:
+    if level and start.yaw_sigma > AMBIGUOUS_HEADING:
         other = start.with_yaw(nominal)
         turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
-        starts += [other] * bool(abs(turned) > TWO_HEADINGS)
+        starts += [other] * bool(abs(turned) > AMBIGUOUS_HEADING)
     if len(starts) == 1:
-        return fit(problem, start.state, _first_levels(problem, start), passes, trace=trace)
-    about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
+        return fit(problem, start.state, _initial_levels(problem, start), passes, trace=trace)
+    about = max((fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
                  for one in starts), key=lambda f: f.likelihood).summary()
     last = fit(problem, about.state, about.levels, passes, about=about, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 
 
-def _first_levels(problem: Problem, start: Start) -> Levels:
+def _initial_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels: fixes no better than their fit to the odometer track."""
     wide, wide_up = (max(1.0, (spread / sigma)**2) for spread, sigma in (
         (start.fix_spread, problem.fix_sigma), (2 * start.fix_spread, problem.height_sigma)))
@@ -126,20 +126,21 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
     leg = problem.leg
     long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
-    return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide_up,
-                                    correlation_time=time, **sizes, **problem.vibrating)
+    return problem.first_levels.replaced(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE
+                                         * wide_up,
+                                         correlation_time=time, **sizes, **problem.vibrating)
 
 
-def too_little_of(leg: SmootherLeg) -> Reason | None:
+def missing_samples_reason(leg: SmootherLeg) -> Reason | None:
     """Return the reason if a leg has too few fixes with IMU rows, else None."""
     _, t = imu_rows(leg)
     if len(t) < 2:
-        return too_little(0, 0.0)
+        return too_few_samples_reason(0, 0.0)
     beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    return too_little(int(beside.sum()), float(t[-1] - t[0]))
+    return too_few_samples_reason(int(beside.sum()), float(t[-1] - t[0]))
 
 
-def too_little(fixes: int, seconds: float) -> Reason | None:
+def too_few_samples_reason(fixes: int, seconds: float) -> Reason | None:
     """Return the reason if a number of fixes, or their duration, is too small, else None."""
     fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
     if fixes >= fewest and seconds >= shortest:
@@ -150,11 +151,11 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
                   f'data; the smoother needs at least {fewest} fixes and {shortest:.0f} s')
 
 
-def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels) -> Floats:
+def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels) -> Floats:
     """
     Return the covariance of the constants at a given state: (M, M), ln K first.
 
     The inverse of the information that the rows hold there, priors of the constants included.
-    truth : values of all unknowns, at the keyframes of ``problem_of``.   levels : noise levels.
+    truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
-    return Equations(problem_of(leg, config), truth, fitted=True).at(levels).solved().covariance
+    return Equations(make_problem(leg, config), truth, fitted=True).at(levels).solved().covariance

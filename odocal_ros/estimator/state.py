@@ -242,6 +242,6 @@ class Priors:
     centre: Floats               # (M,) of the constants
 
     @property
-    def in_use(self) -> int:
+    def used_count(self) -> int:
         """Return the number of constants up to the last one that a row depends on."""
         return int(np.flatnonzero(self.constants > NO_ERROR)[-1]) + 1

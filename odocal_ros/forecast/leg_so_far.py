@@ -21,11 +21,11 @@ from odocal_ros.data.samples import ImuSamples
 from odocal_ros.errors import BadData
 from odocal_ros.estimator import (
     GrowingFit,
-    Running,
-    smoother_leg,
+    make_smoother_leg,
+    missing_samples_reason,
+    RunningEstimate,
     SmootherLeg,
-    too_little,
-    too_little_of,
+    too_few_samples_reason,
 )
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
@@ -180,7 +180,7 @@ class SmootherSoFar:
         return self._growing.cold_start_cpu_s
 
     def update(self, leg: Leg, config: Config,
-               is_needed: Callable[[], bool] = lambda: True) -> Running:
+               is_needed: Callable[[], bool] = lambda: True) -> RunningEstimate:
         """
         Return the running estimate.
 
@@ -205,7 +205,7 @@ class SmootherSoFar:
         inputs = seen.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs IMU and odometer samples')
-        few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
+        few = too_few_samples_reason(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
         _refuse_unusable(seen.reasons)
@@ -220,9 +220,9 @@ class SmootherSoFar:
         spans = inputs.standstills(placed.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
-                            placed.rough, t_stop)
-        few = too_little_of(view)
+        view = make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
+                                 placed.rough, t_stop)
+        few = missing_samples_reason(view)
         if few:
             raise BadData(few.text)
         return view

@@ -19,7 +19,7 @@ from odocal_ros.calib.planar.run import of_sides, rows_of, Run, Wheels
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.errors import BadUsage
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.forecast import planned_methods
 from odocal_ros.forecast.planned_drive import drive_from_rates
@@ -247,10 +247,10 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
         origin=replace(leg.origin, local=rate_without_north(leg.origin.latitude)))
     # the positions of a mark share one error
     made = replace(made, leg=leg, fixes_in_one=1.0 if robot.at_rests else made.fixes_in_one)
-    problem = problem_of(leg, config, made.imu)
+    problem = make_problem(leg, config, made.imu)
     white = 1 / made.fixes_in_one
     slow = 2 / max(correlated, 1.0) * robot.drift**2 * drifts
-    levels = planned_methods.planned_noise_levels(problem, sigmas, made.fixes_in_one).but(
+    levels = planned_methods.planned_noise_levels(problem, sigmas, made.fixes_in_one).replaced(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
     fit = planned_methods.fit_at_truth(problem, made, levels)
     return _with_slip(make_result(leg, problem, fit, config), motion, robot)

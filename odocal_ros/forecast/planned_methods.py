@@ -17,20 +17,20 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.factor import SPREAD
+from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import ImuSteps, keyframes, sensor_noise
 from odocal_ros.estimator.leg import BEFORE_MARK, EXTERNAL_RATE, ExternalSamples, SmootherLeg
-from odocal_ros.estimator.level_steps import SLIPPING
+from odocal_ros.estimator.level_steps import SLIP_LEVELS
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of, SPACING
+from odocal_ros.estimator.prepare import make_problem, SPACING
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.estimates import refused_result
 from odocal_ros.estimator.result.outcome import make_result
-from odocal_ros.estimator.smoother import too_little
+from odocal_ros.estimator.smoother import too_few_samples_reason
 from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import predict, Prediction, Sigmas
@@ -163,11 +163,11 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     same code as for a fit. Scale is 1, angles are 0; sigmas and budget are the predicted ones.
     spacing : s between keyframes; default: ``keyframe_spacing``.
     """
-    few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
+    few = too_few_samples_reason(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
         return refused_result([few], '1')
     made = ideal_samples(drive, sigmas, keyframe_spacing(drive) if spacing is None else spacing)
-    problem = problem_of(made.leg, sigmas.config, made.imu)
+    problem = make_problem(made.leg, sigmas.config, made.imu)
     levels = planned_noise_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = fit_at_truth(problem, made, levels)
@@ -196,7 +196,7 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
     time-correlated. No level is below the lower bound of the smoother.
     """
     grade = grade_of(sigmas.config.imu)
-    road = dict.fromkeys(SLIPPING, sigmas.sway**2 / SWAY_RATE)
+    road = dict.fromkeys(SLIP_LEVELS, sigmas.sway**2 / SWAY_RATE)
     road |= dict.fromkeys(('along', 'along_hard'), sigmas.slip**2)
     tau = sigmas.correlation_time
     white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
@@ -207,7 +207,7 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
     least = {name: problem.least.get(name, 0.0) for name in values}
     # the bound is for one fix, not for the fixes that it replaces
     least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
-    return problem.first_levels.but(
+    return problem.first_levels.replaced(
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
@@ -215,7 +215,8 @@ def fit_at_truth(problem: Problem, made: IdealSamples, levels: Levels) -> Fit:
     """Return the fit at the true state, without any step."""
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
-    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, SPREAD)), True, False, 0,
+    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, VARIANCE_FACTOR_COUNT)),
+               True, False, 0,
                np.nan, weighted, weighted.solved(), np.zeros((M, 0)))     # none estimated
 
 

@@ -14,7 +14,7 @@ from odocal_ros.calib.choice import ABOUT, choose, deciding, PLANAR
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.estimator import Running
+from odocal_ros.estimator import RunningEstimate
 from odocal_ros.forecast.forecast import (
     Abandoned,
     FARTHEST_LIMIT_M,
@@ -45,7 +45,7 @@ DRIVE_ON = 'drive straights, and turn on the spot in both directions'
 
 
 def update_running(leg: Leg, config: Config, smoother: SmootherSoFar | None,
-                   is_needed: Callable[[], bool]) -> Running | None:
+                   is_needed: Callable[[], bool]) -> RunningEstimate | None:
     """Return the running estimate, None without; raise OdocalError if no other method is used."""
     if smoother is None or 'smoother' not in deciding(config.method):
         return None
@@ -57,7 +57,7 @@ def update_running(leg: Leg, config: Config, smoother: SmootherSoFar | None,
         return None
 
 
-def has_all_values(running: Running | None) -> bool:
+def has_all_values(running: RunningEstimate | None) -> bool:
     """Return True if scale, yaw and pitch of the result will come from the smoother."""
     return running is not None and running.method.verdict is not Verdict.REJECTED and all(
         running.method.estimates[name].value is not None for name in PARAMETERS)
@@ -71,7 +71,7 @@ def without_accelerometer_values(forecast: Forecast) -> Forecast:
     return replace(forecast, yaw=yaw, pitch=None)
 
 
-def add_running_estimate(forecast: Forecast, running: Running, config: Config) -> Forecast:
+def add_running_estimate(forecast: Forecast, running: RunningEstimate, config: Config) -> Forecast:
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
     faults = [r for r in method.reasons
@@ -107,7 +107,7 @@ def relative_sigma(e: Estimate) -> float | None:
     return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
-def _forecast_scale(running: Running, limit: float) -> ParameterForecast:
+def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast:
     e = running.method.estimates[SCALE]
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
@@ -120,7 +120,7 @@ def _forecast_scale(running: Running, limit: float) -> ParameterForecast:
                              UNREACHABLE, now)
 
 
-def _slow_share(running: Running) -> float:
+def _slow_share(running: RunningEstimate) -> float:
     """Return the share of slow errors in the contribution of fixes to the scale's variance."""
     by = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
           if s.name in ('fixes', 'slow_fix_errors')}
@@ -128,7 +128,7 @@ def _slow_share(running: Running) -> float:
     return by.get('slow_fix_errors', 0.0) / total if total else 0.0
 
 
-def _forecast_yaw(running: Running, limit: float) -> ParameterForecast:
+def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
     """Return the forecast of the yaw, which accelerations along or across determine."""
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
@@ -144,7 +144,7 @@ def _forecast_yaw(running: Running, limit: float) -> ParameterForecast:
                              main_sources(running.method, YAW), '', now, lack)
 
 
-def _remaining_distance(running: Running, ratio: float, power: float) -> float | None:
+def _remaining_distance(running: RunningEstimate, ratio: float, power: float) -> float | None:
     """Return the further distance that improves a sigma by a ratio, driven as so far, m."""
     metres = running.distance * (max(ratio, 1.0)**power - 1)
     return metres if metres <= FARTHEST_LIMIT_M else None

@@ -18,7 +18,7 @@ from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
 from odocal_ros.calib.wheel_search.search import search, SearchResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
-from odocal_ros.estimator import smooth, smoother_leg
+from odocal_ros.estimator import make_smoother_leg, smooth
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 from odocal_ros.pipeline.prepared_leg import (
@@ -36,8 +36,8 @@ from odocal_ros.settings.config import Config
 
 def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
-    leg = smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
-                       prepared.spans, prepared.rough, prepared.t_fit)
+    leg = make_smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
+                            prepared.spans, prepared.rough, prepared.t_fit)
     t_slip, metres = prepared.wheel_slips.doubts()
     leg = replace(leg, doubt_t=np.append(leg.doubt_t, t_slip),
                   doubt_sigma=np.append(leg.doubt_sigma, metres / prepared.rough))

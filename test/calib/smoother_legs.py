@@ -7,8 +7,8 @@ from drives import cached, settings
 import numpy as np
 
 from odocal_ros.data.samples import VelocitySamples
-from odocal_ros.estimator import smooth, smoother_leg
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator import make_smoother_leg, smooth
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.geodesy import C_en
@@ -52,7 +52,7 @@ def leg_of(leg, config):
     placed = place(inputs, config)
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                         config.leg.standstill)
-    return smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
+    return make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
 
 
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
@@ -71,7 +71,7 @@ def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
 def truth(drive, config, leg) -> State:
     """Return the true state at the keyframes of a leg, on level ground."""
     o = drive.options
-    imu = problem_of(leg, config).imu
+    imu = make_problem(leg, config).imu
     t = imu.t[imu.key]
     since = t + (drive.truth.start_ns - o.start_ns) * 1e-9
     state = drive.motion.at(since)

@@ -18,7 +18,7 @@ from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import CONVERGENCE
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import _change_reasons, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, M, PITCH, YAW
@@ -55,14 +55,14 @@ def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
 
 def equations_at(problem, fit, constants):
     """Return the equations of a fit at other constants."""
-    return Equations(problem, replace(fit.state, constants=constants), fit.priors, fit.spread,
-                     True)
+    return Equations(problem, replace(fit.state, constants=constants), fit.priors,
+                     fit.variance_factors, True)
 
 
 @pytest.fixture(scope='module')
 def fitted():
     _, config, leg = made(**DRIVE)
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     return problem, best_fit(problem, config)
 
 
@@ -113,7 +113,8 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
         full = solve(weighted.normal())
         solved = replace(full, step=taken * full.step, step_border=taken * full.step_border,
                          taken=taken)
-        found.append([step.size for step in find_constant_steps(weighted.after(solved), solved)])
+        found.append([step.size
+                      for step in find_constant_steps(weighted.apply_step(solved), solved)])
     sigma = [step.sigma for step in fit.steps]
     # fixes beyond their tails lose weight with the full step
     np.testing.assert_allclose(*found, atol=0.1 * max(sigma))

@@ -14,11 +14,11 @@ from smoother_legs import leg_of, made, said as texts, truth
 from odocal_ros.data.leg import part_of
 from odocal_ros.estimator import fit, smooth
 from odocal_ros.estimator.chain import Solved
-from odocal_ros.estimator.cold_start import first_state, with_bias
-from odocal_ros.estimator.fit import damped
+from odocal_ros.estimator.cold_start import change_gyro_bias, cold_start
+from odocal_ros.estimator.fit import damp_step
 from odocal_ros.estimator.preintegrate import preintegrate
-from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.smoother import TWO_HEADINGS
+from odocal_ros.estimator.prepare import make_problem
+from odocal_ros.estimator.smoother import AMBIGUOUS_HEADING
 from odocal_ros.estimator.state import YAW
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -60,11 +60,11 @@ def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
             passes.append((args[4], False))
             super().__init__(*args)
 
-    def damped(solved, taken, own=fit.damped):
+    def damp_step(solved, taken, own=fit.damp_step):
         passes[-1] = passes[-1][0], bool(taken.any())
         return own(solved, taken)
     monkeypatch.setattr(fit, 'Equations', Watched)
-    monkeypatch.setattr(fit, 'damped', damped)
+    monkeypatch.setattr(fit, 'damped', damp_step)
     calibrate(drive.leg(), configured(drive))
     first = passes.index((True, False))
     assert first > 1
@@ -73,7 +73,7 @@ def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
 
 
 def step_of(border, reduced):
-    """Return a solution, with what ``damped`` reads of it."""
+    """Return a solution, with what ``damp_step`` reads of it."""
     return Solved(border[None, :], border, None, 0.0, reduced, None, None, None, None)
 
 
@@ -81,7 +81,7 @@ def walked(slope, passes):
     """Return how far off an iteration is whose steps are ``slope`` times what is left."""
     off, taken = np.array([1.0, -0.5]), np.zeros(2)
     for _ in range(passes):
-        found = damped(step_of(-slope * off, np.diag([4.0, 1.0])), taken)
+        found = damp_step(step_of(-slope * off, np.diag([4.0, 1.0])), taken)
         assert_allclose(found.step[0], found.step_border)
         taken = found.step_border
         off = off + taken
@@ -94,8 +94,8 @@ def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
     assert walked(2.0, 2) < 1e-12
     assert walked(0.4, 3) == pytest.approx(0.6**3)
     back = np.array([-2.0, 1.0])
-    assert damped(step_of(back, np.eye(2)), -back).taken == pytest.approx(0.5)
-    assert np.array_equal(damped(step_of(back, np.eye(2)), np.zeros(2)).step_border, back)
+    assert damp_step(step_of(back, np.eye(2)), -back).taken == pytest.approx(0.5)
+    assert np.array_equal(damp_step(step_of(back, np.eye(2)), np.zeros(2)).step_border, back)
 
 
 def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
@@ -119,8 +119,8 @@ def test_a_gyro_that_warms_up_is_level_in_each_part_with_fixes(gap, parts):
         seen = (leg.t_fix < gap[0]) | (leg.t_fix > gap[1])
         leg = replace(leg, **{name: getattr(leg, name)[seen] for name in (
             't_fix', 'fixes_n', 'covariance_n', 'rounding_n')})
-    problem = problem_of(leg, config)
-    start = first_state(leg, problem.imu, problem.priors).state
+    problem = make_problem(leg, config)
+    start = cold_start(leg, problem.imu, problem.priors).state
     true = truth(drive, config, leg)
     assert (start.t == true.t).all()
     assert len(np.unique(start.gyro_bias, axis=0)) == parts
@@ -138,25 +138,25 @@ def test_a_heading_that_accelerations_do_not_give_is_tried_at_the_nominal_yaw():
     config = settings(drive, None, imu__nominal_yaw=yaw)
     begin, end = (drive.leg().start_ns + s * 10**9 for s in (80, 115))
     leg = leg_of(part_of(drive.leg(), begin, end, begin), config)
-    problem = problem_of(leg, config)
-    start = first_state(leg, problem.imu, problem.priors)
-    assert start.yaw_sigma > TWO_HEADINGS
+    problem = make_problem(leg, config)
+    start = cold_start(leg, problem.imu, problem.priors)
+    assert start.yaw_sigma > AMBIGUOUS_HEADING
     assert start.state.constants[YAW] == 0.0
     assert_allclose(start.with_yaw(yaw).state.C_nb,
-                    first_state(leg, problem.imu, problem.priors, yaw).state.C_nb)
+                    cold_start(leg, problem.imu, problem.priors, yaw).state.C_nb)
     found = smooth(leg, config).estimates['yaw_mounting_angle']
     assert abs(found.value - yaw) < 3 * found.sigma < 0.05
 
 
 def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
     _, config, leg = made(duration=120.0, imu_rate=50.0, odometer_rate=20.0)
-    imu = problem_of(leg, config).imu
+    imu = make_problem(leg, config).imu
     K = len(imu.key) - 1
 
     def of_bias(bias, change):
         sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                                np.array([1.0, 0.0, 0.0]), np.empty(0))
-        sums, C = with_bias(sums, change)
+        sums, C = change_gyro_bias(sums, change)
         return sums.R, sums.dv, sums.S[:, :, 0], C
     change, none = np.array([0.01, -0.02, 0.015]), np.zeros(3)
     apart = []

@@ -12,7 +12,7 @@ import pytest
 from smoother_legs import leg_of, made, said as texts
 
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result import remarks
 from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
@@ -162,7 +162,7 @@ def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
 def test_an_imu_has_the_turn_on_bias_of_its_own_grade_as_sold(changes, accel):
     """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
     _, config, leg = made(imu_grade='consumer', duration=135.0)
-    priors = problem_of(leg, with_settings(config, changes)).priors
+    priors = make_problem(leg, with_settings(config, changes)).priors
     assert priors.accel_bias[:2] == pytest.approx(accel)
     assert priors.gyro_bias == pytest.approx(TURN_ON['consumer'][0])
 

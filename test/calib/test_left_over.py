@@ -14,7 +14,7 @@ from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.motion import D, PHI, V
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.residuals import bias_sigmas, stored_residuals
 from odocal_ros.estimator.smoother import best_fit
 
@@ -25,7 +25,7 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 @cached
 def fitted(**options):
     drive, config, leg = made(**(SHORT | options))
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     return drive, config, leg, problem, best_fit(problem, config)
 
 
@@ -35,7 +35,7 @@ def in_halves(rows):
 
 def left_by_odometer(leg, config):
     """Return the fit of a leg, and the odometer's residuals and sigmas."""
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     fit = best_fit(problem, config)
     return fit, *in_halves(stored_residuals(leg, problem, fit)['left_odometer'])
 
@@ -44,7 +44,7 @@ def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
     """The fit has brought its rows there to first order; it ended within 0.03 sigma."""
     _, _, leg, problem, fit = fitted()
     found = stored_residuals(leg, problem, fit)
-    again = Equations(problem, fit.state, fit.priors, fit.spread, True)
+    again = Equations(problem, fit.state, fit.priors, fit.variance_factors, True)
     motion = again.parts[MotionRows.name].motion
     begin, end = (np.swapaxes(C, 1, 2) for C in (motion.C, motion.C_end))
     middle = np.swapaxes((motion.C + motion.C_end) @ fit.state.C_bv, 1, 2) / 2

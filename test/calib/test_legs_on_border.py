@@ -59,7 +59,7 @@ def test_legs_of_the_smoother_add_up_their_information(legs, monkeypatch):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
     # one size of each imperfection, whichever leg it is of
-    used = np.max([b.used for b in several._of_one_vehicle([r.border for r in results])], axis=0)
+    used = np.max([b.used for b in several._share_sizes([r.border for r in results])], axis=0)
     C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
     sigma = np.hypot(np.sqrt(np.diag(C))[:3], MODEL_FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
@@ -151,7 +151,7 @@ def test_sections_of_a_leg_that_disagree_name_the_largest_deviation(legs):
 def test_small_deviations_are_no_cause():
     found = SimpleNamespace(names=('scale_factor', 'odometer_delay', 'gnss_delay'), between={
         'scale_factor': 1e-5}, deviation=np.array([[9, 1, 0], [0, -2.5, 1], [0, 1, -1.0]]))
-    assert several._largest(found, [4, 7, 9]) == (
+    assert several._largest_deviation(found, [4, 7, 9]) == (
         'no parameter alone explains it: odometer_delay of leg 7 differs most (2.5 sigma)')
 
 

@@ -14,7 +14,7 @@ from odocal_ros.estimator.chain import solve
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors import point_rows, signals
 from odocal_ros.estimator.level_steps import prior_information
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.smoother import best_fit
 
 STEP = 0.02                 # of logarithms of levels
@@ -25,27 +25,27 @@ NAMES = ('size_squat', 'gyro', 'along', 'side', 'fix', 'slow', 'size_gyro_axis')
 
 
 @pytest.fixture(scope='module')
-def weighed():
+def weighted_copy():
     """Return (function from changed levels to equations and solution, levels), no row a tail."""
     _, config, leg = made(imu_grade='industrial', duration=135.0, fix_sigma=0.5)
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     fit = best_fit(problem, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # weights would change with the levels
         patch.setattr(signals, 'LIKELY_NOISE', 1e-3)    # and derivatives by small rates
-        equations = Equations(problem, fit.state, fit.priors, fit.spread, True)
+        equations = Equations(problem, fit.state, fit.priors, fit.variance_factors, True)
 
         def at(**by):
-            levels = fit.levels.but(**{n: fit.levels[n] * np.exp(x) for n, x in by.items()})
+            levels = fit.levels.replaced(**{n: fit.levels[n] * np.exp(x) for n, x in by.items()})
             weighted = equations.at(levels)
             solved = solve(weighted.normal())
-            return weighted.after(solved), solved
+            return weighted.apply_step(solved), solved
 
         yield at, fit.levels
 
 
-def test_moves_are_the_differences_of_solutions(weighed):
-    at, levels = weighed
+def test_moves_are_the_differences_of_solutions(weighted_copy):
+    at, levels = weighted_copy
     both, solved = at()
     information = both.information(solved)
     sigma = np.sqrt(np.diag(solved.covariance))
@@ -56,9 +56,9 @@ def test_moves_are_the_differences_of_solutions(weighed):
                                    rtol=ROUGH, atol=ROUGH * np.abs(moves / sigma).max() + 1e-9)
 
 
-def test_average_information_is_the_curvature_of_the_cost(weighed):
+def test_average_information_is_the_curvature_of_the_cost(weighted_copy):
     """Of a variance s V the least cost C has d2C/d(ln s)2 = 4 A + dC/d(ln s), and 4 A across."""
-    at, levels = weighed
+    at, levels = weighted_copy
     both, solved = at()
     information = both.information(solved)
     A = information.average
@@ -82,8 +82,8 @@ def test_average_information_is_the_curvature_of_the_cost(weighed):
             across / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), (name, other)
 
 
-def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighed):
-    at, levels = weighed
+def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_copy):
+    at, levels = weighted_copy
     both, solved = at()
     information = both.information(solved)
     own = prior_information(levels)

@@ -16,7 +16,7 @@ from odocal_ros.estimator.result.mismatch import (
     quantisation_steps,
 )
 from odocal_ros.estimator.result.odometry_output import twist_noise
-from odocal_ros.estimator.several import _disputed
+from odocal_ros.estimator.several import _disagreement_reasons
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.sim.real import Real
@@ -108,7 +108,7 @@ def test_a_quantised_sensor_is_named_beside_another_cause():
 def test_legs_that_differ_in_a_delay_blame_no_tyre(name, tyres):
     found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], disputed=[name],
                             factor=1.0)
-    reason, = _disputed(found, [1, 2])
+    reason, = _disagreement_reasons(found, [1, 2])
     assert ('tyre' in reason.remedy) == tyres
     assert ('time stamps' in reason.remedy) != tyres
 

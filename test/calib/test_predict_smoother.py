@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.estimator import bound, prepare, smooth
+from odocal_ros.estimator import cramer_rao_bound, prepare, smooth
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.forecast.planned_drive import drive_from_rates, TOWN_SIDES, TOWN_SPEED, TOWN_T
 from odocal_ros.forecast.planned_methods import (
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}
-USUAL = prepare.imperfect_sigmas(GRADES['consumer'])
+USUAL = prepare.imperfection_sigmas(GRADES['consumer'])
 
 
 def sigmas_of(method):
@@ -54,8 +54,9 @@ CELLS = [({'scenario': 'town', 'imu_grade': 'industrial'}, 0.0),
 def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(options, tau):
     drive, config, leg = made(**ROAD, **options)
     sigmas = figures(drive, config, tau)
-    problem = problem_of(leg, config)
-    true = bound(leg, config, truth(drive, config, leg), planned_noise_levels(problem, sigmas))
+    problem = make_problem(leg, config)
+    true = cramer_rao_bound(leg, config, truth(drive, config, leg),
+                            planned_noise_levels(problem, sigmas))
     sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
     # elsewhere: 5 % of what rests tell
@@ -153,7 +154,7 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
         'gnss.lever_arm': (0.3, -0.6, 1.5)})
     sigmas = replace(town_sigmas, config=config, fix=0.02)
     one = ideal_samples(drive, sigmas, 1.0)
-    problem = problem_of(one.leg, config, one.imu)
+    problem = make_problem(one.leg, config, one.imu)
     parts = Equations(problem, one.state).parts
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
     # most, beside what a planned drive's own steps of 0.1 s leave

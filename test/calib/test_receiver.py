@@ -13,7 +13,7 @@ import pytest
 from smoother_legs import leg_of, made, said as texts
 
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.level_steps import long_run
+from odocal_ros.estimator.level_steps import long_span_factors
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.state import BY_SIGMA, CONSTANTS, HEIGHT_DRIFT
 from odocal_ros.reasons import Code
@@ -83,16 +83,16 @@ def test_errors_as_the_model_has_them_are_left_as_they_are():
     gain = 2 * sigma**2 / time
     levels = Levels({'slow': gain, 'slow_up': gain, 'fix': white**2, 'fix_up': white**2,
                      'correlation_time': time})
-    high = levels.but(slow=4 * gain, slow_up=4 * gain)
+    high = levels.replaced(slow=4 * gain, slow_up=4 * gain)
     steps = AS_IT_IS | {'slow': (0.25, 1.0), 'slow_up': (0.25, 1.0)}
     factors = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         error = gauss_markov(rng, sigma, time, t) + white * rng.standard_normal((len(t), 3))
-        found = long_run(fixes_of(error, t), levels, AS_IT_IS)
+        found = long_span_factors(fixes_of(error, t), levels, AS_IT_IS)
         factors += found.values()
         # a level that is four times too high, as its own steps say, is no reason
-        again = long_run(fixes_of(error, t), high, steps)
+        again = long_span_factors(fixes_of(error, t), high, steps)
         assert again == pytest.approx(found)
     # one span in six is a sigma too large by chance, the longest, of 8 differences, by half of it;
     # 1 in 1000 times their mean square is 3.3 times too large, of which 1.5 are allowed
@@ -109,7 +109,7 @@ def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
         # the mean of a walk over 20 s: steps of 1 / sqrt(20), in the long run as large as before
         error = np.stack([np.convolve(x, np.full(seconds, 1 / seconds), 'valid')
                           for x in np.cumsum(steps, axis=0).T], -1)[:len(t)]
-        factors += long_run(fixes_of(error, t), levels, AS_IT_IS).values()
+        factors += long_span_factors(fixes_of(error, t), levels, AS_IT_IS).values()
     assert seconds / 3 < min(factors) < max(factors) < 1.5 * seconds
     # 20 less what chance may do at spans of 50 s or more: a quarter, or more
     assert np.mean(factors) > 0.6 * seconds

@@ -12,11 +12,11 @@ import pytest
 from smoother_legs import made, truth
 
 from odocal_ros.data.mapped import HELD_BYTES, let_go, room
-from odocal_ros.estimator import bound
+from odocal_ros.estimator import cramer_rao_bound
 from odocal_ros.estimator.chain import Normal, NotPositive, solve
-from odocal_ros.estimator.cold_start import first_state
+from odocal_ros.estimator.cold_start import cold_start
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.axle import rates_at
+from odocal_ros.estimator.factors.axle import mean_rates_at
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.pseudo_observations import (
     SIZE,
@@ -24,7 +24,7 @@ from odocal_ros.estimator.factors.pseudo_observations import (
     STILL_SPEED,
     STILL_TURN,
 )
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
 pytestmark = pytest.mark.core
@@ -36,8 +36,8 @@ TOTAL = N * STATES + BORDER
 def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     drive, config, leg = made(duration=140.0, fix_rate=1.0)
     leg = replace(leg, t_stop=50.0)
-    problem = problem_of(leg, config)
-    levels = problem.first_levels.but(correlation_time=correlation_time, fix=0.5)
+    problem = make_problem(leg, config)
+    levels = problem.first_levels.replaced(correlation_time=correlation_time, fix=0.5)
     state = truth(drive, config, leg)
     parts = Equations(problem, state, fitted=True).parts
     motion, fixes = parts['motion'], parts['fixes']
@@ -56,9 +56,9 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         return np.arange(k * n, (k + 1) * n)
 
     border = np.arange(N * n, size)
-    every, weighed = slice(None), motion.weighed(levels, M)
-    units = motion.noise.columns(every) * weighed.roots()
-    a, b, c = weighed.derivatives(every, units)
+    every, weighted_copy = slice(None), motion.weighted_copy(levels, M)
+    units = motion.noise.columns(every) * weighted_copy.sigmas()
+    a, b, c = weighted_copy.derivatives(every, units)
     Q = motion.noise.covariance(units, every)
     for k in range(N - 1):
         s = 1 / np.sqrt(np.diag(Q[k]))
@@ -109,7 +109,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     R = np.linalg.qr(A / scale, mode='r')
     last = np.linalg.inv(R[-M:, -M:])
     dense = last @ last.T / np.outer(scale[-M:], scale[-M:])
-    got = bound(leg, config, state, levels)
+    got = cramer_rao_bound(leg, config, state, levels)
     sigma = np.sqrt(np.diag(dense))
     # the normal equations of the chain lose what their condition costs: 1e-6 of a sigma
     np.testing.assert_allclose(got / np.outer(sigma, sigma), dense / np.outer(sigma, sigma),
@@ -199,13 +199,13 @@ MOST = 41.5e3
 def peak_of_a_pass(duration):
     """Return the number of keyframes and the peak, bytes, of a pass with slow fix errors."""
     _, config, leg = made(scenario='town', duration=duration, imu_rate=25.0, fix_rate=1.0)
-    problem = problem_of(leg, config)
-    state = first_state(leg, problem.imu, problem.priors).state
-    levels = problem.first_levels.but(correlation_time=60.0)
+    problem = make_problem(leg, config)
+    state = cold_start(leg, problem.imu, problem.priors).state
+    levels = problem.first_levels.replaced(correlation_time=60.0)
     tracemalloc.start()
     weighted = Equations(problem, state).at(levels)
     solved = solve(weighted.normal())
-    weighted.after(solved)
+    weighted.apply_step(solved)
     near = solved.marginals()
     weighted.components(near)
     weighted[MotionRows].road_noise(near)
@@ -235,6 +235,6 @@ def test_turn_rates_in_a_file_are_read_piece_by_piece():
     assert w_b.nbytes > HELD_BYTES
     let_go()
     before = resident()
-    rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))
+    mean_rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))
     # all times are touched; the rates, if held as a whole, would add their own size
     assert resident(peak=True) - before - t.nbytes < w_b.nbytes / 2

@@ -16,7 +16,7 @@ from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import M, PHI, WITH_SLOW
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
@@ -35,7 +35,7 @@ def at_truth(t_stop=None, **options):
     """Return a drive without noise, and problem and state of its leg."""
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
     leg = replace(leg, t_stop=t_stop or leg.t_stop)
-    return drive, problem_of(leg, config), truth(drive, config, leg)
+    return drive, make_problem(leg, config), truth(drive, config, leg)
 
 
 @pytest.fixture(scope='module')
@@ -76,7 +76,7 @@ def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
     rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level, and the mounting is 1 deg
     leaning = replace(state, C_nb=rolled)
     measured = turn(transpose(rolled[:-1]), rate_n)
-    upright, other = (Motion(problem, one, own).nose_down[:, 0] for one, own in (
+    upright, other = (Motion(problem, one, own).pitch_increments[:, 0] for one, own in (
         (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
     # of a turn by 0.2 rad a tenth was pitch; the heading that the mounting changes with the roll,
     # by 0.1 times some degrees, turns what the body really pitches by
@@ -182,7 +182,7 @@ def test_on_banked_ground_a_turn_pitches_the_vehicle_about_its_own_left_axis(ban
     want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
     steady = np.abs(np.gradient(rate)) < 0.01        # the lean is that at the begin
     assert np.abs(want[steady]).max() >= 0.06 * banking
-    np.testing.assert_allclose(motion.nose_down[steady, 2], want[steady], atol=5e-3)
+    np.testing.assert_allclose(motion.pitch_increments[steady, 2], want[steady], atol=5e-3)
 
 
 def test_bumps_may_have_another_centre_than_hills():
@@ -194,7 +194,7 @@ def test_bumps_may_have_another_centre_than_hills():
     assert slowly(bump)[around] == pytest.approx(0.0, abs=1e-9)
     assert slowly(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
                                                  * hill[around])
-    both, fast = motion.nose_down.T[:2]
+    both, fast = motion.pitch_increments.T[:2]
     assert fast == pytest.approx(both - slowly(both))
 
 
@@ -209,7 +209,7 @@ def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
     assert np.abs(motion.axle.acceleration() - want)[fast].max() < 0.3
     assert np.ptp(G * there.slope[fast]) > 0.5
     # the body's axes are those of the road here
-    assert np.abs(motion.pushed[:, 0] - want)[fast].max() < 0.3
+    assert np.abs(motion.lean_accelerations[:, 0] - want)[fast].max() < 0.3
 
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
@@ -238,11 +238,12 @@ def test_the_scale_is_that_of_the_path_wherever_the_body_points():
                       .parts['motion'].motion for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
     # slower than a walk the direction of travel is not known
-    walks = np.linalg.norm(level.travelled, axis=1) > WALK_SPEED * level.T[:, 0]
-    hard = straight & walks & (np.abs(level.pushed[:, 0]) > 0.5)
+    walks = np.linalg.norm(level.displacement_by_state, axis=1) > WALK_SPEED * level.T[:, 0]
+    hard = straight & walks & (np.abs(level.lean_accelerations[:, 0]) > 0.5)
     assert hard.sum() > 10
     ahead = (level.f_n + level.f_n_end) / 2
-    length, other = (np.einsum('ki,ki->k', x.rolled, ahead)[hard] for x in (level, leaning))
+    length, other = (np.einsum('ki,ki->k', x.wheel_displacement, ahead)[hard]
+                     for x in (level, leaning))
     # with the square of the lean it would be (0.05)^2 / 2 = 1e-3 shorter
     np.testing.assert_allclose(other, length, rtol=1e-5)
 
@@ -269,7 +270,7 @@ def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
 @pytest.mark.core
 def test_a_turn_at_rest_has_the_variance_that_makes_it_an_outlier_of_three_sigmas():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     k = int(np.flatnonzero(problem.still[:-1] & problem.still[1:])[3])
     step, tilt = np.zeros((len(state.t), WITH_SLOW)), 0.01
     step[k + 1:, PHI.start] = tilt

@@ -17,7 +17,7 @@ from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import once_a_rest
 from odocal_ros.estimator.imu import white_noise_at_rest
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import drawn
@@ -98,7 +98,7 @@ def by_grade(config):
 def scores(fitted):
     """Return the scores of the IMU's errors at the truth by noise alone, in their sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     weighted = Equations(problem, state, fitted=fitted).at(problem.first_levels)
     rows = weighted[MotionRows]
     J = rows.J[:, :, -rows.m:]
@@ -153,7 +153,7 @@ KERBS = {'scenario': 'yard', 'real': Real(kerbs=0.06, wheelbase=0.5)}
 @pytest.mark.parametrize('road', [BANKED, KERBS])
 def test_without_noise_the_whole_signal_counts(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
         Equations(problem, state, fitted=x).at(problem.first_levels)[MotionRows]
         for x in (False, True)))

@@ -19,11 +19,11 @@ from smoother_legs import (
     with_velocity,
 )
 
-from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator import cramer_rao_bound, smooth
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.point_rows import rows_per_effective
+from odocal_ros.estimator.factors.point_rows import count_rows_per_independent
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import PRESSURE, YAW
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
@@ -52,7 +52,7 @@ def test_rows_are_true_at_the_truth():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             heading_sigma=0.0, **ARMS)
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     parts = Equations(problem, state).parts
     # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
     assert np.abs(parts['velocity'].raw).max() < 5e-3
@@ -148,7 +148,7 @@ def test_white_errors_are_not_alike():
         r, weight = rng.standard_normal((1000, 3)), np.ones((1000, 3))
 
     # the largest of seven ratios of chi2 with 24 to 1000 degrees of freedom: 1 + 3 / sqrt(12)
-    assert rows_per_effective(White) < 1.9
+    assert count_rows_per_independent(White) < 1.9
 
 
 @pytest.mark.parametrize('how', ['topic', 'fixed', 'imu'])
@@ -161,9 +161,9 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
                      'alignment__heading_sigma': sigma}}[how]
     method = fitted(drive.leg(), config, **ask)
     # without it, at the noise levels that this fit found: a fit of its own would find others
-    levels = Levels.of_roots(method.details['noise'])
-    alone = math.sqrt(bound(replace(leg, external={}), config,
-                            truth(drive, config, leg), levels)[YAW, YAW])
+    levels = Levels.from_sigmas(method.details['noise'])
+    alone = math.sqrt(cramer_rao_bound(replace(leg, external={}), config,
+                                       truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the
     # drive contradicts, by 1.5 of its sigmas here, has less weight: up to 15 %
     both = 1 / np.hypot(1 / sigma, 1 / alone)
@@ -205,7 +205,7 @@ def test_rows_vanish_at_the_truth_but_for_the_constants():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             **HILLS | {'pressure_sigma': 0.0})
     leg = replace(leg_of(drive.leg(), config), t_stop=60.0)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     part = Equations(problem, state).parts['pressure']
     _, by_constants = part.jacobians(16)
     by = by_constants[:, 0, PRESSURE]

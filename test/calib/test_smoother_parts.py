@@ -17,7 +17,7 @@ from odocal_ros.estimator.factors.axle import Axle
 from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE, SIZE_SPREADS
 from odocal_ros.estimator.factors.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.odometer import Travel
@@ -53,7 +53,7 @@ def moved():
                             pressure_sigma=0.0, antenna_lever_arm=(0.5, -0.3, 1.2))
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=END,
                   imu_arm=np.array([1.2, 0.3, 0.4]))
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    problem, state = make_problem(leg, config), truth(drive, config, leg)
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, layout.PHI.start:layout.BG.stop] *= 0.1
@@ -177,8 +177,8 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     problem, state = stepping if name == 'steps' else moved
     # so wide that nothing lies far out: squares only
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
-    levels = problem.first_levels.but(correlation_time=40.0, **wide)
-    part = part_at(problem, state, name).weighed(levels, layout.M)
+    levels = problem.first_levels.replaced(correlation_time=40.0, **wide)
+    part = part_at(problem, state, name).weighted_copy(levels, layout.M)
     normal = Normal(len(state.t), N, layout.M)
     part.add(normal)
     rng = np.random.default_rng(2)
@@ -201,8 +201,8 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
 @pytest.mark.parametrize('name', ['slow', 'slow_up', 'correlation_time'])
 def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
     problem, state = moved
-    levels = problem.first_levels.but(correlation_time=20.0, slow=0.01, slow_up=0.02,
-                                      fix=1e4, fix_up=1e4, velocity=1.0)
+    levels = problem.first_levels.replaced(correlation_time=20.0, slow=0.01, slow_up=0.02,
+                                           fix=1e4, fix_up=1e4, velocity=1.0)
 
     weighted, solved, at = least(problem, state, levels)
     quadratic, expected = weighted[SlowError].components(solved.marginals())[name]
@@ -222,7 +222,7 @@ def least(problem, state, levels):
     def at(levels):
         weighted = Equations(problem, state).at(levels)
         solved = solve(weighted.normal())
-        weighted.after(solved)
+        weighted.apply_step(solved)
         return weighted, solved, -0.5 * (weighted.cost() + weighted.log_R_total()
                                          + solved.log_determinant)
 
@@ -235,7 +235,7 @@ def least(problem, state, levels):
 def slope(at, levels, name):
     """Return by how much the likelihood rises with the logarithm of a level."""
     h = 1e-2      # at 1e-3 rounding of the cost is 1e-3 of the score
-    above, below = (at(levels.but(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
+    above, below = (at(levels.replaced(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
     return (above - below) / (2 * h)
 
 
@@ -258,7 +258,7 @@ def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, nam
     found = weighted[PriorRows].sizes(solved.marginals())[name]
     # 1.5 of the prior for each, against the log-normal prior of the size
     logs = np.log(SIZE) + np.arange(-2.5, 5.0, 0.25)
-    likelihood = np.array([at(levels.but(**{name: float(np.exp(x))}))[2] for x in logs])
+    likelihood = np.array([at(levels.replaced(**{name: float(np.exp(x))}))[2] for x in logs])
     likelihood -= ((logs - np.log(SIZE)) / SIZE_SPREADS[name])**2 / 2
     p = np.exp(likelihood - likelihood.max())
     assert found == pytest.approx((np.exp(logs) * p).sum() / p.sum(), rel=0.01)

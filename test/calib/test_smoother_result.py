@@ -15,11 +15,11 @@ from smoother_legs import leg_of, made, said as texts, smoothed, truth
 
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.cold_start import first_state
+from odocal_ros.estimator.cold_start import cold_start
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.estimates import estimate_constants
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
@@ -99,10 +99,10 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     details = method.details
     usual = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
                       for name in CONSTANTS[IMPERFECT]])
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     problem.priors.constants[IMPERFECT] = usual
     covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
-        Levels.of_roots(details['noise'])).solved().covariance
+        Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same but for heavy tails
@@ -156,7 +156,7 @@ def test_the_gyro_scale_has_the_configured_sigma():
     _, config, leg = made(**SHORT)
     for asked, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         asking = with_settings(config, {'imu.gyro_scale_sigma': asked})
-        assert problem_of(leg, asking).priors.constants[GYRO.start] == prior
+        assert make_problem(leg, asking).priors.constants[GYRO.start] == prior
 
 
 def test_an_imu_worse_than_its_grade_is_said():
@@ -171,8 +171,8 @@ def test_an_imu_worse_than_its_grade_is_said():
 
 def test_what_still_moves_far_widens_by_as_much():
     _, config, leg = made(**SHORT)
-    problem = problem_of(leg, config)
-    start = first_state(leg, problem.imu, problem.priors).state
+    problem = make_problem(leg, config)
+    start = cold_start(leg, problem.imu, problem.priors).state
     start.constants[YAW] += 0.1         # far off, and but one pass
     method = make_result(leg, problem, fit(problem, start, problem.first_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',
@@ -209,7 +209,7 @@ def test_equations_without_a_solution_say_the_time(monkeypatch):
     monkeypatch.setattr(Weighted, 'normal', undetermined)
     reason, = smooth(leg, config).reasons
     assert reason.code is Code.NOT_CONVERGED
-    imu = problem_of(leg, config).imu
+    imu = make_problem(leg, config).imu
     assert (f'do not determine the motion at t = {imu.t[imu.key[40]]:.1f} s. Likely cause: '
             in reason.text)
 

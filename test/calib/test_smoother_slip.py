@@ -14,7 +14,7 @@ from smoother_legs import leg_of, made, said as texts, smoothed
 
 from odocal_ros.calib.slip import find_slips, unforced_sign
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
+from odocal_ros.estimator.factors.factor import ACCEL_NOISE, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.result import mismatch
 from odocal_ros.estimator.result.estimates import join_names
 from odocal_ros.nav.dead_reckoning import Track
@@ -98,9 +98,9 @@ def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
 
 @pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
 def test_a_shock_of_a_short_drive_is_no_vibration(seconds, reported):
-    spread = np.ones((60, SPREAD))
+    spread = np.ones((60, VARIANCE_FACTOR_COUNT))
     spread[:seconds, ACCEL_NOISE] = 100.0
-    fit = SimpleNamespace(spread=spread, levels={'accel': 0.005**2})
+    fit = SimpleNamespace(variance_factors=spread, levels={'accel': 0.005**2})
     assert bool(mismatch._outliers(fit)) == reported
 
 

@@ -12,10 +12,10 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import made, said as texts, truth
 
-from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator import cramer_rao_bound, smooth
 from odocal_ros.estimator.factors import interval_noise
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -99,9 +99,9 @@ def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
     drive, config, leg = straight(sway=sway)
     method = smooth(leg, config)
     # the road's noise in the place of what the fit made of the seconds
-    levels = Levels.of_roots(method.details['noise']).but(
+    levels = Levels.from_sigmas(method.details['noise']).replaced(
         **dict.fromkeys(interval_noise.SIDEWAYS, 0.05**2 / 10.0))
-    sigma = np.sqrt(bound(leg, config, truth(drive, config, leg), levels)[1, 1])
+    sigma = np.sqrt(cramer_rao_bound(leg, config, truth(drive, config, leg), levels)[1, 1])
     stated = method.estimates['yaw_mounting_angle'].sigma
     # linearised at the estimate and not at the truth, heavy tails: 3 %; a second sways
     # by a level known to 5 % of sqrt(1 / 2 / 200 s)
@@ -123,16 +123,16 @@ def test_a_leg_with_turns_tests_it_itself():
 
 def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
     drive, config, leg = made(duration=200.0, imu_grade='industrial')
-    problem = problem_of(leg, config)
+    problem = make_problem(leg, config)
     t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     yaw = np.abs(np.diff(drive.motion.at(t).yaw))
     # slower than TURNING between turns: less than that rate for all the time
     turn = interval_noise.total_turn(leg, problem.imu)
     assert turn == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
     biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
-    assert problem_of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
+    assert make_problem(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
     _, config, leg = straight()
-    assert problem_of(leg, config).turned == 0.0
+    assert make_problem(leg, config).turned == 0.0
 
 
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():

@@ -8,7 +8,7 @@ import pytest
 
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LIFT, PITCH
 from odocal_ros.nav.dead_reckoning import Origin
@@ -70,7 +70,7 @@ def test_ground_that_rolls_the_vehicle_in_the_mean_does_not_change_the_pitch():
     leg, roll = figures_of_eight()
     assert abs(roll) > 0.005
     config = with_settings(Config(), {'imu.grade': 'tactical'})
-    fit = best_fit(problem_of(leg, config), config)
+    fit = best_fit(make_problem(leg, config), config)
     # without noise, but for the prior of the centre of pitch
     assert abs(fit.state.constants[PITCH] - MOUNTING) < 1.5 * np.sqrt(fit.covariance[PITCH, PITCH])
     assert fit.state.constants[LIFT] == pytest.approx(WHEELBASE / 2 * roll, rel=0.1)

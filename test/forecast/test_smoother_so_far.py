@@ -14,8 +14,8 @@ import pytest
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import growing
-from odocal_ros.estimator.growing import carried, LOOK_PASSES, steps_of
-from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.growing import extend_warm_start, make_imu_steps, UPDATE_PASSES
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.pipeline.calibrate import calibrate
@@ -49,9 +49,9 @@ def test_it_ends_as_the_result_and_is_within_its_sigma_all_along(town_drive, exa
 
 def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(exact, looks):
     passes = [x.running.method.details['iterations'] for x in looks]
-    assert passes[0] > LOOK_PASSES
+    assert passes[0] > UPDATE_PASSES
     # of 4, with driving, stops and turns in between; the others are cold starts
-    assert passes.count(LOOK_PASSES) >= 2
+    assert passes.count(UPDATE_PASSES) >= 2
     anew = SmootherSoFar().update(looks[-1].leg, exact).method.estimates
     assert anew['scale_factor'].value != looks[-1].running.method.estimates['scale_factor'].value
     for off, ratio in apart(looks[-1].running.method.estimates, anew):
@@ -106,7 +106,8 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, loo
     so_far = SmootherSoFar()
     so_far.update(looks[-3].leg, exact)      # 7 s are to be reckoned on, at speed
     view = so_far._view(looks[-2].leg, exact)
-    state = carried(so_far._growing._last, problem_of(view, exact, steps_of(view, 1.0))).state
+    state = extend_warm_start(so_far._growing._last,
+                              make_problem(view, exact, make_imu_steps(view, 1.0))).state
     later = SmootherSoFar()
     later.update(looks[-2].leg, exact)
     last = later._growing._last.state
@@ -119,8 +120,8 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, loo
     stated = view.covariance_n * np.linspace(1.0, 2.0, len(view.t_fix))[:, None, None]
     varies = replace(view, covariance_n=stated)
     for leg, spacing in ((view, 0.7), (varies, 1.0)):
-        other = problem_of(leg, exact, steps_of(leg, spacing))
-        assert carried(so_far._growing._last, other) is None
+        other = make_problem(leg, exact, make_imu_steps(leg, spacing))
+        assert extend_warm_start(so_far._growing._last, other) is None
 
 
 def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(exact):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.estimator import prepare, smoother_leg
+from odocal_ros.estimator import make_smoother_leg, prepare
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
@@ -180,7 +180,8 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
     config = settings(made, imu__grade='tactical', imu__gyro_bias=1e-6)
     inputs, _ = screen(posed(made), config)
     there = place(inputs, config)
-    leg = smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)), there.rough)
+    leg = make_smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)),
+                            there.rough)
     grade = grade_of(config.imu)
     np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias, math.hypot(1e-6, OMEGA))
     north = replace(leg, origin=replace(there.origin, local=None))

@@ -24,7 +24,7 @@ WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
 RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
 
 
-def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
+def mean_rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
     """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
     first = np.searchsorted(t, at - RATE_WINDOW / 2)
     last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
@@ -49,16 +49,16 @@ class Axle:
             return state.v_n + turn(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
 
         self.v_n = at(arm)
-        self.wheel = self._ahead(at(arm + leg.odometer_arm))
+        self.wheel = self._forward_speed(at(arm + leg.odometer_arm))
 
-    def _ahead(self, v_n: Floats) -> Floats:
+    def _forward_speed(self, v_n: Floats) -> Floats:
         speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
         return speed
 
     def _slope(self) -> Floats:
         """Return the slope of the road in each interval from the vertical velocity: (K,) rad."""
         # not by the attitude, which contains the pitch mounting angle
-        speed, rise = self._ahead(self.v_n), self.v_n[:, 2]
+        speed, rise = self._forward_speed(self.v_n), self.v_n[:, 2]
         ahead = speed[1:] + speed[:-1]
         return (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
 
@@ -85,24 +85,24 @@ class Axle:
         The tyres produce both. By speeds: in a turn with sideslip, the acceleration has a forward
         component.
         """
-        speed = self._ahead(self.v_n)
+        speed = self._forward_speed(self.v_n)
         up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
 
     def means_by_path(self, sums: Intervals) -> Floats:
-        """Return the means of ``varies_with`` over a leg, weighted by distance: (4,)."""
+        """Return the means of ``tyre_signals_at`` over a leg, weighted by distance: (4,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         share = path / max(path.sum(), 1e-9)
-        mean: Floats = share @ varies_with(path / sums.T, t - state.t[0], self.acceleration())
+        mean: Floats = share @ tyre_signals_at(path / sums.T, t - state.t[0], self.acceleration())
         return mean
 
 
-def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
+def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats) -> Floats:
     """Return the signals that change the scale, as TYRES, (S11): (..., 4); t : s of the leg."""
     # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
-    force = faster + 0.1 + 1e-4 * speed**2
+    force = acceleration_along + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
     return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),
                      np.minimum(force, 0.0)], -1)

@@ -6,8 +6,8 @@ A factor of the likelihood: the residuals of one sensor or one prior.
 
 Each factor is a file. It holds residuals and derivatives at one state, initial and minimum noise
 levels, and its terms of the normal equations, the cost, the variance components and the error
-budget. It is created without weights; ``weighed`` returns a copy at given levels, whose ``after``
-applies a step to the residuals.
+budget. It is created without weights; ``weighted_copy`` returns a copy at given levels, to whose
+residuals ``apply_step`` applies a step.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import blocks
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.levels import Levels, LevelSides
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
@@ -32,11 +32,11 @@ IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
 # of the IMU (kerbs, aliased vibration; biases that step), and of the driving noise of the
 # correlated fix error (jumps of the receiver)
 VARIANCE_FACTORS = ('along', 'side', 'up', *IMU, 'jump')
-SPREAD, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
+VARIANCE_FACTOR_COUNT, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 ACCEL_NOISE = VARIANCE_FACTORS.index('accel')
 IMU_NOISE = slice(VARIANCE_FACTORS.index('gyro'), JUMP)
 GYRO_STEP, ACCEL_STEP = map(VARIANCE_FACTORS.index, ('gyro_walk', 'accel_walk'))
-WANTED = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
+PARAMETER_COUNT = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,8 @@ class LinearisationPoint:
     intervals: Intervals
     points: dict[str, Points]  # up to the times of the rows, by the name of their factor
     priors: Priors
-    spread: np.ndarray | None  # (K, SPREAD) factors on the variances of outlier intervals
+    # (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals
+    variance_factors: np.ndarray | None
     fitted: bool = False       # as for ``Motion``
 
 
@@ -72,7 +73,7 @@ class Factor:
         self.state = point.state
 
     @classmethod
-    def there(cls, problem: Problem) -> bool:
+    def is_present(cls, problem: Problem) -> bool:
         """Return True if a leg has such rows."""
         return True
 
@@ -81,11 +82,11 @@ class Factor:
         """Return the initial and the minimum variances, by the names of its levels."""
         return {}, {}
 
-    def in_use(self, levels: Levels) -> bool:
+    def is_used(self, levels: Levels) -> bool:
         """Return True if the rows exist at these levels."""
         return True
 
-    def weighed(self, levels: Levels, m: int) -> 'Factor':
+    def weighted_copy(self, levels: Levels, m: int) -> 'Factor':
         """Return a copy with weighted rows and the first m constants."""
         new = copy(self)
         new.levels, new.m = levels, m
@@ -99,7 +100,7 @@ class Factor:
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
 
-    def after(self, step: Floats, constants: Floats, reached: State) -> None:
+    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
         """Apply a step (N, n), (M,) to the residuals, to first order."""
         self.state = reached
 
@@ -111,21 +112,21 @@ class Factor:
         """Return the quadratic sum and the redundancy of each level, (S26)."""
         return {}
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, marginals: JointMarginals) -> Iterable[tuple[str, Floats]]:
         """Yield the names of error sources and the effects of their unit errors: (..., 3, k)."""
         return ()
 
-    def with_wanted(self, block: Floats) -> Floats:
+    def with_parameters(self, block: Floats) -> Floats:
         """Return the cross-covariance of scale, yaw, pitch and the unknowns: (k, 3, 2n + M)."""
-        return block[:, 2 * self.n:2 * self.n + WANTED, :]
+        return block[:, 2 * self.n:2 * self.n + PARAMETER_COUNT, :]
 
-    def all_with_wanted(self, marginals: JointMarginals) -> Floats:
+    def all_with_parameters(self, marginals: JointMarginals) -> Floats:
         """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would keep the whole block in memory
-        return np.concatenate([self.with_wanted(block).copy() for block in marginals.blocks()])
+        return np.concatenate([self.with_parameters(block).copy() for block in marginals.blocks()])
 
 
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,

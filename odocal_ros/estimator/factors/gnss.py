@@ -116,10 +116,10 @@ class Fixes(PointRows):
         out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
-    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         return self.root[some] @ rows
 
-    def known(self) -> Bools:
+    def existing_components(self) -> Bools:
         """Return a mask of the components that exist, (m, 3); fixes without height have two."""
         known = np.ones((len(self.k), 3), bool)
         known[:, 2] = self.root[:, 2, 2] > 1e-5

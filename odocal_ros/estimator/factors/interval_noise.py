@@ -20,7 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, SPREAD
+from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import stamp_of
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
@@ -160,13 +160,13 @@ class IntervalNoise:
 
 
 def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
-                   spread: Floats | None) -> IntervalNoise:
+                   variance_factors: Floats | None) -> IntervalNoise:
     """
     Return the noises of a motion.
 
     rest : (K,) bool, intervals at standstill: their odometer noise is given, since it does not
         depend on the noise in motion.
-    spread : (K, SPREAD) factors on the variances of outlier intervals.
+    variance_factors : (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals.
     """
     K, T = len(motion.T), motion.T[:, 0]
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
@@ -175,17 +175,18 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     speed = np.linalg.norm(motion.displacement, axis=1) / T
     share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
     hard, turning = hard_and_turning(motion)
-    spread = np.ones((K, SPREAD)) if spread is None else spread
+    variance_factors = np.ones(
+        (K, VARIANCE_FACTOR_COUNT)) if variance_factors is None else variance_factors
     acting = (share * ~hard, share * hard, share * ~turning, share * turning, share,
-              np.sqrt(2 * motion.swung))
-    road = np.stack([size * ~rest * np.sqrt(spread[:, axis])
+              np.sqrt(2 * motion.half_pitch_variance))
+    road = np.stack([size * ~rest * np.sqrt(variance_factors[:, axis])
                      for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
     extra = _given_variances(motion, leg)
     still = rest_noise(speed, rest)
     extra[rest, D] += still
     slow = ~rest & (speed < 1.0)
     extra[slow, D] += still * (1 - speed[slow, None])
-    return IntervalNoise(motion, axes, np.sqrt(spread[:, IMU_NOISE]), road, extra,
+    return IntervalNoise(motion, axes, np.sqrt(variance_factors[:, IMU_NOISE]), road, extra,
                          _given_noises(motion, leg, axes, rest))
 
 
@@ -206,8 +207,8 @@ def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]
     # of unknown length, in the direction of rolling, without the pitching of the body
-    size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
-    along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
+    size = np.linalg.norm(motion.wheel_displacement, axis=1, keepdims=True)
+    along = np.where(size > 1e-3, motion.wheel_displacement / np.maximum(size, 1e-3), axes[:, 0])
     total_turn = motion.turning * motion.T[:, 0]
     most = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))

@@ -16,7 +16,7 @@ from copy import copy
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.factors.axle import Axle, varies_with, WALK_SPEED
+from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at, WALK_SPEED
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
@@ -52,9 +52,11 @@ ROWS = D.stop
 # judgement: intervals of a hill; faster pitching is a bump of the road, or squat
 HILL_INTERVALS = 5
 # attributes of Motion with a row for each interval
-EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'rolled', 'faster', 'unsaid',
-        'pushed', 'nose_down', 'rate_n', 'level_left', 'swung', 'up_n', 'shorter', 'from_mean',
-        'varied', 'travelled', 'residual')
+INTERVAL_ATTRIBUTES = (
+    'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
+    'by_speed_offset', 'lean_accelerations', 'pitch_increments', 'rate_n', 'level_left',
+    'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
+    'displacement_by_state', 'residual')
 
 
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:
@@ -66,7 +68,7 @@ def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     return down
 
 
-def slowly(x: Floats) -> Floats:
+def moving_mean(x: Floats) -> Floats:
     """Return moving means over HILL_INTERVALS: (K,)."""
     around = np.ones(HILL_INTERVALS)
     return np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
@@ -96,19 +98,22 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         p, v = state.p_n, state.v_n
         moved = p[1:] - p[:-1]
-        self.travelled = moved + (self.C_end - self.C) @ (state.C_bv @ self.arm_v)
-        along = self.f + self._vary()
+        self.displacement_by_state = moved + (self.C_end - self.C) @ (state.C_bv @ self.arm_v)
+        along = self.f + self._vary_axis()
         # the odometer measures the path, in any direction of the body
         along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
         straight = turn(half @ self.C, turn(intervals.S, along))
-        self.rolled = straight * self.varied * self._inclined(straight)[:, None]
-        self.faster = self._by_odometer_filter()
-        self.displacement = self.rolled + self.vertical_shift
-        self.unsaid: Floats | None = None       # derivative by the offset of a coarse speed
+        self.wheel_displacement = straight * self.scale_ratio * self._inclination_ratio(straight)[
+            :, None]
+        self.by_delay = self._derivative_by_filter()
+        self.displacement = self.wheel_displacement + self.vertical_shift
+        # derivative by the offset of a coarse speed
+        self.by_speed_offset: Floats | None = None
         if leg.travel.coarse is not None:
             moved_s = leg.travel.coarse.time_in_motion(state.t)
-            self.unsaid = (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
-            self.displacement = self.displacement + self.unsaid * state.constants[SPEED_OFFSET]
+            self.by_speed_offset = (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
+            self.displacement = self.displacement + self.by_speed_offset * state.constants[
+                SPEED_OFFSET]
         self.dv, self.dp = dv, dp
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
         r_p = moved - (v[:-1] * T + dp - dp @ W.T * T / 3 + g * T**2 / 2
@@ -118,7 +123,8 @@ class Motion:
         r_phi = rotvec(self.C_end @ transpose(predicted))
         e = state.travel_error
         f_n, f_n_end = self.f_n, self.f_n_end
-        r_d = self.travelled - (self.displacement - f_n_end * e[1:, None] + f_n * e[:-1, None])
+        r_d = self.displacement_by_state - (self.displacement - f_n_end * e[1:, None] + f_n
+                                            * e[:-1, None])
         self.residual = np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
@@ -127,7 +133,7 @@ class Motion:
         """Return the motion of the intervals of a slice, for derivatives and noises of its own."""
         part = copy(self)
         part.sums = self.sums.take(rows)
-        for name in EACH:
+        for name in INTERVAL_ATTRIBUTES:
             whole = getattr(self, name)
             setattr(part, name, whole if whole is None else whole[rows])
         return part
@@ -149,40 +155,42 @@ class Motion:
         return self.C_end @ self.f
 
     @property
-    def pitched(self) -> Floats:
+    def by_pitch_centre(self) -> Floats:
         """Return the derivatives of the path by the centres of pitch: (K, 3, 2)."""
-        out: Floats = (self.C @ self.up)[:, :, None] * self.nose_down[:, None]
+        out: Floats = (self.C @ self.up)[:, :, None] * self.pitch_increments[:, None]
         return out
 
     @property
     def vertical_shift(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
-        return self.pitched @ self.state.constants[PITCH_CENTRE]
+        return self.by_pitch_centre @ self.state.constants[PITCH_CENTRE]
 
-    def _vary(self) -> Floats:
+    def _vary_axis(self) -> Floats:
         """Return the change of the scaled forward axis, (K, 3), (S11), (S12); set its signals."""
         state, T, c = self.state, self.T, self.state.constants
-        self.pushed = self.axle.accelerations()
+        self.lean_accelerations = self.axle.accelerations()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
-        self.from_mean = varies_with(
+        self.tyre_signals = tyre_signals_at(
             speed, self.t_middle - state.t[0],
             self.axle.acceleration()) - self.axle.means_by_path(self.sums)
-        self.swung = np.maximum(self.left @ self.swings @ self.left, 0.0) / 2
-        self.varied = 1 + self.from_mean @ c[TYRES, None] + self.swung[:, None] * c[BY_PITCHING]
-        pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
+        self.half_pitch_variance = np.maximum(self.left @ self.swings @ self.left, 0.0) / 2
+        self.scale_ratio = 1 + self.tyre_signals @ c[TYRES, None] + self.half_pitch_variance[
+            :, None] * c[BY_PITCHING]
+        pitch, yaw = (self.lean_accelerations * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up; not by turns of a body that rolls
         self.rate_n = turn(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
-        nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
+        pitch_increments = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         # on banked ground a turn of the vehicle pitches it about its own axis
         left = np.einsum('ki,ki->k', self.rate_n, self.C @ self.left) * T[:, 0]
         turned = self.sums.mean_rate @ self.up * T[:, 0]
-        self.nose_down = np.stack(
-            [nose_down, nose_down - slowly(nose_down), left - nose_down, turned], -1)
+        self.pitch_increments = np.stack(
+            [pitch_increments, pitch_increments - moving_mean(pitch_increments), left
+             - pitch_increments, turned], -1)
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
-    def _inclined(self, straight: Floats) -> Floats:
+    def _inclination_ratio(self, straight: Floats) -> Floats:
         """Return the path over its projection on the body axis, (K,); set those of its slope."""
         # the odometer counts the path along the ground, independent of the body pitch by sway or
         # bumps; both projections are shorter by the cosine of their angle
@@ -195,24 +203,25 @@ class Motion:
             return np.einsum('ki,ki->k', x, self.up_n) * along / size, along / size
 
         of_body, _ = slope(straight)
-        travelled, per_metre = slope(self.travelled)
-        self.shorter = travelled * per_metre / (1 + travelled**2)
+        displacement_by_state, per_metre = slope(self.displacement_by_state)
+        self.slope_gradient = displacement_by_state * per_metre / (1 + displacement_by_state**2)
         # the wheel does not count a bounce on the springs, which changes the inclination to the
         # body and that to the horizontal; sway changes the first only, a crest the second
-        climbed = self.travelled[:, 2] * per_metre
+        climbed = self.displacement_by_state[:, 2] * per_metre
         bounced = np.clip(
-            (travelled - slowly(travelled)) * (climbed - slowly(climbed)), -0.5, 0.5)
-        return np.sqrt((1 + of_body**2 + bounced) / (1 + travelled**2))
+            (displacement_by_state - moving_mean(displacement_by_state))
+            * (climbed - moving_mean(climbed)), -0.5, 0.5)
+        return np.sqrt((1 + of_body**2 + bounced) / (1 + displacement_by_state**2))
 
-    def _by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
+    def _derivative_by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""
-        by_turn = np.cross(C @ self.up, self.travelled) / 2 + sign * np.cross(
+        by_turn = np.cross(C @ self.up, self.displacement_by_state) / 2 + sign * np.cross(
             C @ arm_b, self.up_n)
-        by = np.concatenate([sign * self.up_n, by_turn], axis=1) * self.shorter[:, None]
-        out: Floats = self.rolled[:, :, None] * by[:, None]
+        by = np.concatenate([sign * self.up_n, by_turn], axis=1) * self.slope_gradient[:, None]
+        out: Floats = self.wheel_displacement[:, :, None] * by[:, None]
         return out
 
-    def _by_odometer_filter(self) -> Floats:
+    def _derivative_by_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
         wheel = self.axle.wheel / self.state.scale
         # from the fit: the accelerometer determines it better than the readings
@@ -241,7 +250,8 @@ class Motion:
         a[:, PHI, PHI] = -one
         a[:, BG, BG] = a[:, BA, BA] = -one
         a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.displacement)
-        by_begin, by_end = self._by_slope(C, arm_b, -1.0), self._by_slope(self.C_end, arm_b, 1.0)
+        by_begin, by_end = self._derivative_by_slope(C, arm_b, -1.0), self._derivative_by_slope(
+            self.C_end, arm_b, 1.0)
         a[:, D, P] += by_begin[:, :, :3]
         a[:, D, PHI] += by_begin[:, :, 3:]
         # on a body with roll, part of the turn about its left axis is not about the level axis
@@ -261,27 +271,32 @@ class Motion:
         # the odometer does not count its vertical motion by pitch
         displacement = self.displacement
         if self.fitted:     # without sway and vertical motion, which are road noise
-            along = self.rolled / np.maximum(np.linalg.norm(self.rolled, axis=1), 1e-6)[:, None]
-            displacement = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
+            along = self.wheel_displacement / np.maximum(np.linalg.norm(self.wheel_displacement,
+                                                                        axis=1), 1e-6)[:, None]
+            displacement = along * np.einsum('ki,ki->k', along, self.displacement_by_state)[:,
+                                                                                            None]
         c[:, D, LN_K] = self.vertical_shift - displacement
-        by_scale = c[:, D, LN_K] / self.varied
-        c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
-        c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]
+        by_scale = c[:, D, LN_K] / self.scale_ratio
+        c[:, D, TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
+        c[:, D, BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
         for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
-            tilt = np.einsum('ki,ki->k', self.travelled, (C + self.C_end) @ gradient[:, 2] / 2)
+            tilt = np.einsum('ki,ki->k', self.displacement_by_state,
+                             (C + self.C_end) @ gradient[:, 2] / 2)
             c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
-                + swing @ gradient @ self.arm_v + self.rolled * (tilt * self.shorter)[:, None]
+                + swing @ gradient @ self.arm_v + self.wheel_displacement * (
+                    tilt * self.slope_gradient)[:, None]
         for i, axis in enumerate((self.up, -self.left)):
             turned = C @ s.S @ (state.scale * axis)
-            c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
-        c[:, D, PITCH_CENTRE] = -self.pitched
+            c[:, D, LEAN.start
+              + i:LEAN.stop:2] = -turned[:, :, None] * self.lean_accelerations[:, None, i::2]
+        c[:, D, PITCH_CENTRE] = -self.by_pitch_centre
         c[:, D, ODO_ARM] = swing @ state.C_bv
-        if self.unsaid is not None:
-            c[:, D, SPEED_OFFSET] = -self.unsaid
+        if self.by_speed_offset is not None:
+            c[:, D, SPEED_OFFSET] = -self.by_speed_offset
         # stamps late by d: the reading at a time is the travel d before it
         ahead = (self.f_n + self.f_n_end) / 2
-        c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
-        c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.rolled
+        c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.by_delay[:, None]
+        c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.wheel_displacement
         if self.by_steps:       # only the direction of the path is used, independent of these
             c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, BY_PITCHING, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0

@@ -25,7 +25,7 @@ from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
-from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
+from odocal_ros.estimator.levels import LEAST, LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
 
@@ -55,7 +55,7 @@ class MotionRows(Factor):
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion)
         self.noise = interval_noise(self.motion, problem.leg,
-                                    problem.still[:-1] & problem.still[1:], point.spread)
+                                    problem.still[:-1] & problem.still[1:], point.variance_factors)
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -85,7 +85,7 @@ class MotionRows(Factor):
                 self.derivatives(rows, units), axis=2)[:, :, :self.J.shape[2]]
         self.log_R = -2 * logs.sum()
 
-    def after(self, step: Floats, constants: Floats, reached: State) -> None:
+    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
         r, n = self.r.copy(), self.n
         for rows in blocks(len(r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
@@ -143,7 +143,7 @@ class MotionRows(Factor):
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         n, columns = self.n, out.at(INTERVAL)
         of = np.eye(len(INTERVAL))[self.noise.component]
         for rows in blocks(len(self.r)):
@@ -196,7 +196,7 @@ class MotionRows(Factor):
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         units, given = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
-            cross = self.with_wanted(block)
+            cross = self.with_parameters(block)
             by_rows = cross @ np.swapaxes(self.J[rows], 1, 2)
             units.append(by_rows @ self.units(rows))
             given.append(by_rows @ (self.whiten[rows] @ self.noise.given[rows]))

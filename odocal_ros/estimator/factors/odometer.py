@@ -17,11 +17,11 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.axle import Axle, varies_with
+from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
+from odocal_ros.estimator.levels import LEAST, LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.coarse_speed import SpeedInstants
@@ -104,14 +104,14 @@ class TravelError(Factor):
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         i, = out.at((self.name,))
         g = self.weight * self.state.travel_error / self.variance
         out.chain[:, E, i] += g
         out.square[i, i] += g @ self.state.travel_error
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        cross = self.all_with_wanted(marginals)
+        cross = self.all_with_parameters(marginals)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
         yield 'quantisation', travel[:, :, None]
@@ -165,16 +165,16 @@ class SpeedSteps(PointRows):
             + np.cross(points.spin, arm_b) @ state.forward
         c = state.constants
         axle = Axle(problem, state)
-        self.from_mean = varies_with(
+        self.tyre_signals = tyre_signals_at(
             self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
         ) - axle.means_by_path(point.intervals)
-        self.varied = 1 + self.from_mean @ c[layout.TYRES]
+        self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         said = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
-        self.said = state.scale * self.varied * said
+        self.said = state.scale * self.scale_ratio * said
         self.raw = (self.said - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
-    def there(cls, problem: Problem) -> bool:
+    def is_present(cls, problem: Problem) -> bool:
         return problem.leg.by_steps and len(_within(problem).t) > 0
 
     @classmethod
@@ -191,7 +191,7 @@ class SpeedSteps(PointRows):
         # factors on the variances by the grid: real transitions are no more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
-    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         return rows / self.sigma[some, None, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
@@ -206,10 +206,10 @@ class SpeedSteps(PointRows):
         J[:, layout.BG] = by_gyro[:, :3] + by_rate
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
-        K = state.scale * self.varied
+        K = state.scale * self.scale_ratio
         # by the published value: the speed is anywhere in its step, so only the speed has an error
         c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.said, K * self.instants.side
-        c[:, layout.TYRES] = (self.said / self.varied)[:, None] * self.from_mean
+        c[:, layout.TYRES] = (self.said / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(

@@ -23,7 +23,7 @@ from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.leg import ExternalSamples
-from odocal_ros.estimator.levels import Levels, LevelSides
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, CONSTANTS, SLOW, State, WITH_SLOW
@@ -45,9 +45,9 @@ class PointRows(Factor):
     """
     Rows of d components each.
 
-    k (m,) are the keyframes before, per_effective the rows per independent row. A subclass sets
-    raw (m, d), the residuals; share (m,), the weight of the correlated fix error of the keyframe
-    after, in rows of three components, or None. It implements ``jacobians`` and ``stated``.
+    k (m,) are the keyframes before, rows_per_independent the rows per independent row. A subclass
+    sets raw (m, d), the residuals; share (m,), the weight of the correlated fix error of the
+    keyframe after, in rows of three components, or None. It implements ``jacobians`` and ``whiten``.
     Weighted are r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
     """
 
@@ -59,7 +59,7 @@ class PointRows(Factor):
 
     def __init__(self, problem: Problem, points: Points) -> None:
         self.k = points.interval
-        self.per_effective = problem.per_effective.get(self.name, 1.0)
+        self.rows_per_independent = problem.rows_per_independent.get(self.name, 1.0)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -70,30 +70,31 @@ class PointRows(Factor):
         """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         raise NotImplementedError
 
-    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         """Return some of the rows, (k, d, c), divided by the sigmas that the sensor states."""
         raise NotImplementedError
 
-    def known(self) -> Bools | bool:
+    def existing_components(self) -> Bools | bool:
         """Return a mask of the components that exist: (m, d) bool or one for all."""
         return True
 
     def weigh(self, levels: Levels) -> None:
         """Compute r and J_end with the weights of heavy tails."""
-        white = self.stated(self.raw[:, :, None])[:, :, 0]
+        white = self.whiten(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
         for level, columns in self.levels_of.items():
             factor[columns] /= np.sqrt(levels[level])
         white = white * factor
         self.weight = self._weights(white)
-        each = np.sqrt(self.weight / self.per_effective)
+        each = np.sqrt(self.weight / self.rows_per_independent)
         self.r = each * white
         self._root = (each * factor)[:, :, None]
         self.J_end = None
         if self.n == WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
-            self.J_end = -self.stated(one) * self._root * self.share[:, None, None]
-        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.per_effective
+            self.J_end = -self.whiten(one) * self._root * self.share[:, None, None]
+        self.log_R = -2 * np.log(np.tile(factor,
+                                         (len(white), 1))).sum() / self.rows_per_independent
 
     @cached_property
     def J(self) -> Floats:
@@ -101,8 +102,8 @@ class PointRows(Factor):
         rows, constants = self.jacobians(self.n)
         out = room(*self.raw.shape, self.n + self.m)
         for some in blocks(len(out)):
-            out[some, :, :self.n] = self.stated(rows[some], some)
-            out[some, :, self.n:] = self.stated(constants[some, :, :self.m], some)
+            out[some, :, :self.n] = self.whiten(rows[some], some)
+            out[some, :, self.n:] = self.whiten(constants[some, :, :self.m], some)
             out[some] *= self._root[some]
         return out
 
@@ -121,13 +122,13 @@ class PointRows(Factor):
     def cost(self) -> float:
         """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
-        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.per_effective)):
+        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.rows_per_independent)):
             far = np.maximum(size / TAIL_SIGMAS, 1.0)
             total += float((np.minimum(size, TAIL_SIGMAS)**2
                             + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
-        return total / self.per_effective
+        return total / self.rows_per_independent
 
-    def after(self, step: Floats, constants: Floats, reached: State) -> None:
+    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
         own = np.concatenate([step[self.k], np.broadcast_to(
             constants[:self.m], (len(self.k), self.m))], axis=1)
         self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
@@ -177,13 +178,13 @@ class PointRows(Factor):
             return {}
         taken = np.concatenate([self._taken(marginals, present, gather)
                                 for present, gather in self._intervals()])
-        known = np.broadcast_to(self.known(), self.r.shape)
-        r2 = np.where(known, self.r, 0.0)**2 * self.per_effective
+        known = np.broadcast_to(self.existing_components(), self.r.shape)
+        r2 = np.where(known, self.r, 0.0)**2 * self.rows_per_independent
         return {level: (float(r2[:, columns].sum()),
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         if len(self.k) < FEWEST_JUDGED:
             return
         columns = out.at(self.levels_of)
@@ -211,7 +212,7 @@ class PointRows(Factor):
         n, parts = self.n, []       # columns of J and of J_end in the joint marginals
         own, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
-            cross = np.ascontiguousarray(self.with_wanted(marginals.of(present)))
+            cross = np.ascontiguousarray(self.with_parameters(marginals.of(present)))
             X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
@@ -219,7 +220,7 @@ class PointRows(Factor):
         yield self.source, np.concatenate(parts)
 
 
-def rows_per_effective(rows: PointRows) -> float:
+def count_rows_per_independent(rows: PointRows) -> float:
     """Return rows per independent row, by the scatter of means of adjacent rows."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # horizontal: determine scale and yaw
@@ -276,7 +277,7 @@ class ExternalRows(PointRows):
         raise NotImplementedError
 
     @classmethod
-    def there(cls, problem: Problem) -> bool:
+    def is_present(cls, problem: Problem) -> bool:
         return cls.name in problem.external
 
     @classmethod
@@ -296,6 +297,6 @@ class ExternalRows(PointRows):
         J = self._rows.J
         return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
 
-    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         out: Floats = rows * self._rows.root[some, :, None]
         return out

@@ -21,10 +21,10 @@ from odocal_ros.estimator.factors.factor import (
     add_process,
     Factor,
     LinearisationPoint,
-    WANTED,
+    PARAMETER_COUNT,
 )
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
-from odocal_ros.estimator.levels import Levels, LevelSides
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import PHI, V
 from odocal_ros.nav.rotations import rotvec, transpose
@@ -112,7 +112,7 @@ class PriorRows(Factor):
                           weights=np.exp((cost.min(axis=0) - cost) / 2))
         return dict(zip(SIZES, np.where(spread > 1, likely, mean).tolist(), strict=True))
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         columns = out.at(SIZES)
         off = self._constants_off()[layout.IMPERFECT]
         sigma = self.priors.constants[layout.IMPERFECT]
@@ -148,7 +148,7 @@ class PriorRows(Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        first = self.with_wanted(marginals[0][None])[0]
+        first = self.with_parameters(marginals[0][None])[0]
         yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias
         for name, where in self.own.items():
@@ -158,7 +158,7 @@ class PriorRows(Factor):
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""
         for name, where in self.shared.items():
-            yield name, covariance[:WANTED, where] / self.priors.constants[where]
+            yield name, covariance[:PARAMETER_COUNT, where] / self.priors.constants[where]
 
 
 # 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.

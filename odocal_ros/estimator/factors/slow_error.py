@@ -11,7 +11,7 @@ from scipy.linalg import solveh_banded
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors import factor
-from odocal_ros.estimator.levels import Levels, LevelSides
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import SLOW
 
@@ -34,7 +34,8 @@ class SlowError(factor.Factor):
 
     def __init__(self, problem: Problem, point: factor.LinearisationPoint) -> None:
         self.state, self.T = point.state, problem.drift_time
-        self.jump = 1.0 if point.spread is None else point.spread[:, factor.JUMP:]
+        self.jump = 1.0 if point.variance_factors is None else point.variance_factors[:,
+                                                                                      factor.JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
         # start of runs of intervals without fixes: a fix ends a run
         ends = np.bincount(point.points['fixes'].interval, minlength=len(self.T)) > 0
@@ -47,7 +48,7 @@ class SlowError(factor.Factor):
             **dict.fromkeys(('slow', 'slow_up'), 2 * problem.fix_least**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: shorter times are not separable from white noise
 
-    def in_use(self, levels: Levels) -> bool:
+    def is_used(self, levels: Levels) -> bool:
         return levels.correlation_time > 0
 
     def weigh(self, levels: Levels) -> None:
@@ -123,7 +124,7 @@ class SlowError(factor.Factor):
         information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
         return information + score, information
 
-    def add_levels(self, out: LevelSides) -> None:
+    def add_levels(self, out: LevelRightHandSides) -> None:
         """Add the right-hand sides of its levels; for a power, q is the error itself."""
         s = self.state.slow_n
         axes = {'slow': np.array([1.0, 1.0, 0.0]), 'slow_up': np.array([0.0, 0.0, 1.0])}
@@ -170,7 +171,7 @@ class SlowError(factor.Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        cross, n = self.all_with_wanted(marginals), self.n
+        cross, n = self.all_with_parameters(marginals), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]

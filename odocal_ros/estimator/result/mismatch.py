@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import Array, by_row, thinned
-from odocal_ros.estimator.factors.factor import ACCEL_NOISE, WANTED
+from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.heading import Heading
 from odocal_ros.estimator.fit import CONVERGENCE, Fit
@@ -51,7 +51,7 @@ UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white nois
 
 def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
-    level = fit.levels.roots()
+    level = fit.levels.sigmas()
     noise = _noise_over_grade(problem, level, config)
     excess = noise.over_problem_grade
     # vibration is not white, and its spectrum is unknown
@@ -134,7 +134,8 @@ def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> list[st
     """Return texts about outliers, slip, sideslip and height errors beyond their limits."""
     texts = []
     for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
-                       ('of the time the wheel slips', fit.spread[:, 0] > SLIP_VARIANCE)):
+                       ('of the time the wheel slips',
+                        fit.variance_factors[:, 0] > SLIP_VARIANCE)):
         share = float(mask.mean())
         if share > OUTLIER_SHARE_LIMIT:
             texts.append(f'{100 * share:.0f} % {what} (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)')
@@ -152,7 +153,7 @@ def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> list[st
 
 def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
     """Report an accelerometer whose errors are far beyond its noise level for many seconds."""
-    factor = fit.spread[:, ACCEL_NOISE]
+    factor = fit.variance_factors[:, ACCEL_NOISE]
     size = np.sqrt(factor * fit.levels['accel'])
     outlier = (factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)
     share = float(outlier.mean())
@@ -168,7 +169,7 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
 def last_step(fit: Fit) -> float:
     """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
     step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
-    return float(np.abs(step[:WANTED]).max())
+    return float(np.abs(step[:PARAMETER_COUNT]).max())
 
 
 def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reason]:

@@ -24,7 +24,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import EXTERNAL_FACTORS
-from odocal_ros.estimator.factors.factor import WANTED
+from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.interval_noise import assumed_noise_reasons
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -171,8 +171,8 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     border = marginal_information(fit, configured_constants(leg)).widened(posterior.factor)
     for error in posterior.beyond_fit:
         shared = error.source == 'height'      # unknown on one road as on the next
-        sources.append(Source(error.source, error.sigma * np.eye(WANTED)[:, [error.constant]],
-                              shared))
+        sources.append(Source(error.source, error.sigma
+                              * np.eye(PARAMETER_COUNT)[:, [error.constant]], shared))
         if not shared:
             border = border.loosened({layout.CONSTANTS[error.constant]: error.sigma})
     return sources, border
@@ -218,7 +218,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
         'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
         'f': K * state.forward,
-        'noise': fit.levels.roots(),
+        'noise': fit.levels.sigmas(),
         'iterations': fit.iterations, 'widened': float(widen),
         'outside': _outside(problem, fit, sigma),
         'posterior_to_prior': ratio,
@@ -228,7 +228,8 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
                       'fix_correlation_2s': correlation(t_fix, fixes.r[:, :2]),
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix), 'normalised': normalised_residuals(fit.weighted),
-                      'intervals_slipping': int((fit.spread[:, 0] > SLIP_VARIANCE).sum())},
+                      'intervals_slipping': int((fit.variance_factors[:,
+                                                                      0] > SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float((motion.turning * motion.T[:, 0]).sum()),
@@ -243,7 +244,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
 def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return details of the sensors besides IMU, odometer and fixes."""
     return {part.name: {'messages': len(sent.t),
-                        'alike': problem.per_effective.get(part.name, 1.0),
+                        'alike': problem.rows_per_independent.get(part.name, 1.0),
                         **part.details(sent, fit.state.constants, sigma)}
             for part in EXTERNAL_FACTORS if (sent := problem.external.get(part.name)) is not None}
 
@@ -259,13 +260,13 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     covariance: dict[str, np.ndarray] = {}
     for part in parts.values():
         for name, effects in part.effects(marginals):
-            flat = np.moveaxis(effects, -2, 0).reshape(WANTED, -1)
+            flat = np.moveaxis(effects, -2, 0).reshape(PARAMETER_COUNT, -1)
             covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
     shared = [Source(name, effects, True)
               for name, effects in fit.weighted[PriorRows].shared_effects(solved)]
-    rest = solved[:WANTED, :WANTED] - sum(covariance.values()) - sum(
+    rest = solved[:PARAMETER_COUNT, :PARAMETER_COUNT] - sum(covariance.values()) - sum(
         s.effects @ s.effects.T for s in shared)
-    by_levels = fit.by_levels[:WANTED]
+    by_levels = fit.by_levels[:PARAMETER_COUNT]
     for name, effects in (('noise_levels', by_levels[:, :-len(SIZES)]),
                           ('imperfection_sizes', by_levels[:, -len(SIZES):])):
         covariance[name] = effects @ effects.T

@@ -19,7 +19,7 @@ from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import imperfect_sigmas
+from odocal_ros.estimator.prepare import imperfection_sigmas
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.geodesy import A
 from odocal_ros.reasons import Code, Reason
@@ -95,7 +95,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
             *_scale_variation_reasons(fit, sigma), *_change_reasons(fit), *_bias_step_reasons(fit)]
-    usual = imperfect_sigmas(grade_of(config.imu))
+    usual = imperfection_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
@@ -144,8 +144,8 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
-    for i, span, what in ((layout.BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
-                          (layout.BY_TIME, motion.from_mean[:, 1], 'from start to end')):
+    for i, span, what in ((layout.BY_SPEED, motion.tyre_signals[:, 0], 'from low to high speed'),
+                          (layout.BY_TIME, motion.tyre_signals[:, 1], 'from start to end')):
         change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
         if abs(change) > max(REMARK_SIGMAS * doubt, LEAST_CHANGE):
             said.append(f'{100 * change:+z.2f} ± {100 * doubt:.2f} % {what}')
@@ -162,7 +162,7 @@ def _bias_step_reasons(fit: Fit) -> list[Reason]:
     for name, bias, column, unit, per in (
             ('gyro', fit.state.gyro_bias, GYRO_STEP, 'deg/s', np.rad2deg(1.0)),
             ('accelerometer', fit.state.accel_bias, ACCEL_STEP, 'm/s^2', 1.0)):
-        odd = np.r_[False, fit.spread[:, column] > STEP_VARIANCE, False]
+        odd = np.r_[False, fit.variance_factors[:, column] > STEP_VARIANCE, False]
         begin, end = np.flatnonzero(np.diff(odd.astype(int))).reshape(-1, 2).T
         size = np.linalg.norm(bias[end] - bias[begin], axis=1)
         if len(size):

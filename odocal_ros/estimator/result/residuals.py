@@ -70,7 +70,7 @@ def correlation(t: Floats, residual: Floats) -> float:
 def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
     """Return rms and outlier share of whitened residuals by sensor, without outlier weights."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
-    white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
+    white = fixes.r / np.sqrt(fixes.weight / fixes.rows_per_independent)
     return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
                    'beyond_3_sigma': float((np.abs(r) > 3).mean())}
             for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
@@ -106,10 +106,10 @@ def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     factor = np.ones(3)
     for level, columns in fixes.levels_of.items():
         factor[columns] = np.sqrt(fixes.levels[level])
-    each = np.sqrt(fixes.weight / fixes.per_effective) / factor
+    each = np.sqrt(fixes.weight / fixes.rows_per_independent) / factor
     value = -(covariance_root @ (fixes.r / each)[:, :, None])[:, :, 0]
     sigma = np.sqrt(covariance_root**2 @ factor**2)
-    known = fixes.known()
+    known = fixes.existing_components()
     return np.where(known, value, np.nan), np.where(known, sigma, np.nan)
 
 
@@ -146,7 +146,7 @@ def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
     """
     t = fit.state.t
     least = max(4 * float(np.sqrt(fit.levels['along'])), LEAST_SLIP, count)    # sigmas of a second
-    far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
+    far = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
     if not len(far):
         return ()
     slips = []
@@ -160,7 +160,7 @@ def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
 
 def describe_slip_level(fit: Fit, marginals: JointMarginals, count: float) -> str:
     """Return the slip level at changes of speed as text, '' if it is not observable."""
-    level = fit.levels.roots()
+    level = fit.levels.sigmas()
     # the noise of the difference of two readings, over a phase of 10 s
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
     # a level without information keeps its initial value
