@@ -4,21 +4,21 @@
 """
 Cold start: level, gyro bias, scale, heading and yaw mounting angle, without initial values.
 
-The gyro gives the attitude relative to the first keyframe. The mean specific force of the drive
-is up; its apparent rotation is the gyro bias about the horizontal axes. In the level frame the
-odometer gives the shape of the track. Its fit to the fixes gives the scale and the sum of heading
-and mounting angle; a change of this angle is the gyro bias about up. The heading alone is the
-rotation from the specific force to the accelerations of the track. All this is done for each
-section of a long leg, since a gyro warms up.
+The gyro gives the attitude relative to the first keyframe. The mean specific force of the drive is
+up; its apparent rotation is the gyro bias about the horizontal axes. The fit of the odometer's
+track in the level frame to the fixes gives the scale and the sum of heading and mounting angle; a
+change of this angle is the gyro bias about up. The heading alone is the rotation from the specific
+force to the accelerations of the track. A gyro warms up: a long leg is divided into sections.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from odocal_ros.calib.track_check import cut_pieces, find_inliers
 from odocal_ros.data.arrays import Complexes, Floats
+from odocal_ros.estimator.factors.odometer import odometer_speed
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import Intervals, preintegrate
@@ -26,9 +26,8 @@ from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.nav.alignment import level_frame
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.rotations import exp_so3, skew, wrap
+from odocal_ros.nav.time_series import fit_robust_line
 
-# s each side, for the mean of a speed: some rows of an odometer. Judgement
-SPEED_WINDOW = 0.4
 SECTION_LENGTH = 600.0      # s, judgement: in which one bias levels a gyro that warms up
 
 
@@ -38,7 +37,7 @@ class FittedTrack:
 
     X : (N,) travel units, complex.   K : m per unit.   chi : rad, rotation to the fixes at the
     first keyframe.   slope : rad/s, its change, None without fixes.   place : (N,) m, east + i
-    north.   height : (N,) m.   spread : m, scatter of the fixes about the track.
+    north.   height : (N,) m.   scatter : m, of the fixes about the track.
     """
 
     def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
@@ -51,52 +50,39 @@ class FittedTrack:
         at = np.interp(t_fix, t, self.X)
         self.K, self.slope = leg.rough_scale, None
         # weighted by length of the odometer: a jump of the fixes does not get a larger weight
-        moved, gone = np.diff(at), np.diff(z)
-        self.chi = float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
+        track_step, fix_step = np.diff(at), np.diff(z)
+        self.chi = float(np.angle((
+            track_step.conj() * fix_step / np.maximum(np.abs(fix_step), sigma)).sum()))
         for _ in range(2):
-            laid = self.K * np.exp(1j * self.chi) * at
-            apart = np.stack([(laid - z).real, (laid - z).imag], -1)
-            keep, noise = find_inliers(apart, sigma)
+            residual = self.K * np.exp(1j * self.chi) * at - z
+            keep, noise = find_inliers(np.stack([residual.real, residual.imag], -1), sigma)
             flat = np.stack([at.real, at.imag], -1) * self.K
-            found = cut_pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
-            middle, off = found.t, -found.off
+            pieces = cut_pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
+            middle, rotation = pieces.t, -pieces.off
             if not len(middle):
                 break
-            centre = float(np.angle(np.exp(1j * off).sum()))
-            off = np.unwrap(centre + wrap(off - centre)) if len(off) > 1 else off
-            self.chi, self.slope = _fit_line(middle, off)
-            at_mid = np.interp(middle, t_fix, np.arange(len(t_fix)))
-            k = np.unique(np.round(at_mid).astype(int))
-            run = np.abs(np.diff(at[k]))
-            chord = np.abs(np.diff(z[k]))
-            if (run > 0).any():
-                self.K = float(np.median(chord[run > 0] / run[run > 0]))
-        self.bend = 0.0 if self.slope is None else self.slope
-        self.chi_at = self.chi + self.bend * (t - t[0])
+            centre = float(np.angle(np.exp(1j * rotation).sum()))
+            if len(rotation) > 1:
+                rotation = np.unwrap(centre + wrap(rotation - centre))
+            self.chi, self.slope = fit_robust_line(middle, rotation)
+            rows = np.interp(middle, t_fix, np.arange(len(t_fix)))
+            k = np.unique(np.round(rows).astype(int))
+            path, chord = np.abs(np.diff(at[k])), np.abs(np.diff(z[k]))
+            if (path > 0).any():
+                self.K = float(np.median(chord[path > 0] / path[path > 0]))
+        self.chi_at = self.chi + (self.slope or 0.0) * (t - t[0])
         self.place = self._place(t, t_fix, z)
         self.height = _window_medians(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
-        laid = np.interp(t_fix, t, self.place)
-        self.spread = max(float(np.median(np.abs(laid - z))) / 1.18, 1e-3)
+        scatter = np.median(np.abs(np.interp(t_fix, t, self.place) - z))
+        self.scatter = max(float(scatter) / 1.18, 1e-3)
 
     def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
         """Return the track plus the smoothed difference from the fixes: (N,) m, east + i north."""
         steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
         off = z - np.interp(t_fix, t, path)
-        return path + _window_medians(t, t_fix, off.real) + 1j * _window_medians(t, t_fix,
-                                                                                 off.imag)
-
-
-def _fit_line(t: Floats, y: Floats) -> tuple[float, float]:
-    """Return value at the first time and slope of a line through points, by medians."""
-    if len(t) < 3:
-        return float(np.median(y)), 0.0
-    i, j = np.triu_indices(min(len(t), 400), 1)
-    pick = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
-    dt = t[pick][j] - t[pick][i]
-    far = dt > (t[-1] - t[0]) / 4
-    slope = float(np.median((y[pick][j] - y[pick][i])[far] / dt[far]))
-    return float(np.median(y - slope * (t - t[0]))), slope
+        east, north = (_window_medians(t, t_fix, x) for x in (off.real, off.imag))
+        return path + east + 1j * north
 
 
 def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
@@ -111,19 +97,31 @@ def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
+class _Section:
+    """A section of a leg."""
+
+    t: Floats           # (n,) s, of its keyframes
+    C_Lk: Floats        # (n, 3, 3) attitudes in its level frame
+    bias: Floats        # (3,) rad/s
+    track: FittedTrack
+    psi: float          # rad, rotation from the level frame to n by accelerations
+    sigma: float        # rad
+
+
+@dataclass(frozen=True, eq=False)
 class Start:
-    """A first state and its uncertainty; its parts give the state for another yaw."""
+    """A first state and its uncertainty; its sections give the state for another yaw."""
 
     state: State
     yaw_sigma: float        # rad, of the heading by acceleration
-    fix_spread: float       # m, scatter of the fixes about the track
+    fix_scatter: float       # m, scatter of the fixes about the track
     leg: SmootherLeg
-    parts: 'list[_Section]'
+    sections: list[_Section]
     scale: float            # metres per unit of travel
 
     def with_yaw(self, yaw: float) -> 'Start':
         """Return the start with this yaw mounting, rad, instead of the one by acceleration."""
-        return replace(self, state=_state_of_parts(self.leg, self.parts, self.scale, yaw))
+        return replace(self, state=_join_sections(self.leg, self.sections, self.scale, yaw))
 
 
 def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
@@ -134,57 +132,47 @@ def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
     initial yaw mounting, rad, instead of the one estimated from accelerations.
     """
-    parts = _estimate_sections(leg, imu, priors)
-    K = float(np.average([part.track.K for part in parts],
-                         weights=[np.abs(np.diff(part.track.X)).sum() + 1e-9 for part in parts]))
-    weight = np.array([1 / part.sigma**2 for part in parts])
+    sections = _estimate_sections(leg, imu, priors)
+    K = float(np.average([section.track.K for section in sections],
+                         weights=[np.abs(np.diff(section.track.X)).sum() + 1e-9
+                                  for section in sections]))
+    weight = np.array([1 / section.sigma**2 for section in sections])
     sigma = 1 / np.sqrt(weight.sum()) if weight.any() else np.inf
     if yaw is None:       # rad: beyond this sigma, the heading is ambiguous
-        turned = [np.exp(1j * (part.psi - part.track.chi)) for part in parts]
+        turned = [np.exp(1j * (section.psi - section.track.chi)) for section in sections]
         yaw = float(np.angle(weight @ turned)) if sigma <= 0.2 else 0.0
-    return Start(_state_of_parts(leg, parts, K, yaw), float(sigma),
-                 float(np.median([part.track.spread for part in parts])), leg, parts, K)
-
-
-@dataclass(frozen=True, eq=False)
-class _Section:
-    """Part of a leg."""
-
-    t: Floats           # (n,) s, of its keyframes
-    C_Lk: Floats        # (n, 3, 3) attitudes in its level frame
-    bias: Floats        # (3,) rad/s
-    track: FittedTrack
-    psi: float          # rad, rotation from the level frame to n by accelerations
-    sigma: float        # rad
+    return Start(_join_sections(leg, sections, K, yaw), float(sigma),
+                 float(np.median([section.track.scatter for section in sections])), leg, sections,
+                 K)
 
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
-    """Return the parts of a leg, of about START_PART each, with biases of their own."""
+    """Return the sections of a leg, of about SECTION_LENGTH each, with biases of their own."""
     # one whose heading no fixes determine is joined with the next, at the end with the one before
     count = max(1, round(float(np.ptp(imu.t[imu.key])) / SECTION_LENGTH))
     ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
-    parts, firsts = list[_Section](), [0]
+    sections, firsts = list[_Section](), [0]
 
     def between(first: int, last: int) -> _Section:
-        before = parts[-1].bias if parts else np.zeros(3)
+        before = sections[-1].bias if sections else np.zeros(3)
         return _estimate_section(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
 
     for last in ends[1:]:
         begin, end = imu.t[imu.key[[firsts[-1], last]]]
         if np.count_nonzero((leg.t_fix >= begin) & (leg.t_fix <= end)) < 2:
             continue
-        part = between(firsts[-1], last)
-        if part.track.slope is not None:
-            parts.append(part)
+        section = between(firsts[-1], last)
+        if section.track.slope is not None:
+            sections.append(section)
             firsts.append(last)
     if firsts[-1] < ends[-1]:
-        first = firsts[-2] if parts else 0
-        parts[-1:] = [between(first, ends[-1])]
-    return parts
+        first = firsts[-2] if sections else 0
+        sections[-1:] = [between(first, ends[-1])]
+    return sections
 
 
 def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Section:
-    """Return a part; before : (3,) gyro bias of the part before it."""
+    """Return a section; before : (3,) gyro bias of the section before it."""
     rest = gyro_bias_at_rest(leg, imu)
     bias = before if rest is None else rest
     sigma = np.maximum(priors.gyro_bias, 1e-3) if rest is None else np.full(3, 2e-4)
@@ -248,11 +236,6 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     return up, change
 
 
-def odometer_speed(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
-    """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
-    return (travel(t + SPEED_WINDOW) - travel(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
-
-
 def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
                   track: FittedTrack) -> tuple[float, float]:
     """Return the rotation from the level frame to n from accelerations, rad, and its sigma."""
@@ -286,27 +269,28 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
     return float(np.angle(x[0])), float(sigma)
 
 
-def _state(leg: SmootherLeg, part: _Section, K: float, yaw: float) -> State:
-    """Return the state of a part with scale and yaw mounting of the leg."""
-    t, track, N = part.t, part.track, len(part.t)
+def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
+    """Return the state of a section with scale and yaw mounting of the leg."""
+    t, track, N = section.t, section.track, len(section.t)
     turned = np.exp(1j * (track.chi_at + yaw))
     c, s = turned.real, turned.imag
     spin = np.zeros((N, 3, 3))
     spin[:, 0, 0], spin[:, 0, 1], spin[:, 1, 0], spin[:, 1, 1], spin[:, 2, 2] = c, -s, s, c, 1.0
-    C_nb = spin @ part.C_Lk
+    C_nb = spin @ section.C_Lk
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     ahead = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
     v_n = (C_nb @ ahead) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
-    return State(t, p_n, v_n, C_nb, np.tile(part.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
+    return State(t, p_n, v_n, C_nb, np.tile(section.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
                  np.zeros((N, 3)), constants)
 
 
-def _state_of_parts(leg: SmootherLeg, parts: 'Sequence[_Section]', K: float, yaw: float) -> State:
-    """Return the states of adjacent parts as one; each begins where the one before ends."""
-    states = [_state(leg, part, K, yaw) for part in parts]
+def _join_sections(leg: SmootherLeg, sections: 'Sequence[_Section]', K: float,
+                   yaw: float) -> State:
+    """Return the states of adjacent sections as one; each begins where the one before ends."""
+    states = [_state(leg, section, K, yaw) for section in sections]
     columns = [one.of_keyframes() for one in states]
     return replace(states[0], **{name: np.concatenate([
         column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})

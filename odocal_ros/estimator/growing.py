@@ -22,10 +22,8 @@ from odocal_ros.calib.result import MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive
-from odocal_ros.estimator.cold_start import odometer_speed, SPEED_WINDOW
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT, VARIANCE_FACTOR_COUNT
-from odocal_ros.estimator.factors.motion import gravity_n
-from odocal_ros.estimator.factors.odometer import as_rolled
+from odocal_ros.estimator.factors.odometer import as_rolled, odometer_speed, SPEED_WINDOW
 from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES, WarmStart
 from odocal_ros.estimator.imu import imu_rows, ImuSteps, nearest_samples
 from odocal_ros.estimator.leg import SmootherLeg
@@ -37,6 +35,7 @@ from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, NO_ERROR, State
+from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 

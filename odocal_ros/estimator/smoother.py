@@ -121,7 +121,7 @@ def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> F
 def _initial_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels: fixes no better than their fit to the odometer track."""
     wide, wide_up = (max(1.0, (spread / sigma)**2) for spread, sigma in (
-        (start.fix_spread, problem.fix_sigma), (2 * start.fix_spread, problem.height_sigma)))
+        (start.fix_scatter, problem.fix_sigma), (2 * start.fix_scatter, problem.height_sigma)))
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     leg = problem.leg
     long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM

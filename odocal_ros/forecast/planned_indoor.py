@@ -23,7 +23,6 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.forecast import planned_methods
 from odocal_ros.forecast.planned_drive import drive_from_rates
-from odocal_ros.forecast.planned_methods import ideal_samples
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative_sigma
 from odocal_ros.nav.geodesy import rate_without_north
@@ -235,7 +234,7 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
                     sway=float(robot.slip * np.sqrt(planned_methods.SWAY_RATE)),
                     slip=float(robot.slip / np.sqrt(robot.wheels)))
     drive = drive_from_rates(motion.t, motion.speed, motion.rate)
-    made = ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
+    made = planned_methods.ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
     leg = made.leg
     turned = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
     used = _fixes_at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)

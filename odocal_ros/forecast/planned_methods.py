@@ -19,7 +19,6 @@ from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
-from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import ImuSteps, keyframes, sensor_noise
@@ -35,7 +34,7 @@ from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import predict, Prediction, Sigmas
 from odocal_ros.nav.alignment import HEADING_LIMIT
-from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose

@@ -19,7 +19,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
 from odocal_ros.nav import geodesy
-from odocal_ros.nav.geodesy import GNSS_MOVES
+from odocal_ros.nav.geodesy import C_en, GNSS_MOVES, gravity
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.time_series import robust_sigma
@@ -166,3 +166,12 @@ def level_track(travel: Floats, turned: Floats) -> Floats:
     middle = (turned[1:] + turned[:-1]) / 2
     step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+
+
+def gravity_n(position_n: Floats, origin: Origin) -> Floats:
+    """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
+    latitude, longitude, height = origin.to_geodetic(position_n).T
+    up_e = C_en(latitude, longitude)[..., 2]
+    down: Floats = -gravity(latitude, height)[:, None] * (
+        up_e @ C_en(origin.latitude, origin.longitude))
+    return down

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Time series: integrals, gaps in the times of rows, robust sigmas by medians.
+Time series: integrals, gaps in the times of rows, sigmas and lines by medians.
 
 Integrals of long columns are computed in pieces, bitwise equal to integrals at once.
 """
@@ -104,3 +104,15 @@ def gaps_in_rhythm(t: Floats) -> Floats:
         return np.empty((0, 2))
     shortest_gap = 0.2    # s
     return gaps_longer(t, max(GAP_INTERVALS * float(np.median(np.diff(t))), shortest_gap))
+
+
+def fit_robust_line(t: Floats, y: Floats) -> tuple[float, float]:
+    """Return value at the first time and slope of a line through points, by medians."""
+    if len(t) < 3:
+        return float(np.median(y)), 0.0
+    i, j = np.triu_indices(min(len(t), 400), 1)
+    pick = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
+    dt = t[pick][j] - t[pick][i]
+    far = dt > (t[-1] - t[0]) / 4
+    slope = float(np.median((y[pick][j] - y[pick][i])[far] / dt[far]))
+    return float(np.median(y - slope * (t - t[0]))), slope

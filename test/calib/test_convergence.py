@@ -64,7 +64,7 @@ def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
         passes[-1] = passes[-1][0], bool(taken.any())
         return own(solved, taken)
     monkeypatch.setattr(fit, 'Equations', Watched)
-    monkeypatch.setattr(fit, 'damped', damp_step)
+    monkeypatch.setattr(fit, 'damp_step', damp_step)
     calibrate(drive.leg(), configured(drive))
     first = passes.index((True, False))
     assert first > 1

@@ -109,7 +109,7 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
         'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})
-    monkeypatch.setattr(prepare, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
+    monkeypatch.setattr(prepare, 'imperfection_sigmas', lambda *_: np.zeros(len(USUAL)))
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(

@@ -13,7 +13,7 @@ from smoother_legs import made, truth
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, preintegrate_at as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
-from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
+from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, moving_mean
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
 from odocal_ros.estimator.prepare import make_problem
@@ -191,11 +191,11 @@ def test_bumps_may_have_another_centre_than_hills():
     hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
     around = slice(HILL_INTERVALS, -HILL_INTERVALS)
     # the mean of five over a period of 2.5 is 0; over one of 40 it is a sinc: 0.974
-    assert slowly(bump)[around] == pytest.approx(0.0, abs=1e-9)
-    assert slowly(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
-                                                 * hill[around])
+    assert moving_mean(bump)[around] == pytest.approx(0.0, abs=1e-9)
+    assert moving_mean(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
+                                                      * hill[around])
     both, fast = motion.pitch_increments.T[:2]
-    assert fast == pytest.approx(both - slowly(both))
+    assert fast == pytest.approx(both - moving_mean(both))
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():

@@ -101,7 +101,7 @@ def test_a_shock_of_a_short_drive_is_no_vibration(seconds, reported):
     spread = np.ones((60, VARIANCE_FACTOR_COUNT))
     spread[:seconds, ACCEL_NOISE] = 100.0
     fit = SimpleNamespace(variance_factors=spread, levels={'accel': 0.005**2})
-    assert bool(mismatch._outliers(fit)) == reported
+    assert bool(mismatch._accelerometer_outlier_reasons(fit)) == reported
 
 
 def test_a_level_that_no_row_determines_is_not_reported():

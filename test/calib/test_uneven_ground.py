@@ -6,12 +6,11 @@
 import numpy as np
 import pytest
 
-from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LIFT, PITCH
-from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.settings.config import Config, with_settings

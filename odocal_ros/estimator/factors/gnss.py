@@ -16,12 +16,11 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows, Rows
 from odocal_ros.estimator.leg import ExternalSamples, from_place, thinned
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.receiver_filter import odometer_error, smoothing
 from odocal_ros.nav.rotations import skew, transpose, turn
 from odocal_ros.screening.inputs import Inputs

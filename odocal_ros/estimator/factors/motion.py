@@ -43,8 +43,7 @@ from odocal_ros.estimator.state import (
     V,
     YAW,
 )
-from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.geodesy import C_en, gravity
+from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
@@ -57,15 +56,6 @@ INTERVAL_ATTRIBUTES = (
     'by_speed_offset', 'lean_accelerations', 'pitch_increments', 'rate_n', 'level_left',
     'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
     'displacement_by_state', 'residual')
-
-
-def gravity_n(position_n: Floats, origin: Origin) -> Floats:
-    """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
-    latitude, longitude, height = origin.to_geodetic(position_n).T
-    up_e = C_en(latitude, longitude)[..., 2]
-    down: Floats = -gravity(latitude, height)[:, None] * (
-        up_e @ C_en(origin.latitude, origin.longitude))
-    return down
 
 
 def moving_mean(x: Floats) -> Floats:

@@ -19,14 +19,22 @@ from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
-from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
 from odocal_ros.estimator.levels import LEAST, LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
+from odocal_ros.estimator.state import (
+    E,
+    ODO_CLOCK,
+    ODO_DELAY,
+    ODO_LAG2,
+)
 from odocal_ros.nav.coarse_speed import SpeedInstants
+from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import turn
+
+# s each side, for the mean of a speed: some rows of an odometer. Judgement
+SPEED_WINDOW = 0.4
 
 # s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s, the
 # rounding error of a counter adds twice the error of a reading
@@ -231,3 +239,8 @@ def _within(problem: Problem) -> SpeedInstants:
 def filter_time(constants: Floats) -> float:
     """Return the time constant of a first-order filter with the variance of its delays, s."""
     return float(np.sqrt(max(constants[layout.ODO_LAG2], LEAST_FILTER**2)))
+
+
+def odometer_speed(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
+    """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
+    return (travel(t + SPEED_WINDOW) - travel(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)

@@ -35,20 +35,17 @@ from odocal_ros.settings.config import Config
 # sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
 # row in 370 is down-weighted
 TAIL_SIGMAS = 3.0
-FEWEST_JUDGED = 5    # rows, of which one may be an outlier: judgement
-
-
+LEAST_ROWS = 5    # rows, of which one may be an outlier: judgement
 Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
 
 
 class PointRows(Factor):
     """
-    Rows of d components each.
+    Rows of d components each; k (m,) : the keyframes before.
 
-    k (m,) are the keyframes before, rows_per_independent the rows per independent row. A subclass
-    sets raw (m, d), the residuals; share (m,), the weight of the correlated fix error of the
-    keyframe after, in rows of three components, or None. It implements ``jacobians`` and ``whiten``.
-    Weighted are r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
+    A subclass sets raw (m, d), the residuals; share (m,), the weight of the correlated fix error
+    of the keyframe after, in rows of three components, or None. It implements ``jacobians`` and
+    ``whiten``. Weighted are r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that error, or None.
     """
 
     levels_of: ClassVar[dict[str, slice]]     # columns of each level, a factor on variances
@@ -114,7 +111,7 @@ class PointRows(Factor):
     def _weights(self, white: Floats) -> Floats:
         """Return weights of whitened residuals, (m, d), equal for the columns of one level."""
         w = np.ones_like(white)
-        if len(white) >= FEWEST_JUDGED:
+        if len(white) >= LEAST_ROWS:
             for columns, size in self._sizes(white):
                 w[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
         return w
@@ -174,7 +171,7 @@ class PointRows(Factor):
             yield present[some], gather
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        if len(self.k) < FEWEST_JUDGED:
+        if len(self.k) < LEAST_ROWS:
             return {}
         taken = np.concatenate([self._taken(marginals, present, gather)
                                 for present, gather in self._intervals()])
@@ -185,7 +182,7 @@ class PointRows(Factor):
                 for level, columns in self.levels_of.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
-        if len(self.k) < FEWEST_JUDGED:
+        if len(self.k) < LEAST_ROWS:
             return
         columns = out.at(self.levels_of)
         q = np.zeros((*self.r.shape, len(columns)))

@@ -14,13 +14,12 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
 from odocal_ros.estimator.leg import ExternalSamples
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BARE, BG, GYRO, M, P, PHI, PRESSURE, V
-from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.rotations import skew, turn
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
