@@ -31,7 +31,7 @@ from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import running_integral
-from odocal_ros.pipeline.calibrate import faults, Screened, screened
+from odocal_ros.pipeline.calibrate import faults, screen_leg, Screened
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.imu_orientation import (
     estimate_orientation,
@@ -79,7 +79,7 @@ class ImuGaps:
 @lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
 def screened_in_cells(leg: Leg, config: Config) -> Screened:
     """Return the inputs of a leg whose IMU rows are means over cells of time."""
-    return screened(leg, _with_cells(leg, config))
+    return screen_leg(leg, _with_cells(leg, config))
 
 
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:

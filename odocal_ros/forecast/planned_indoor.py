@@ -27,7 +27,7 @@ from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative_sigma
 from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.time_series import running_integral
-from odocal_ros.pipeline.planar_run import known_of
+from odocal_ros.pipeline.planar_run import known_values
 from odocal_ros.settings import config as settings
 
 MOTION_STEP = 0.1                     # s, definition: time step of a motion
@@ -198,7 +198,7 @@ def _position_nodes(motion: RobotMotion, robot: Robot) -> Ints:
 def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the planar estimator: covariance of its fit at the truth."""
     run, state, constants = ideal_planar_run(motion, robot)
-    known = replace(known_of(run, config), drift_length=robot.drift_length)
+    known = replace(known_values(run, config), drift_length=robot.drift_length)
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
     found = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)

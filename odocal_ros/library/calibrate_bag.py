@@ -179,10 +179,10 @@ def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[
 
 def _without_refused(results: list[LegResult], listener: Notes) -> list[LegResult]:
     """Return automatic legs without the unusable ones, as in the node."""
-    from odocal_ros.pipeline.automatic import refusal
+    from odocal_ros.pipeline.automatic import rejecting_reason
     kept, notes = [], []
     for leg in results:
-        if reason := refusal(leg):
+        if reason := rejecting_reason(leg):
             start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
             notes.append(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
                          f'{reason.code.name}: {reason.text}')

@@ -26,7 +26,7 @@ from odocal_ros.pipeline.floor_marks import (
     FloorMark,
     mark_positions,
     marks_at,
-    with_marks,
+    settings_with_marks,
     WITHIN,
 )
 from odocal_ros.reasons import Reason
@@ -141,7 +141,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         name = one_line(bag.name)
         floor_marks = floor_marks_of(settings, bag)
         if floor_marks:
-            settings = with_marks(settings)
+            settings = settings_with_marks(settings)
         if journal:
             listener.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')

@@ -65,7 +65,7 @@ def provisional_answer(at_stop: SessionView) -> str:
         estimate = (f'the running estimate is {values_in_words(known)}, computed '
                     f'{at_stop.forecast_age_s:.0f} s before the end')
     faults = [f'The leg would be rejected: {r.code.name}: {r.text}'
-              for r in at_stop.faults[:1] if at_stop.lost_cause]
+              for r in at_stop.faults[:1] if at_stop.is_rejected_so_far]
     of_all = ' of all legs' if session.legs else ''
     return _sentences([
         f'provisional: leg {session.leg_id} is being computed; {estimate}', *faults,
@@ -100,8 +100,8 @@ def hint(now: SessionView) -> str:
         return f'computing: {now.computed.words() or "started"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
-                if session.open_leg else 'call ~/reset')
-    if now.lost_cause:
+                if session.has_open_leg else 'call ~/reset')
+    if now.is_rejected_so_far:
         return '; '.join([_fault_text(now), *now.missing[:1]])
     if now.missing:
         return now.missing[0]
@@ -122,7 +122,7 @@ def hint(now: SessionView) -> str:
 
 def hint_action_first(now: SessionView) -> str:
     """Return the hint for a single line: in a leg the action comes before the estimate."""
-    fine = not (now.lost_cause or now.missing or now.clocks)
+    fine = not (now.is_rejected_so_far or now.missing or now.clocks)
     if now.session.state is State.RECORDING and fine:
         actions, facts = _recording_hint(now)
         return '; '.join([*(actions or ['drive on']), *facts])
@@ -133,7 +133,8 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
     """Return the quantities that meet their limits: of the current leg, else of the result."""
     session = now.session
     if session.state is State.RECORDING:
-        return quantities.check_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
+        return quantities.check_forecast(now.forecast, now.config, now.two_wheels,
+                                         now.is_rejected_so_far)
     if session.state is not State.COMPUTING and session.calibration is not None:
         return quantities.check_calibration(session.calibration, now.config, now.two_wheels)
     if session.state is not State.COMPUTING and session.restored is not None:
@@ -151,7 +152,7 @@ def metres_to_go(now: SessionView) -> float:
 
 def seconds_to_stand(now: SessionView) -> float:
     """Return the seconds of standstill still required, before the start or at the end of a leg."""
-    if now.session.state is State.RECORDING or not now.session.busy:
+    if now.session.state is State.RECORDING or not now.session.is_busy:
         return max(0.0, PREDICTED_REST_S - now.still_s)
     return 0.0
 

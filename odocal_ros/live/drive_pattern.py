@@ -44,7 +44,7 @@ class DrivePattern(SettledNode):
     default_name = 'drive_pattern'
 
     def _build(self) -> None:
-        self.config: PatternConfig = params.declare(self, PatternConfig)
+        self.config: PatternConfig = params.declare_settings(self, PatternConfig)
         if math.isnan(self.config.speed):
             raise BadConfig('speed is not set; required: the speed limit, m/s: -p speed:=0.2')
         self._rectangle = pattern.rectangle_of(self.config)
@@ -64,7 +64,7 @@ class DrivePattern(SettledNode):
                                                 'cmd_vel', 1)
         self.create_service(Trigger, '~/start', self._start)
         self.create_service(Trigger, '~/stop', self._stop)
-        self.add_on_set_parameters_callback(params.fixed(PatternConfig))
+        self.add_on_set_parameters_callback(params.refuse_after_start(PatternConfig))
         self.steady_timer(PERIOD_S, self._tick)
         self.get_logger().info(f'ready: {self.config.pattern} in the rectangle {self._rectangle}, '
                                f'at most {self.config.speed:g} m/s; call ~/start')

@@ -198,8 +198,8 @@ class Filing:
         return future
 
     @property
-    def busy(self) -> bool:
-        return self._saves_running > 0 or self._report_worker.busy
+    def is_busy(self) -> bool:
+        return self._saves_running > 0 or self._report_worker.is_busy
 
     def _write(self, calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:

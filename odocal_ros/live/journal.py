@@ -80,14 +80,14 @@ class Journal:
         received.sent_ns += sent_ns
         received.newest_ns = source.newest_ns
 
-    def tick(self, config: Config, busy: bool) -> None:
+    def tick(self, config: Config, is_busy: bool) -> None:
         """Hand over new messages if due; join the files of an ended leg once no leg is busy."""
         now_ns = time.monotonic_ns()
-        if not self._limit_from(config):
+        if not self._update_limit(config):
             return
         if now_ns >= self._due_ns:
             self._hand_over()
-        if self._ended and not busy:
+        if self._ended and not is_busy:
             self._leg_id, self._ended = 0, False
             self._writer.submit(self._writer.finish)
         if self.trouble != self._reported:
@@ -95,7 +95,7 @@ class Journal:
             if self._reported:
                 self._log.warning(f'the journal cannot be written: {self._reported}')
 
-    def _limit_from(self, config: Config) -> int:
+    def _update_limit(self, config: Config) -> int:
         """Update limit and reach from the settings; return the limit, 0 for no journal."""
         if self._limit and not config.journal.max_bytes:
             self.restart()
@@ -114,7 +114,7 @@ class Journal:
     def begin(self, session: Session, topics: dict[str, str]) -> None:
         """Open the journal of the leg that the session has just started."""
         config = session.config
-        if not self._limit_from(config):
+        if not self._update_limit(config):
             return
         self._hand_over()       # earlier messages are pre-roll
         now_ns = self._clock.now().nanoseconds

@@ -24,7 +24,7 @@ WAITING_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
 HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 
-def journals(root: Path) -> list[Path]:
+def journal_folders(root: Path) -> list[Path]:
     found = []
     with suppress(FileNotFoundError):
         for folder in root.iterdir():
@@ -46,7 +46,7 @@ def clear_empty(root: Path) -> None:
                 shutil.rmtree(folder)
 
 
-def size_of(folder: Path) -> int:
+def folder_size(folder: Path) -> int:
     total = 0
     with suppress(FileNotFoundError):
         for path in folder.iterdir():
@@ -61,17 +61,17 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
 
     Journals in use are kept. Returns the remaining size, bytes.
     """
-    sizes = {folder: size_of(folder) for folder in journals(root)}
+    sizes = {folder: folder_size(folder) for folder in journal_folders(root)}
     for folder in list(sizes):
         if sum(sizes.values()) + needed <= limit:
             break
         if not _in_use(folder):
             shutil.rmtree(folder, ignore_errors=True)
-            sizes[folder] = size_of(folder)
+            sizes[folder] = folder_size(folder)
     return sum(sizes.values())
 
 
-def claim(folder: Path) -> TextIO:
+def lock_journal(folder: Path) -> TextIO:
     """Lock a journal as in use, until the returned file is closed or the process ends."""
     file = (folder / JOURNAL).open(encoding='utf-8')
     with suppress(OSError):      # a file system without locks: its use is unknown
@@ -115,7 +115,7 @@ class LegJournal:
         self._channels = channels
         self._waiting = chunks        # the pre-roll is written with the start mark, not before
         self._bag: SegmentedBag | None = None
-        self._claim: TextIO | None = None
+        self._lock: TextIO | None = None
         self._others = 0              # bytes of the other journals
         self._over = False            # given up, or finished
         self.late: list[Chunk] = []  # marks that came after the end, not written yet
@@ -145,8 +145,8 @@ class LegJournal:
                 shutil.rmtree(self._bag.folder, ignore_errors=True)
                 self._bag = None
         self._over, self._waiting = True, []
-        if self._claim is not None:
-            self._claim.close()
+        if self._lock is not None:
+            self._lock.close()
 
     def add(self, chunks: list[Chunk]) -> None:
         """Add a mark to the finished journal."""
@@ -191,7 +191,7 @@ class LegJournal:
         folder = new_folder(root, self.plan.name)
         try:
             write_text(folder / JOURNAL, self.plan.settings)
-            self._claim = claim(folder)
+            self._lock = lock_journal(folder)
         except OSError:
             shutil.rmtree(folder, ignore_errors=True)
             raise

@@ -27,7 +27,7 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.output.figures import iso
-from odocal_ros.pipeline.floor_marks import with_marks
+from odocal_ros.pipeline.floor_marks import settings_with_marks
 from odocal_ros.settings.config import Config
 
 LATE_TOPIC_S = 1.0   # judgement: longest wait for late topics at the stop mark
@@ -65,14 +65,14 @@ class LegCompletion:
     @property
     def is_awaited(self) -> bool:
         """Return True while a leg is computed or files are written."""
-        return self.session.state is State.COMPUTING or self._filing.busy
+        return self.session.state is State.COMPUTING or self._filing.is_busy
 
     def tick(self) -> None:
         """Process finished jobs, new messages and timeouts."""
         self._worker.poll()
         self._filing.poll()
         self.pump()
-        if self._recording.time_jumped:
+        if self._recording.has_time_jumped:
             self._restart_after_jump()
         self._stop_when_too_long()
         self._close_when_complete()
@@ -82,7 +82,7 @@ class LegCompletion:
             self._running_estimate.update(self._recording.newest_ns,
                                           self._recording.progress.distance_m())
             self._report_silence()
-        self._journal.tick(self._config(), self.session.busy)
+        self._journal.tick(self._config(), self.session.is_busy)
 
     def _report_silence(self) -> None:
         """Publish the status immediately when the IMU falls silent or returns."""
@@ -98,7 +98,7 @@ class LegCompletion:
 
     def close(self) -> bool:
         self._running_estimate.end()
-        grace_s = worker.FILES_GRACE_S if self._filing.busy else worker.JOB_GRACE_S
+        grace_s = worker.FILES_GRACE_S if self._filing.is_busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
@@ -137,7 +137,7 @@ class LegCompletion:
         forecast = self._running_estimate.forecast
         if self._view_at_stop is not None and session.state is State.COMPUTING:
             forecast = self._view_at_stop.forecast
-        config = session.config if session.busy else self._config()
+        config = session.config if session.is_busy else self._config()
         return SessionView(
             session, config, missing=inputs.missing(config),
             duplicate_publishers=inputs.duplicate_publishers(),
@@ -185,7 +185,7 @@ class LegCompletion:
         """Open a leg at a mark and return the text for log and answer."""
         session = self.session
         config = self._config()
-        session.start(mark_ns, with_marks(config) if config.reference.points else config,
+        session.start(mark_ns, settings_with_marks(config) if config.reference.points else config,
                       is_automatic)
         self._recording.inputs.begin_leg()
         self._journal.begin(session, self._recording.inputs.topics)
@@ -236,7 +236,7 @@ class LegCompletion:
             self.session.fail(trouble)
         self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
         remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
-                  'it') if self.session.open_leg else 'call ~/reset'
+                  'it') if self.session.has_open_leg else 'call ~/reset'
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
     def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:

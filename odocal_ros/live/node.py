@@ -62,7 +62,7 @@ class Calibrator(SettledNode):
     at_work = False
 
     def _build(self) -> None:
-        self.config = params.declare(self)
+        self.config = params.declare_settings(self)
         known_imu(self.config)      # raises now, not after the first leg
         if self.config.reference.points:
             check_points(self.config)
@@ -98,19 +98,19 @@ class Calibrator(SettledNode):
         """Refuse parameters that cannot be set now; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
-        refusal = params.refused(self.config, self.publishing.results(), parameters)
+        refusal = params.change_refusal(self.config, self.publishing.results(), parameters)
         session = self.operation.session
-        if not refusal and session.busy:
+        if not refusal and session.is_busy:
             refusal = (f'leg {session.leg_id} is {session.state.value}: its configuration is '
                        'fixed; end it with ~/stop_leg or ~/cancel_leg first')
         try:
-            params.changed(self.config, parameters)
+            params.with_parameters(self.config, parameters)
         except OdocalError as error:
             refusal = refusal or str(error)
         return SetParametersResult(successful=not refusal, reason=refusal)
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
-        self.config = params.changed(self.config, parameters)
+        self.config = params.with_parameters(self.config, parameters)
 
     # called five times a second
 
@@ -121,7 +121,7 @@ class Calibrator(SettledNode):
                 self.recording.inputs.update(self.config)
                 session = self.operation.session
                 self.recording.forget(self.config.leg.preroll,
-                                      session.start_ns if session.open_leg else 0)
+                                      session.start_ns if session.has_open_leg else 0)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
                 self.publishing.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):

@@ -80,7 +80,7 @@ class OdometryNode(SettledNode):
     default_name = 'odometry'
 
     def _build(self) -> None:
-        self.config = params.declare(self, ApplyConfig)
+        self.config = params.declare_settings(self, ApplyConfig)
         calibration = params.declare_results(self, params.APPLIED)
         if calibration is None or not calibration.valid:
             refusal = 'no calibration is given' if calibration is None else (
@@ -106,7 +106,7 @@ class OdometryNode(SettledNode):
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
         self._logged_ns: dict[str, int] = {}      # last log by kind of text
         self._topics = TopicReport()
-        self.add_on_set_parameters_callback(params.fixed(ApplyConfig))
+        self.add_on_set_parameters_callback(params.refuse_after_start(ApplyConfig))
         self._tf = self._transforms() if self.config.publish_tf else None
         self._due_ns = self._reckoned_ns = 0
         self._timer = self.steady_timer(CHECK_PERIOD_S, self._run_cycle)

@@ -18,7 +18,7 @@ from odocal_ros.live.session import Refused, State
 from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.pipeline.automatic import LegSearch
-from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
+from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITHIN
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
@@ -82,13 +82,13 @@ class AutomaticLegs(LegCompletion):
         if session.state is not State.RECORDING and newest.start_ns != self._counted_ns:
             self._counted_ns = newest.start_ns      # the leg before may still be computed
             self._recording.progress.begin_leg()
-        if session.state is State.FAILED and session.open_leg and session.is_automatic:
+        if session.state is State.FAILED and session.has_open_leg and session.is_automatic:
             self._drop_leg(lost=session.trouble)
         elif session.state is State.RECORDING:
             if session.is_automatic and span.stop_ns:
                 search.spans.popleft()
                 self._end_leg(span.stop_ns)
-        elif not session.open_leg and not session.busy and not self._start_refusal():
+        elif not session.has_open_leg and not session.is_busy and not self._start_refusal():
             if span.start_ns < self._recording.newest_ns - self._config().leg.preroll * 1e9:
                 search.spans.popleft()      # its samples were dropped
             else:
@@ -161,7 +161,7 @@ class Operation(AutomaticLegs):
         mark = session.mark(newest_ns - round(WITHIN * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
         self.show_status()
-        x, y = place_of(session.config, mark.point)
+        x, y = point_position(session.config, mark.point)
         text = (f'mark {len(session.marks_of_leg())} of leg {session.leg_id}: point '
                 f'{mark.point + 1}, x {x:g} m, y {y:g} m')
         self._log.info(text)
@@ -172,7 +172,7 @@ class Operation(AutomaticLegs):
         session = self.session
         if session.state is State.RECORDING:
             self.end_leg_now()
-        elif session.open_leg and session.state is State.FAILED and self._snapshot is not None:
+        elif session.has_open_leg and session.state is State.FAILED and self._snapshot is not None:
             session.retry(self._config())
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
@@ -222,7 +222,7 @@ class Operation(AutomaticLegs):
         return self._computing.create_future()
 
     def reset(self) -> tuple[bool, str]:
-        if self.session.state is State.FAILED and self.session.open_leg:
+        if self.session.state is State.FAILED and self.session.has_open_leg:
             self._drop_leg('reset')
         dropped = self.session.begin_reset()
         self._publishing.forget_restored()

@@ -80,7 +80,7 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     return result
 
 
-def declare(node: Node, kind: type = Config) -> Any:
+def declare_settings(node: Node, kind: type = Config) -> Any:
     """
     Declare every setting as a parameter and return the configuration, of class ``kind``.
 
@@ -98,7 +98,7 @@ def declare(node: Node, kind: type = Config) -> Any:
                 node.set_parameters([Parameter(name, Parameter.Type[array], [])])
         except ParameterException as error:
             raise BadConfig(_refusal(name, setting, error)) from None
-        values[name] = setting.default if value is None else _plain(value)
+        values[name] = setting.default if value is None else _python_value(value)
     _warn_of_unknown(node, settings)
     return with_settings(kind(), values)
 
@@ -133,13 +133,13 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
                                 'and restart')
 
 
-def changed(config: Config, parameters: list[Parameter]) -> Config:
+def with_parameters(config: Config, parameters: list[Parameter]) -> Config:
     """Return config with the settings among the parameters applied and checked."""
     return with_settings(config, {
-        p.name: _plain(p.value) for p in parameters if p.name in SETTINGS})
+        p.name: _python_value(p.value) for p in parameters if p.name in SETTINGS})
 
 
-def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
+def change_refusal(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
     """Return the refusal of parameters that only the node or its start may set, or ''."""
     for p in parameters:
         now = results.get(p.name)
@@ -147,13 +147,13 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
             return (f'{p.name} is set by the node after each leg; to restore a result, start the '
                     'node with --params-file calibration.yaml')
         if p.name in SETTINGS and SETTINGS[p.name].ro and (
-                _plain(p.value) != attrgetter(p.name)(config)):
+                _python_value(p.value) != attrgetter(p.name)(config)):
             return (f'{p.name} is fixed at start-up: restart the node with '
                     f'"--ros-args -p {p.name}:=VALUE"')
     return ''
 
 
-def fixed(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
+def refuse_after_start(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
     """Return the on-set callback of a node that reads settings of a kind only at start-up."""
     def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
         own_parameters = [p.name for p in parameters
@@ -187,7 +187,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
     return kept
 
 
-def as_results(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
+def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
     values = RESULTS | {
         PREFIX + 'legs': len(calibration.legs), PREFIX + 'stamp': stamp,
         PREFIX + 'valid': calibration.verdict is not Verdict.REJECTED, PREFIX + 'vehicle': vehicle}
@@ -225,7 +225,7 @@ def restored_from(results: dict[str, Any],
                     results[PREFIX + 'vehicle'])
 
 
-def _plain(value: Any) -> Any:
+def _python_value(value: Any) -> Any:
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value
     return tuple(value)

@@ -110,7 +110,7 @@ def current_value(now: SessionView, name: str) -> float:
 def level(now: SessionView) -> Any:
     """Return STALE before any message, ERROR if action is required, WARN for cautions."""
     state = now.session.state
-    if state in (State.FAILED, State.REJECTED) or now.lost_cause:
+    if state in (State.FAILED, State.REJECTED) or now.is_rejected_so_far:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not now.received:
         return DiagnosticStatus.STALE
@@ -250,8 +250,8 @@ class Publishing:
         results = self._restored_results
         if calibration:
             stamp = date_text(iso(self._node.get_clock().now().nanoseconds))
-            results = params.as_results(calibration, stamp,
-                                        self._node.get_parameter('vehicle').value)
+            results = params.result_values(calibration, stamp,
+                                           self._node.get_parameter('vehicle').value)
         self.setting_results = True
         try:
             self._node.set_parameters_atomically(

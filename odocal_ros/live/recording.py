@@ -171,7 +171,7 @@ class Recording:
                 if not source.plausible.all():     # the recorder has all: the pipeline screens
                     block = take(block, source.plausible)
                 self._distribute(slot, block, config, found_scale)
-            if not self.time_jumped:     # after a jump: no sample of an earlier leg
+            if not self.has_time_jumped:     # after a jump: no sample of an earlier leg
                 self._store_messages(source, raws, sent_ns)
 
     def add_marks(self, block: FixSamples, config: Config) -> None:
@@ -225,7 +225,7 @@ class Recording:
         return copy
 
     @property
-    def time_jumped(self) -> bool:
+    def has_time_jumped(self) -> bool:
         return self._clock_jumped or self.inputs.leading.health.jumped_back
 
     def restart(self) -> None:

@@ -96,12 +96,12 @@ class Session:
         self._last_id = 0
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Return True while a leg runs or is computed: settings cannot change then."""
         return self.state in (State.RECORDING, State.COMPUTING)
 
     @property
-    def open_leg(self) -> bool:
+    def has_open_leg(self) -> bool:
         """Return True if there is a leg that is neither kept nor dropped."""
         is_stopped = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
         return self.state is State.RECORDING or is_stopped
@@ -111,7 +111,7 @@ class Session:
         if self.state is State.COMPUTING:
             raise Refused(f'leg {self.leg_id} is being computed: call again when its result is on '
                           '~/status, or drop it with ~/cancel_leg')
-        if self.open_leg:
+        if self.has_open_leg:
             raise Refused(f'leg {self.leg_id} failed and is kept: call ~/stop_leg to compute it '
                           'again, or drop it with ~/cancel_leg')
         self._last_id += 1
@@ -170,7 +170,7 @@ class Session:
 
     def cancel(self, lost: str = '') -> None:
         """Drop the open leg; ``lost``: the cause if it is dropped automatically."""
-        if not self.open_leg:
+        if not self.has_open_leg:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
                           'leg')
         self.event, self.lost = 'cancelled', lost
@@ -178,7 +178,7 @@ class Session:
 
     def begin_undo(self) -> list[KeptLeg]:
         """Drop the last kept leg and return those left, which must be combined again."""
-        if self.open_leg:
+        if self.has_open_leg:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
                           'before ~/undo_leg')
         if not self.legs:
@@ -191,7 +191,7 @@ class Session:
 
     def begin_reset(self) -> list[KeptLeg]:
         """Drop everything and return the legs that were kept."""
-        if self.busy:
+        if self.is_busy:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
                           'before ~/reset')
         note_undone, self.legs = self.legs, []
@@ -270,6 +270,6 @@ class SessionView:
         return (config.in_local_frame() if self.local else config).leg
 
     @property
-    def lost_cause(self) -> bool:
+    def is_rejected_so_far(self) -> bool:
         """Return True if the current leg would be rejected now."""
         return any(r.code.severity is Verdict.REJECTED for r in self.faults)

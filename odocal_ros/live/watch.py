@@ -57,7 +57,7 @@ def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     bars['standstill'] = 1 - standstill_s / PREDICTED_REST_S, f'{standstill_s:.0f} s to go'
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         required = number(status, f'required_{name}_sigma_{unit}')
-        sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
+        sigma = number(status, f'predicted_{name}_sigma_{unit}') or _result_sigmas(status)[name]
         # a sigma falls with the path length or its root: the ratio to the limit is a rough measure
         share = min(required / sigma, 1.0) if sigma > 0 else 0.0
         sigma_text = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
@@ -65,7 +65,7 @@ def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     return bars
 
 
-def _of_result(status: dict[str, str]) -> dict[str, float]:
+def _result_sigmas(status: dict[str, str]) -> dict[str, float]:
     if status.get('state') == 'recording':
         return {'scale': 0.0, 'yaw': 0.0}
     relative = number(status, 'scale_factor_sigma') / (number(status, 'scale_factor') or nan)

@@ -25,7 +25,7 @@ from odocal_ros.live import answers
 from odocal_ros.live.session import LEGS_HELD, MARKED_LEGS_HELD
 from odocal_ros.output.drawing import evenly
 from odocal_ros.output.stored import known_imu
-from odocal_ros.pipeline.automatic import fold, refusal
+from odocal_ros.pipeline.automatic import add_to_carried, rejecting_reason
 from odocal_ros.pipeline.calibrate import calibrate_parts, combine
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
@@ -79,12 +79,13 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     """Return a leg's result, its combination with the kept legs, and the paths to publish."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
-    if is_automatic and (reason := refusal(results[0])):
+    if is_automatic and (reason := rejecting_reason(results[0])):
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
     folded = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
-    carried_before, carried = carried, fold([result for leg in kept[:folded] for result in leg],
-                                            config, carried)
+    carried_before, carried = carried, add_to_carried([result for leg in kept[:folded]
+                                                       for result in leg],
+                                                      config, carried)
     # two-point results carry nothing: all are kept
     if carried is carried_before and not is_automatic:
         folded = 0
@@ -132,7 +133,7 @@ class Worker:
         self._thread.start()
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         return self._jobs.unfinished_tasks > 0
 
     def submit(self, job: Job, then: Then) -> None:

@@ -112,20 +112,21 @@ class Column:
         return values or None
 
 
-def fixed(dtype: type, *paths: str) -> Column:
+def fixed_column(dtype: type, *paths: str) -> Column:
     """Return a column whose values have the same paths in every message."""
     return Column(dtype, len(paths), lambda view: paths)
 
 
-def xyz(prefix: str, names: str = 'xyz') -> Column:
-    return fixed(np.float64, *(f'{prefix}.{name}' for name in names))
+def vector_column(prefix: str, names: str = 'xyz') -> Column:
+    return fixed_column(np.float64, *(f'{prefix}.{name}' for name in names))
 
 
-def array(path: str, *indices: int) -> Column:
-    return fixed(np.float64, *(f'{path}[{i}]' for i in indices))
+def array_column(path: str, *indices: int) -> Column:
+    return fixed_column(np.float64, *(f'{path}[{i}]' for i in indices))
 
 
-STAMP = (fixed(np.int64, 'header.stamp.sec'), fixed(np.int64, 'header.stamp.nanosec'))
+STAMP = (fixed_column(np.int64, 'header.stamp.sec'),
+         fixed_column(np.int64, 'header.stamp.nanosec'))
 
 
 def stamp_ns(sec: Ints, nanosec: Ints) -> Ints:
@@ -141,14 +142,15 @@ Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
 NOT_SENT_BITS = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
-_COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
+_COVARIANCE = array_column('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
 # columns of each type: position, and its covariance if the type has one
 LOCAL_TYPES: dict[str, Sequence[Column]] = {
-    'geometry_msgs/msg/PoseStamped': (xyz('pose.position'),),
-    'geometry_msgs/msg/PoseWithCovarianceStamped': (xyz('pose.pose.position'), _COVARIANCE),
-    'geometry_msgs/msg/PointStamped': (xyz('point'),),
-    'geometry_msgs/msg/TransformStamped': (xyz('transform.translation'),),
-    'nav_msgs/msg/Odometry': (xyz('pose.pose.position'), _COVARIANCE),
+    'geometry_msgs/msg/PoseStamped': (vector_column('pose.position'),),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (vector_column('pose.pose.position'),
+                                                    _COVARIANCE),
+    'geometry_msgs/msg/PointStamped': (vector_column('point'),),
+    'geometry_msgs/msg/TransformStamped': (vector_column('transform.translation'),),
+    'nav_msgs/msg/Odometry': (vector_column('pose.pose.position'), _COVARIANCE),
 }
 
 
@@ -220,21 +222,25 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
 
 
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
-_ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0),
-                array('orientation_covariance', 8))
+_ORIENTATION = (vector_column('orientation', 'xyzw'), array_column('orientation_covariance', 0),
+                array_column('orientation_covariance', 8))
 SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
-    ('imu', IMU): ((*_ORIENTATION, xyz('angular_velocity'), xyz('linear_acceleration'),
-                    array('linear_acceleration_covariance', 0)), _imu),
+    ('imu',
+     IMU): ((*_ORIENTATION, vector_column('angular_velocity'),
+             vector_column('linear_acceleration'),
+                    array_column('linear_acceleration_covariance', 0)), _imu),
     ('heading', IMU): (_ORIENTATION, _heading),
-    ('fix', FIX): ((fixed(np.float64, 'latitude', 'longitude', 'altitude'),
-                    array('position_covariance', *range(9)),
-                    fixed(np.int64, 'position_covariance_type'),
-                    fixed(np.int64, 'status.status')), _fix),
-    ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((xyz('twist.linear'),), _velocity),
+    ('fix', FIX): ((fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),
+                    array_column('position_covariance', *range(9)),
+                    fixed_column(np.int64, 'position_covariance_type'),
+                    fixed_column(np.int64, 'status.status')), _fix),
+    ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((vector_column('twist.linear'),),
+                                                         _velocity),
     ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (
-        (xyz('twist.twist.linear'), array('twist.covariance', 0, 7, 14)), _velocity),
+        (vector_column('twist.twist.linear'), array_column('twist.covariance', 0, 7, 14)),
+        _velocity),
     ('pressure', 'sensor_msgs/msg/FluidPressure'): (
-        (fixed(np.float64, 'fluid_pressure', 'variance'),),
+        (fixed_column(np.float64, 'fluid_pressure', 'variance'),),
         lambda stamps, received, sent: samples.ScalarSamples(stamps, received, *sent.T)),
 }
 

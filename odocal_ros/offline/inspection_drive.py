@@ -23,7 +23,7 @@ from odocal_ros.library.arguments import EACH_STOP, LegSpan
 from odocal_ros.library.find_legs import find_legs, marked_legs, standstills_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
-from odocal_ros.pipeline.calibrate import missing_data
+from odocal_ros.pipeline.calibrate import missing_data_reasons
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.fix_screen import usable_fixes
@@ -67,10 +67,10 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         recorder.rows('fix').stamp_ns)]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
         known = {reason.code for reason in findings}
-        findings += [r for r in missing_data(leg, inputs) if r.code not in known]
+        findings += [r for r in missing_data_reasons(leg, inputs) if r.code not in known]
         return []
     base = (first - bag.start_ns) * 1e-9
-    options, w_i, f_i = _units(inputs, config, findings)
+    options, w_i, f_i = _unit_options(inputs, config, findings)
     placed = place(inputs, config)
     still_reasons = [reason for reason in motion_reasons(
         inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.t_stop,
@@ -80,7 +80,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         return options
     stops, speeds = survey.stops_and_speeds(inputs, placed.rough, config)
     path_length, chord = path_and_chord(inputs.t_fix, placed.fixes_n, inputs.least_motion)
-    driven = _driven(inputs)
+    driven = _travel_between_fixes(inputs)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
     scale = path_length / driven if long and driven else placed.rough or None
     # speeds with the printed scale
@@ -94,12 +94,12 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
     found['standstills'] = [[base + a, base + b] for a, b in stops.tolist()]
-    return [*options, *_axes(inputs, placed, w_i, f_i, config, found, findings),
+    return [*options, *_axis_options(inputs, placed, w_i, f_i, config, found, findings),
             *_sigma_limit(recorder, config),
-            *_legs(bag, recorder, inputs, placed, stops, first, config, found)]
+            *_describe_legs(bag, recorder, inputs, placed, stops, first, config, found)]
 
 
-def _driven(inputs: Inputs) -> float:
+def _travel_between_fixes(inputs: Inputs) -> float:
     """Return the travel between the first and the last fix (else all), in odometer units."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(inputs.t_fix) > 1:
@@ -109,8 +109,8 @@ def _driven(inputs: Inputs) -> float:
     return float(np.abs(np.diff(s)).sum())
 
 
-def _units(inputs: Inputs, config: Config,
-           findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
+def _unit_options(inputs: Inputs, config: Config,
+                  findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
         gravity_turn_reasons(inputs)
@@ -136,8 +136,8 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     return ['gnss.max_sigma=nan'] if kept < all_count / 2 else []
 
 
-def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Config,
-          found: dict[str, Any], findings: list[Reason]) -> list[str]:
+def _axis_options(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Config,
+                  found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return settings for odometer sign and IMU orientation; check the gyro."""
     set_already = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
@@ -168,8 +168,8 @@ def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Conf
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
-def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests: Floats,
-          first: int, config: Config, found: dict[str, Any]) -> list[str]:
+def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests: Floats,
+                   first: int, config: Config, found: dict[str, Any]) -> list[str]:
     """Return the legs that replay would use, and better ones for the two-point method."""
     if not len(inputs.t_fix):
         return []
@@ -258,10 +258,11 @@ def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
         reasons.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
                               f'{drive["fastest"]:.1f} m/s; the limit is '
                               f'{config.leg.min_speed:g} m/s'))
-    return reasons + _heading(found, mapping, config)
+    return reasons + _heading_reasons(found, mapping, config)
 
 
-def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
+def _heading_reasons(found: dict[str, Any], mapping: dict[str, str],
+                     config: Config) -> list[Reason]:
     """Return the reason for a missing or poor heading, with possible sources."""
     if 'heading' in mapping or math.isfinite(config.alignment.heading):
         return []

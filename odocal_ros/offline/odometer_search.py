@@ -93,8 +93,8 @@ class Fields:
         values = np.array(self._values).reshape(len(t_ns), len(self.paths))
         keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
         self._t_ns = t_ns[keep]
-        tested = [_best(name, is_whole, self._t_ns, value, path, self._stride) for name, is_whole,
-                  value in zip(self.paths, self.is_whole, values[keep].T, strict=True)]
+        tested = [_best_meaning(name, is_whole, self._t_ns, value, path, self._stride) for name,
+                  is_whole, value in zip(self.paths, self.is_whole, values[keep].T, strict=True)]
         self._travel = {one[0]['path']: one[1] for one in tested if one}
         found = sorted((one[0] for one in tested if one), key=rank)
         return {'tried': len(self.paths), 'found': [field | {
@@ -156,8 +156,8 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
         yield from _numbers(value, f'{path}.')
 
 
-def _best(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
-          stride: int) -> tuple[dict[str, Any], Floats] | None:
+def _best_meaning(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
+                  stride: int) -> tuple[dict[str, Any], Floats] | None:
     """
     Return the meaning of a field that follows the path best, and its travel; or None.
 
@@ -198,14 +198,14 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
     known : topics that have a reader.   requested : topics that the user named.
     """
     possible = [name for name, info in topics.items()
-                if info.count and name not in known and _possible(info)]
+                if info.count and name not in known and _may_be_odometer(info)]
     usable = {*requested, *without_estimates(possible)}
     found = [name for name, info in topics.items()
              if info.count and name not in known and name in usable]
     return {name: Fields(topics[name].count) for name in found[:MOST_TOPICS]}
 
 
-def _possible(info: TopicInfo) -> bool:
+def _may_be_odometer(info: TopicInfo) -> bool:
     """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in NEVER

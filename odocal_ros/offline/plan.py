@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
 def _indoor(args: argparse.Namespace) -> int:
     from odocal_ros.library.plan_indoor import plan_indoor
     from odocal_ros.offline.plan_text import indoor_screen
-    runs = plan_indoor(args.indoor, imu=not args.no_imu, config=_config(args), **_given(
+    runs = plan_indoor(args.indoor, imu=not args.no_imu, config=_config(args), **_without_none(
         reference=args.reference, drive=args.drive, size=args.size, rounds=args.rounds,
         speed=args.speed, track_width=args.track_width, slip=args.slip_walk))
     if args.json:
@@ -118,9 +118,9 @@ def _figures(args: argparse.Namespace) -> dict[str, Any]:
     from odocal_ros.library.plan import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')
-    return _given(fix=RTK if args.rtk else args.fix_sigma, fix_rate=args.fix_rate,
-                  quantum=args.pulse, sway=args.sway, slip=args.slip_walk)
+    return _without_none(fix=RTK if args.rtk else args.fix_sigma, fix_rate=args.fix_rate,
+                         quantum=args.pulse, sway=args.sway, slip=args.slip_walk)
 
 
-def _given(**options: Any) -> dict[str, Any]:
+def _without_none(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}

@@ -143,7 +143,7 @@ def topics_from_arguments(args: argparse.Namespace) -> dict[str, str]:
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
-def _size(stream: Any) -> tuple[int, int | None]:
+def _terminal_size(stream: Any) -> tuple[int, int | None]:
     """Return columns, at most 98, and rows of a terminal; None rows without a terminal."""
     if not stream.isatty():
         return 98, None
@@ -197,7 +197,7 @@ def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespa
 def _show(calibration: 'Combined', args: Any) -> OSError | None:
     """Print the result before the report is drawn; return an error of the stream, or None."""
     from odocal_ros.output.summary import screen
-    columns, rows = _size(sys.stdout)
+    columns, rows = _terminal_size(sys.stdout)
     styled = (sys.stdout.isatty() and 'NO_COLOR' not in os.environ
               and os.environ.get('TERM') != 'dumb')
     try:
@@ -213,7 +213,7 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
 def _show_files(calibration: 'Combined', output: Path, written: list[Path],
                 report: list[Path]) -> None:
     from odocal_ros.output.summary import sentence
-    columns, rows = _size(sys.stdout)
+    columns, rows = _terminal_size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'
     print_text('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
                             break_on_hyphens=False) if rows else text))

@@ -63,13 +63,16 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     if not inputs.has_accelerometer:
         grade = replace(grade, accel_bias=TILT_SIGMA * G)
     gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))
-    level, reasons = _level(inputs, span, metres_per_unit, origin.latitude, grade, gyro_noise)
-    reasons += _against_grade(noise.get('gyro', 0.0), grade_of(config.imu))
+    level, reasons = _estimate_level(inputs, span, metres_per_unit, origin.latitude, grade,
+                                     gyro_noise)
+    reasons += _noise_reasons(noise.get('gyro', 0.0), grade_of(config.imu))
     level = replace(level, C_np=_place_rotation(inputs, level.standstill, fixes_n, origin))
-    yaw, sigma, source, shared, refusals = _heading(inputs, level, origin.latitude, grade, config)
+    yaw, sigma, source, shared, refusals = _select_heading(inputs, level, origin.latitude, grade,
+                                                           config)
     reasons += refusals
     if source == 'course':
-        yaw, sigma, refusals = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
+        yaw, sigma, refusals = _heading_by_course(inputs, level, metres_per_unit, fixes_n, origin,
+                                                  grade)
         reasons += refusals
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
@@ -114,8 +117,8 @@ def _place_rotation(inputs: Inputs, span: Floats | tuple[float, float] | None, f
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
-def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
-           grade: Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
+def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
+                    grade: Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
     if span is not None:
         return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
     t = inputs.t_imu
@@ -136,7 +139,7 @@ def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude
     return level, (found,)
 
 
-def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
+def _noise_reasons(noise: float, grade: Grade) -> tuple[Reason, ...]:
     """Return a caution if the gyro noise at rest far exceeds that of its grade."""
     times = noise / max(grade.gyro_noise, 1e-12)
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
@@ -158,15 +161,15 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
             for name, x in signals.items() if inputs.has_accelerometer or name == 'gyro'}
 
 
-def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
-             config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
+def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                    config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
     refusals = []
     for source in order if setting != 'course' else ():
-        result, refusal = _from_source(source, inputs, level, latitude, grade, config)
+        result, refusal = _heading_from_source(source, inputs, level, latitude, grade, config)
         if result is not None:
             return *result, source, source != 'gyrocompass', ()
         refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
@@ -174,20 +177,21 @@ def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
 
 
-def _from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                 config: Config) -> HeadingOrRefusal:
+def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                         config: Config) -> HeadingOrRefusal:
     if source == 'heading_topic':
         sent, t = inputs.outside['heading']
-        return _from_quaternions(t, sent.q_ni, sent.yaw_variance, np.eye(3), level, config,
-                                 config.alignment.heading_offset)
+        return _heading_from_orientations(t, sent.q_ni, sent.yaw_variance, np.eye(3), level,
+                                          config, config.alignment.heading_offset)
     if source == 'imu_orientation':
-        return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance,
-                                 transpose(inputs.C_bi), level, config)
-    return _fixed(inputs, level, config) if source == 'fixed' else _gyrocompass(
+        return _heading_from_orientations(inputs.t_imu, inputs.q_ni, inputs.yaw_variance,
+                                          transpose(inputs.C_bi), level, config)
+    return _configured_heading(inputs, level,
+                               config) if source == 'fixed' else _heading_by_gyrocompass(
         inputs, level, latitude, grade, config)
 
 
-def _fixed(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
+def _configured_heading(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
@@ -208,8 +212,8 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
 
-def _from_quaternions(t: Floats, q: Floats, variance: Floats, C_ib: Floats, level: Level,
-                      config: Config, offset: float = 0.0) -> HeadingOrRefusal:
+def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Floats, level: Level,
+                               config: Config, offset: float = 0.0) -> HeadingOrRefusal:
     """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
     heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
     # a leg may have hours of rows: select the used ones first
@@ -232,8 +236,8 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, C_ib: Floats, leve
     return (float(wrap(yaw)), float(sigma)), ''
 
 
-def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                 config: Config) -> HeadingOrRefusal:
+def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                            config: Config) -> HeadingOrRefusal:
     if inputs.local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
@@ -252,8 +256,8 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     return (yaw, sigma), ''
 
 
-def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats, origin: Origin,
-            grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
+def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats,
+                       origin: Origin, grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = complete(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven

@@ -109,7 +109,7 @@ class LegSearch:
     def _evaluate_row(self, t: int, s: float) -> None:
         while self._gaps and self._gaps[0][0] < t:
             last, resumed = self._gaps.popleft()
-            self._close(last)
+            self._end_leg(last)
             self._anchor, self._from_ns = None, max(self._from_ns, resumed)
         if t < self._from_ns:
             return
@@ -126,9 +126,9 @@ class LegSearch:
         rested = t - stood_ns >= self._standstill_ns
         leg, motion_ns = self.open_span, max(t - START_REST_NS, stood_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, stood_ns):
-            self._close(motion_ns)
+            self._end_leg(motion_ns)
         elif leg is not None and t - leg.start_ns >= self._longest_ns:
-            self._close(t)
+            self._end_leg(t)
             motion_ns = t
         if self.open_span is None and not self._needs_rest:
             self.spans.append(Span(motion_ns))
@@ -139,12 +139,12 @@ class LegSearch:
         leg = self.open_span
         if leg is not None and (stood_ns >= PARKED_NS or stood_ns >= self._rest_ns
                                 and self._long_enough(leg, since_ns)):
-            self._close(since_ns + self._rest_ns)
+            self._end_leg(since_ns + self._rest_ns)
 
     def _long_enough(self, leg: Span, until_ns: int) -> bool:
         return 2 * (until_ns - leg.start_ns) >= self._longest_ns
 
-    def _close(self, stop_ns: int) -> None:
+    def _end_leg(self, stop_ns: int) -> None:
         leg = self.open_span
         if leg is not None and stop_ns > leg.start_ns:
             leg.stop_ns = stop_ns
@@ -152,7 +152,7 @@ class LegSearch:
             self.spans.pop()
 
 
-def refusal(result: LegResult) -> Reason | None:
+def rejecting_reason(result: LegResult) -> Reason | None:
     """Return the rejecting reason of a dropped automatic leg, None if it is kept."""
     if result.verdict is not Verdict.REJECTED:
         return None
@@ -161,8 +161,8 @@ def refusal(result: LegResult) -> Reason | None:
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 
-def fold(legs: Iterable[LegResult], config: Config,
-         carried: Carried | None = None) -> Carried | None:
+def add_to_carried(legs: Iterable[LegResult], config: Config,
+                   carried: Carried | None = None) -> Carried | None:
     """Return the carried information with legs added, in order of time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried

@@ -37,7 +37,7 @@ from odocal_ros.screening.reversing import BY_FIT, reversing_reasons, sections_s
 from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
 
-__all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
+__all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'screen_leg', 'Screened']
 # reasons that disappear with more driving
 NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
@@ -66,7 +66,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     if is_planar(leg, config):
         return planar_leg(leg, config, notes, progress)
-    seen = screened(leg, config, notes)
+    seen = screen_leg(leg, config, notes)
     leg, inputs = seen.leg, seen.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
@@ -76,7 +76,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     if not seen.usable:
         return leg_result(leg, inputs, seen.reasons)
     result = result_of(inputs, seen.reasons)
-    back, scale = _reversed(result, inputs)
+    back, scale = _reversed_sections(result, inputs)
     if not len(back):
         return result
     found = reversing_reasons(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
@@ -93,12 +93,12 @@ def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
                  if r.code.severity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
-def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
+def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
     """Return the inputs of a leg, z up."""
     config = settings_by_frame(leg.fix, config)
     leg, inputs, found = screen_aligned(leg, config)
     reasons = (*notes, *found)
-    missing = missing_data(leg, inputs)
+    missing = missing_data_reasons(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
         return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in seen)),
@@ -115,7 +115,7 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
     return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in sanity})
 
 
-def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
+def _reversed_sections(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
     """Return reversed sections by the smoother's slips, (m, 2) s, and the smoother's scale."""
     smoother = result.methods.get('smoother')
     scale = None if smoother is None else smoother.estimates['scale_factor'].value
@@ -124,7 +124,7 @@ def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
     return sections_slipped_twice(smoother.details['slips'], inputs.travel, scale), scale
 
 
-def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
+def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
     """Return the reasons for data that every method needs and that a leg lacks."""
     missing = []
     if leg.stop_ns <= leg.start_ns:
@@ -143,7 +143,7 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return the parts of a leg between IMU gaps over ``limit_s``; the leg if none or many."""
-    return _between_gaps(leg, _gaps(leg, limit_s))
+    return _between_gaps(leg, _imu_gaps(leg, limit_s))
 
 
 def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
@@ -158,7 +158,7 @@ def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
 
 
-def _gaps(leg: Leg, limit_s: float) -> Ints:
+def _imu_gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
     near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
     near, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
@@ -178,9 +178,9 @@ def _gaps(leg: Leg, limit_s: float) -> Ints:
     return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
 
 
-def _carried(leg: Leg, config: Config) -> Ints:
+def _carried_sections(leg: Leg, config: Config) -> Ints:
     """Return begin and end of motion without counts, ns: (k, 2)."""
-    inputs = screened(leg, config).inputs
+    inputs = screen_leg(leg, config).inputs
     placed = place(inputs, settings_by_frame(leg.fix, config))
     spans = ferry_intervals(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
     return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
@@ -190,7 +190,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
                     progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
     """Return the results of a leg's parts that can be calibrated, otherwise that of the leg."""
-    def good_of(parts: list[Leg]) -> list[LegResult]:
+    def usable_results(parts: list[Leg]) -> list[LegResult]:
         results = []
         for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
             def report(stage: Stage, k: int = k) -> None:
@@ -199,11 +199,13 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [one for one in results if one.verdict is not Verdict.REJECTED]
 
-    good, carried_reason = good_of(parts_of(leg, config.leg.max_gap)), None
+    good, carried_reason = usable_results(parts_of(leg, config.leg.max_gap)), None
     if not good:
         whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
         carried_reason = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
-        good = good_of(_between_gaps(leg, _carried(leg, config))) if carried_reason else []
+        good = usable_results(_between_gaps(leg,
+                                            _carried_sections(leg,
+                                                              config))) if carried_reason else []
         if not good:
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:

@@ -55,7 +55,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     # of other legs than those that determined the IMU constants
     before = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
-    methods = {name: _combined(name, [
+    methods = {name: _combine_method(name, [
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and name in leg.methods], config, before) for name in method_names}
     on_border = {name for leg in used for name, m in leg.methods.items() if m.border}
@@ -126,8 +126,8 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
     return combine_method(name, results, walked)
 
 
-def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
-              carried: Carried | None) -> MethodResult:
+def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
+                    carried: Carried | None) -> MethodResult:
     """Return a method's combination of the legs without rejection; of all if all have one."""
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
@@ -200,7 +200,7 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
     """Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle."""
     found = []
     estimates = [(number, leg_estimates(leg)) for number, leg in numbered]
-    scales = [scale for scale in _values('scale_factor', estimates) if scale.value]
+    scales = [scale for scale in _values_by_leg('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
         which = '; '.join(f'{unit} in leg '
@@ -208,14 +208,15 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
                           for unit in units)
         return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
                        f'cannot be combined: {which}'),)
-    far = _farthest(scales)
+    far = _significant_extremes(scales)
     if far and (more := far[1].value / far[0].value - 1) > TYRE_SPREAD:
         low, high = far
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
-    yaws = _values('yaw_mounting_angle', estimates)
+    yaws = _values_by_leg('yaw_mounting_angle', estimates)
     # of a reversed IMU they are near +-180 deg
-    far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
+    far = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
+                                 for yaw in yaws])
     # rad, 5 deg: mountings bend less
     if far and (more := far[1].value - far[0].value) > 0.087:
         low, high = far
@@ -234,13 +235,14 @@ class _LegValue(NamedTuple):
     unit: str
 
 
-def _values(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
+def _values_by_leg(name: str,
+                   estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
     of_legs = ((leg, of_leg.get(name)) for leg, of_leg in estimates)
     return [_LegValue(leg, e.value, e.sigma, e.unit) for leg, e in of_legs
             if e is not None and e.value is not None and e.sigma is not None]
 
 
-def _farthest(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
+def _significant_extremes(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
     """Return the lowest and the highest value if they differ significantly."""
     if len(values) < 2:
         return None

@@ -59,13 +59,13 @@ def next_point(config: Config, marks: int) -> int:
     return marks % (len(config.reference.points) // 2)
 
 
-def place_of(config: Config, point: int) -> tuple[float, float]:
+def point_position(config: Config, point: int) -> tuple[float, float]:
     """Return x and y of a point, m."""
     x, y = config.reference.points[2 * point:2 * point + 2]
     return x, y
 
 
-def with_marks(config: Config) -> Config:
+def settings_with_marks(config: Config) -> Config:
     """Return the settings for a recording with marks; a second call changes nothing."""
     check_points(config)
     gnss, sigma = config.gnss, config.reference.points_sigma
@@ -77,7 +77,7 @@ def with_marks(config: Config) -> Config:
 
 def mark_positions(config: Config, marks: Sequence[FloorMark]) -> FixSamples:
     """Return the positions of marks as samples, as those of SLAM."""
-    places = np.array([(*place_of(config, mark.point), 0.0) for mark in marks])
+    places = np.array([(*point_position(config, mark.point), 0.0) for mark in marks])
     stamps = np.array([mark.stamp_ns for mark in marks])[:, None] + np.round(
         1e9 * np.linspace(-WITHIN, WITHIN, ROWS)).astype(np.int64)
     covariance = np.tile((config.reference.points_sigma**2 * np.eye(3)).ravel(), (stamps.size, 1))

@@ -49,16 +49,16 @@ def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
     inputs, found = screen(leg, config, check_faults=False)
     reasons = [*notes, *(r for r in found if r.code not in OF_IMU)]
     progress(Stage(PLANAR))
-    run, lacking = _run_of(inputs, config)
+    run, lacking = _make_run(inputs, config)
     if run is None:
         methods = {PLANAR: refused(lacking, inputs.scale_unit)}
         return leg_result(leg, inputs, (*reasons, *lacking), methods, deciding=(PLANAR,))
-    method, more = _guarded(run, inputs, config, progress)
+    method, more = _fit_guarded(run, inputs, config, progress)
     return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
 
 
-def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callable[[Stage], None],
-             ) -> tuple[MethodResult, dict[str, Any]]:
+def _fit_guarded(run: Run, inputs: Inputs, config: settings.Config,
+                 progress: Callable[[Stage], None], ) -> tuple[MethodResult, dict[str, Any]]:
     """Return the method's result and plot data; an error only rejects the method."""
     from odocal_ros.calib.planar.fit import fit
     unit = inputs.scale_unit
@@ -67,7 +67,7 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
         return refused([reason], unit)
     try:
         with raised_if_wild():
-            found = fit(run, known_of(run, config), lambda passes, change: progress(
+            found = fit(run, known_values(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
             method = result_of(found, unit, nominal_scale(config, unit), config,
                                shortened_by_slopes(inputs))
@@ -83,9 +83,9 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
         return failed(unknown, PLANAR, error), {}
 
 
-def _run_of(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[Reason]]:
+def _make_run(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[Reason]]:
     travels, kind = inputs.travels, config.odometer.drive
-    if lacking := _lacking_wheels(kind, len(travels)):
+    if lacking := _wheel_count_reason(kind, len(travels)):
         return None, [lacking]
     low = max(0.0, *(one.t[0] for one in travels))
     high = min(inputs.t_stop, *(one.t[-1] for one in travels))
@@ -105,10 +105,10 @@ def _run_of(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[R
               of_sides(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
     if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
-    return Run(t, wheels, node, position, sigma, _gyro(inputs, t)), []
+    return Run(t, wheels, node, position, sigma, _gyro_turns(inputs, t)), []
 
 
-def _lacking_wheels(kind: str, count: int) -> Reason | None:
+def _wheel_count_reason(kind: str, count: int) -> Reason | None:
     """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
         settings.MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
@@ -149,7 +149,7 @@ def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
     return t, np.append(0, np.cumsum(parts)), used
 
 
-def _gyro(inputs: Inputs, t: Floats) -> Floats:
+def _gyro_turns(inputs: Inputs, t: Floats) -> Floats:
     """Return the integral of the turn rate about up in each interval, rad; empty without IMU."""
     if not inputs.has_accelerometer or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
             or inputs.t_imu[-1] < t[-1]:
@@ -158,7 +158,7 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
-def known_of(run: Run, config: settings.Config) -> Known:
+def known_values(run: Run, config: settings.Config) -> Known:
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     grade = grade_of(config.imu)
     known = Known(

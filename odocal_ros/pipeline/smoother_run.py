@@ -70,7 +70,8 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
 
 
 def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    search_result = search_of(prepared, method.estimates['pitch_mounting_angle'].value or 0.0)
+    search_result = run_wheel_search(prepared, method.estimates['pitch_mounting_angle'].value
+                                     or 0.0)
     if search_result is None:
         return method
     # left and right may be separable by the gyro: the smoother reports that itself
@@ -115,7 +116,7 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
     return arm
 
 
-def planar_of(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
+def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """Return a leg as input of the patent's search, None without two wheels or a first fix."""
     inputs = prepared.inputs
     if len(inputs.travels) != 2:
@@ -135,9 +136,9 @@ def planar_of(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
                       (scale, scale), pitch, prepared.lever_b)
 
 
-def search_of(prepared: PreparedLeg, pitch: float) -> SearchResult | None:
+def run_wheel_search(prepared: PreparedLeg, pitch: float) -> SearchResult | None:
     """Return the result of the search, None with too few fixes; arguments as in planar_of."""
-    leg = planar_of(prepared, pitch)
+    leg = planar_input(prepared, pitch)
     if leg is None:
         return None
     a, wheels = prepared.alignment, prepared.config.wheels

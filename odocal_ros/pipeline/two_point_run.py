@@ -171,18 +171,16 @@ class TwoPointRun:
         # track errors count as noise
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
         sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
-        found = reversal_reasons(cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep],
-                                            sigma),
-                                 self.config.odometer.signed)
+        pieces = cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
+        found = reversal_reasons(pieces, self.config.odometer.signed)
         self.found += found
         if not found:
-            off = track_check.track_residuals(prepared.path(f), chord.start, fixes)
-            wrong = track_check.distance_reasons(
-                track_check.track_statistics(off, prepared.distance), prepared.fix_sigma,
-                                                 drift, prepared.distance)
-            self.reasons += wrong or track_check.bend_reasons(t, off, chord.M @ f,
-                                                              prepared.fix_sigma, drift,
-                                                              prepared.distance)
+            residuals = track_check.track_residuals(prepared.path(f), chord.start, fixes)
+            statistics = track_check.track_statistics(residuals, prepared.distance)
+            self.reasons += track_check.distance_reasons(
+                statistics, prepared.fix_sigma, drift, prepared.distance
+            ) or track_check.bend_reasons(t, residuals, chord.M @ f, prepared.fix_sigma, drift,
+                                          prepared.distance)
 
     def _check_counting_direction(self, chord: Chord) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""

@@ -18,7 +18,7 @@ from odocal_ros.calib.track_check import cut_pieces, find_reversed, Pieces, reve
 from odocal_ros.data.samples import take
 from odocal_ros.nav.dead_reckoning import level_track
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.pipeline.calibrate import calibrate, faults, screened
+from odocal_ros.pipeline.calibrate import calibrate, faults, screen_leg
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.gravity_fit import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
@@ -50,7 +50,7 @@ def of_gyro(made, M=SAME, C=SAME, **options):
     """Return what a leg says whose gyro sends M w, and whose Imu sits turned by C (b to i)."""
     config = with_settings(settings(made), options)
     leg = with_imu(made, M @ C, f_i=lambda f: f @ C.T)
-    return {r.code: r for r in faults(screened(leg, config), config)}
+    return {r.code: r for r in faults(screen_leg(leg, config), config)}
 
 
 X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])} for i in (0, 1))
@@ -184,7 +184,7 @@ def test_a_sound_gyro_is_not_accused(scenario, more):
 
 def test_the_fit_finds_each_coefficient_within_its_sigma():
     made = town()
-    inputs = screened(made.leg(), settings(made)).inputs
+    inputs = screen_leg(made.leg(), settings(made)).inputs
     axes, _ = sensor_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
     for M, expected in ((np.eye(3), SOUND), (AXES['mirrored x'], SOUND * [-1, 1, 1]),
                         (AXES['x and y swapped'], SOUND[[1, 0, 2]])):

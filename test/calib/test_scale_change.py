@@ -17,7 +17,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.estimator import several, smooth
 from odocal_ros.output.files import as_json
 from odocal_ros.output.stored import known_imu
-from odocal_ros.pipeline.automatic import fold
+from odocal_ros.pipeline.automatic import add_to_carried
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
@@ -122,12 +122,12 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
     carried = carried_from(written['carried'])
     assert (carried.legs, carried.first_ns, carried.last_ns) == (
         2, legs[0].start_ns, legs[1].start_ns)
-    for before in (carried, fold(legs[:2], config)):
+    for before in (carried, add_to_carried(legs[:2], config)):
         found = combine(legs[2:], config, before)
         compare(found, whole, 1e-3)
         assert found.carried.legs == 3
     rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
-    assert fold([rejected], config, carried) is carried
+    assert add_to_carried([rejected], config, carried) is carried
     assert found.carried.includes(carried)
     assert not carried.includes(found.carried)
     (text,) = changed(combine(legs_of(results, 0.02)[2:], config, carried))
@@ -186,7 +186,7 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
     legs = legs_of(results)
     whole = combine(legs, config)
     found = combine(legs[2:], config, carried_from(json.loads(json.dumps(
-        fold(legs[:2], config).as_dict()))))
+        add_to_carried(legs[:2], config).as_dict()))))
     compare(found, whole, 0.1)
     evidence = found.carried.border.evidence
     assert set(evidence) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}

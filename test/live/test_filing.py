@@ -88,7 +88,7 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_p
     assert not (tmp_path / 'latest' / 'report.html').exists()
     worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
     wait_for(lambda: worker.poll() or done, 'the leg')
-    assert filing.filing.busy
+    assert filing.filing.is_busy
     assert not filing.filing.close(0.05)
     gate.set()
     wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')

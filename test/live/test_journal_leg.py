@@ -17,13 +17,13 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.live import journal_leg
 from odocal_ros.live.journal_leg import (
-    claim,
     clear_empty,
-    journals,
+    folder_size,
+    journal_folders,
     LegJournal,
+    lock_journal,
     make_room,
     Plan,
-    size_of,
 )
 
 SECOND = 10**9
@@ -181,13 +181,13 @@ def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
     (tmp_path / 'calibration').mkdir()
     (tmp_path / 'calibration' / 'result').write_bytes(bytes(5000))
     (tmp_path / 'link').symlink_to(new)
-    assert journals(tmp_path) == [old, middle, new]
+    assert journal_folders(tmp_path) == [old, middle, new]
     assert make_room(tmp_path, 3000) == 3000
     assert make_room(tmp_path, 3000, needed=1) == 2000
-    assert journals(tmp_path) == [middle, new]
-    with claim(middle):                                 # a node is writing to it
+    assert journal_folders(tmp_path) == [middle, new]
+    with lock_journal(middle):                                 # a node is writing to it
         assert make_room(tmp_path, 1500) == 1000
-        assert journals(tmp_path) == [middle]
+        assert journal_folders(tmp_path) == [middle]
         assert make_room(tmp_path, 10) == 1000
     assert make_room(tmp_path, 10) == 0
     assert (tmp_path / 'calibration' / 'result').exists()
@@ -200,7 +200,7 @@ def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
 
     def watched(*args):
         size = write_file(*args)
-        taken.append(sum(size_of(folder) for folder in journals(tmp_path)))
+        taken.append(sum(folder_size(folder) for folder in journal_folders(tmp_path)))
         return size
     monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files are there
     for leg_id in range(1, 5):
@@ -211,7 +211,7 @@ def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
         assert one.trouble == ''
     assert len(taken) == 4 * (5 + 1 + 1)
     assert 900_000 < max(taken) <= limit
-    assert [f.name for f in journals(tmp_path)][-1] == 'leg_4'
+    assert [f.name for f in journal_folders(tmp_path)][-1] == 'leg_4'
 
 
 def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
@@ -222,8 +222,8 @@ def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeyp
         one.put([large(k)])
     assert 'raise journal.max_bytes' in one.trouble
     one.finish()
-    folder, = journals(tmp_path)
-    assert size_of(folder) <= 500_000
+    folder, = journal_folders(tmp_path)
+    assert folder_size(folder) <= 500_000
     with open_bag(folder) as bag:
         # for each that is written, room to join it with those that stand is kept
         assert bag.topics['/odometer'].count == 2

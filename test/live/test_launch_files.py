@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 import yaml
 
 from odocal_ros.data.inputs import TOPICS
-from odocal_ros.live.params import fixed, refused, RESULTS
+from odocal_ros.live.params import change_refusal, refuse_after_start, RESULTS
 from odocal_ros.messages.message_fields import FIX, IMU
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.node_configs import ApplyConfig
@@ -100,27 +100,28 @@ def values_of(**values):
 
 
 def test_what_is_fixed_at_start_up_is_refused_with_the_way_to_set_it():
-    text = refused(Config(), RESULTS, values_of(odometer__type='std_msgs/msg/Int64'))
+    text = change_refusal(Config(), RESULTS, values_of(odometer__type='std_msgs/msg/Int64'))
     assert text == ('odometer.type is fixed at start-up: restart the node with '
                     '"--ros-args -p odometer.type:=VALUE"')
-    assert not refused(Config(), RESULTS, values_of(odometer__type='auto', leg__min_speed=1.0,
+    assert not change_refusal(Config(), RESULTS,
+                              values_of(odometer__type='auto', leg__min_speed=1.0,
                                              imu__lever_arm=[0.0, 0.0, 0.0]))
-    assert 'imu.lever_arm is fixed' in refused(Config(), RESULTS,
-                                               values_of(imu__lever_arm=[0.0, 0.0, 1.0]))
+    assert 'imu.lever_arm is fixed' in change_refusal(Config(), RESULTS,
+                                                      values_of(imu__lever_arm=[0.0, 0.0, 1.0]))
 
 
 def test_a_result_is_refused_unless_it_is_the_one_in_force():
     """So ``ros2 param load`` of the file that the node wrote has nothing to refuse."""
     here = RESULTS | {'result.scale_factor': 0.05}
-    assert not refused(Config(), here, values_of(result__scale_factor=0.05,
+    assert not change_refusal(Config(), here, values_of(result__scale_factor=0.05,
                                           result__yaw_mounting_angle=math.nan))
-    text = refused(Config(), here, values_of(result__scale_factor=0.06))
+    text = change_refusal(Config(), here, values_of(result__scale_factor=0.06))
     assert 'result.scale_factor is set by the node' in text
     assert '--params-file calibration.yaml' in text
 
 
 def test_a_node_that_reads_its_settings_at_start_up_refuses_all_of_them():
-    refuse = fixed(ApplyConfig)
+    refuse = refuse_after_start(ApplyConfig)
     for values in ({'levelling': False}, {'publish__rate': 5.0}, {'result__valid': True}):
         answer = refuse(values_of(**values))
         assert not answer.successful, values

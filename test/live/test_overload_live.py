@@ -44,7 +44,7 @@ CLEAN, SOME, HALF = 2, 3, 5     # seeds: how much of a round is hostile
 
 
 @contextlib.contextmanager
-def busy():
+def is_busy():
     """Keep each core at work."""
     loops = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
              for _ in range(os.cpu_count())]
@@ -61,7 +61,7 @@ def leg(tmp_path_factory):
     """Drive a leg with a loop on each core; in its midst the node is stopped for 0.7 s."""
     settings = {'output.directory': tmp_path_factory.mktemp('out'),
                 'qos_overrides./odometer.subscription.depth': FEW}
-    with playing_to(messages_of(straight()), settings, SPEED) as leg, busy() as loops:
+    with playing_to(messages_of(straight()), settings, SPEED) as leg, is_busy() as loops:
         leg.play(45, 60)
         leg.client.start()
         leg.play(60, 80)

@@ -64,7 +64,7 @@ def test_a_failed_leg_stays_until_retried_or_cancelled():
     session.start(50, CONFIG)
     session.stop(60)
     session.fail('no memory')
-    assert (session.state, session.open_leg, session.busy) == (State.FAILED, True, False)
+    assert (session.state, session.has_open_leg, session.is_busy) == (State.FAILED, True, False)
     with pytest.raises(Refused, match='leg 2 failed and is kept.*~/stop_leg.*~/cancel_leg'):
         session.start(70, CONFIG)
     session.retry(CONFIG)
@@ -131,7 +131,7 @@ def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
     session.start(50, CONFIG, is_automatic=True)
     session.stop(60)
     session.drop_unusable(Reason(Code.LEG_TOO_SHORT, '30 m'))
-    assert (session.state, session.event, session.open_leg) == (
+    assert (session.state, session.event, session.has_open_leg) == (
         State.CALIBRATED, 'cancelled', False)
     assert session.calibration is before
     assert session.unused.text == '30 m'

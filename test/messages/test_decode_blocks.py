@@ -25,8 +25,9 @@ def bits(pairs):
     rows: dict = {}
     for slot, block in pairs:
         for f in dataclasses.fields(block):
-            array = getattr(block, f.name)
-            rows.setdefault((slot, f.name, array.dtype.str), []).append(array.tobytes())
+            array_column = getattr(block, f.name)
+            rows.setdefault((slot, f.name, array_column.dtype.str),
+                            []).append(array_column.tobytes())
     return {key: b''.join(parts) for key, parts in rows.items()}
 
 

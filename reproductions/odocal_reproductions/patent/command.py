@@ -53,7 +53,7 @@ def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
     """
     from odocal_reproductions.patent.embodiment import FOUND, RADIUS
     from odocal_ros.pipeline.prepare import prepare
-    from odocal_ros.pipeline.smoother_run import planar_of
+    from odocal_ros.pipeline.smoother_run import planar_input
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -72,6 +72,6 @@ def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
     inputs, _ = screen(leg, config)
     prepared, _ = prepare(leg, inputs, config)
     assert prepared is not None     # a drive made for it
-    planar = planar_of(prepared, 0.0)
+    planar = planar_input(prepared, 0.0)
     assert planar is not None
     return planar
