@@ -42,29 +42,31 @@ COMPARED = {
     'pitch_mounting_angle': ('pitch', 'heights at the marks, hills, or an accelerometer bias')}
 
 
-def deciding(asked: str | tuple[str, ...], shown: bool = False) -> tuple[str, ...]:
+def deciding_methods(method_setting: str | tuple[str, ...], shown: bool = False) -> tuple[str,
+                                                                                          ...]:
     """
     Return the methods whose values may be the result, the first choice first.
 
-    asked : the setting ``method``, or such methods.   shown : add methods shown for comparison.
+    method_setting : the setting ``method``, or such methods.   shown : add those shown for
+    comparison.
     """
-    if not isinstance(asked, str):
-        return asked
-    if asked in ('auto', 'all'):
+    if not isinstance(method_setting, str):
+        return method_setting
+    if method_setting in ('auto', 'all'):
         return ORDER
-    asked = BY.get(asked, asked)
-    return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
+    method_setting = BY.get(method_setting, method_setting)
+    return tuple(dict.fromkeys((method_setting, ALWAYS))) if shown else (method_setting,)
 
 
 def choose(methods: Mapping[str, MethodResult],
-           asked: str | tuple[str, ...]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
+           method_setting: str | tuple[str, ...]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
     """
     Return each parameter from the first method that has it and is not rejected.
 
     Also the methods that gave a value; if none did, the first usable one.   methods : by name.
-    asked : the setting ``method``, or the methods that may give values.
+    method_setting : the setting ``method``, or the methods that may give values.
     """
-    found = [methods[name] for name in dict.fromkeys((*deciding(asked), PLANAR))
+    found = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))
              if name in methods]
     usable = [m for m in found if m.verdict is not Verdict.REJECTED] or found
     estimates: dict[str, Estimate] = {}
@@ -79,16 +81,17 @@ def choose(methods: Mapping[str, MethodResult],
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
 
 
-def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...],
-                said: Iterable[Code] = ()) -> list[Reason]:
+def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting: str
+                            | tuple[str, ...],
+                            stated_codes: Iterable[Code] = ()) -> list[Reason]:
     """Return METHOD_REJECTED of rejected methods before a usable one; said : by the leg."""
-    found = [methods[name] for name in deciding(asked) if name in methods]
+    found = [methods[name] for name in deciding_methods(method_setting) if name in methods]
     sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
     why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
            for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
     # a method without its data (a second wheel) is not reported
     return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r.code.name}: {r.text}')
-            for name, r in why if r.code not in (Code.NO_METHOD, *said)]
+            for name, r in why if r.code not in (Code.NO_METHOD, *stated_codes)]
 
 
 def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
@@ -120,11 +123,12 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
                 or a.sigma is None or b.sigma is None:
             continue
         sigma = math.hypot(a.sigma, b.sigma)
-        apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
-        if abs(apart) > REMARK_SIGMAS * sigma:
-            off = (format_relative(apart / a.value, '+') if name == 'scale_factor' else
-                   f'{math.degrees(apart):+z.3f} deg')
+        difference = b.value - a.value if name == 'scale_factor' else float(wrap(b.value
+                                                                                 - a.value))
+        if abs(difference) > REMARK_SIGMAS * sigma:
+            off = (format_relative(difference / a.value, '+') if name == 'scale_factor' else
+                   f'{math.degrees(difference):+z.3f} deg')
             found.append(Reason(
                 Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by {off}, '
-                f'{abs(apart) / sigma:.1f} sigma; likely cause: {cause}'))
+                f'{abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
     return found

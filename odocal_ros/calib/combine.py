@@ -103,10 +103,10 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     shared = {n: weight @ g for n, g in by_leg.items()}
     variance = weight @ own @ weight
     # allowed differences: own errors of the legs, and shared errors with different effects
-    apart = own + np.diag(sum((((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
-                               for n, g in by_leg.items()), np.zeros(len(y))))
+    allowed = own + np.diag(sum((((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
+                                 for n, g in by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
-    chi2 = float((y - mean) @ np.linalg.solve(apart, y - mean)) if freedom else 0.0
+    chi2 = float((y - mean) @ np.linalg.solve(allowed, y - mean)) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
     if freedom and deviate(chi2, freedom) > Z95:
         factor = np.sqrt(chi2 / freedom)

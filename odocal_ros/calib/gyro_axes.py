@@ -230,8 +230,8 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
         return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '
                        'the fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
-    wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
+    corrected_scale = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
     return (Reason(Code.IMU_UNITS, f'turns by the gyro are {ratio:#.3g} times those by the '
                    'fixes' + ', typical for deg/s' * degrees,
-                   f'Set imu.gyro_scale to {wanted:.10g}, or correct the unit in the IMU '
+                   f'Set imu.gyro_scale to {corrected_scale:.10g}, or correct the unit in the IMU '
                    'driver.'),)

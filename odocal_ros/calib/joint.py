@@ -70,7 +70,7 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     # a single leg has no scatter
     alone = len(drives.borders) == 1 and not borders[0].evidence
     between = {} if alone else scatter.sigmas
-    left, rest = (apart + of_legs - of_drives for apart, of_legs, of_drives in zip(
+    left, rest = (in_scatter + of_legs - of_drives for in_scatter, of_legs, of_drives in zip(
         drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
     factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
     where = drives.place(len(drives.borders) - 1)

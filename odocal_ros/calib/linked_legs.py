@@ -99,13 +99,13 @@ class LinkedLegs:
 
     def joined(self, same: Sequence[bool]) -> 'LinkedLegs':
         """Return these legs, with the sections of the same leg added up."""
-        apart = [not together for together in same] or [True] * len(self.steps)
-        if all(apart):
+        is_new_leg = [not together for together in same] or [True] * len(self.steps)
+        if all(is_new_leg):
             return self
         borders = self.borders[:1]
-        for border, own in zip(self.borders[1:], apart, strict=True):
+        for border, own in zip(self.borders[1:], is_new_leg, strict=True):
             borders = [*borders, border] if own else [*borders[:-1], borders[-1].plus(border)]
-        return LinkedLegs(borders, self.names[self.drifting], self.steps[apart])
+        return LinkedLegs(borders, self.names[self.drifting], self.steps[is_new_leg])
 
     def take(self, borders: list[Border]) -> None:
         """Replace the borders; each must have the names of all."""

@@ -168,7 +168,7 @@ class Calibration:
         return verdict_of(self.reasons)
 
 
-def raised_if_wild() -> np.errstate:
+def raise_on_overflow() -> np.errstate:
     """Return a context in which overflow raises FloatingPointError instead of a warning."""
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
@@ -177,9 +177,9 @@ def failed(unknown: Callable[[Reason], MethodResult], name: str,
            error: Exception) -> MethodResult:
     """Return the result of a method that raised: no values, the reason, and the trace."""
     where = traceback.extract_tb(error.__traceback__)[-1]
-    said = ' '.join(str(error).split())[:200]
+    text = ' '.join(str(error).split())[:200]
     reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '
-                    f'{type(error).__name__}{f" ({said})" if said else ""} in {where.name}, line '
+                    f'{type(error).__name__}{f" ({text})" if text else ""} in {where.name}, line '
                     f'{where.lineno}')
     return replace(unknown(reason), details={TRACE: ''.join(traceback.format_exception(error))})
 

@@ -119,10 +119,10 @@ def _residual_properties(n: int) -> Floats:
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
     x /= np.linalg.norm(x, axis=0)
     off = np.eye(n) - x @ x.T
-    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    separation = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     table = []
     for memory in MEMORIES:
-        R = memory**apart
+        R = memory**separation
         left = off @ R @ off
         table.append((np.trace(left) / n, x[:, 1] @ R @ x[:, 1],
                       *(np.trace(left, lag) / np.trace(left) for lag in BLOCK_LAGS)))
@@ -143,10 +143,11 @@ def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats)
     for k in range(1, len(known) - 1):
         sides = [log[:k], log[k + 1:]]
         before, after = (np.median(side) for side in sides)
-        apart = max(np.ptp(side) for side in sides)
-        doubt = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
-        if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * doubt, apart / SIDE_SCATTER):
-            found.append((apart / abs(after - before), k, float(np.exp(before - after))))
+        separation = max(np.ptp(side) for side in sides)
+        sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
+        if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * sigma_of_change, separation
+                                     / SIDE_SCATTER):
+            found.append((separation / abs(after - before), k, float(np.exp(before - after))))
     if not found:
         return ()
     _, k, factor = min(found)

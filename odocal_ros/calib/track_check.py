@@ -68,10 +68,11 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
     rise = residual[:, 2] - np.median(residual[:, 2])
     up2 = robust_sigma(rise)**2
-    seen = np.array([level2, level2, up2]) - drift**2
+    observed_variance = np.array([level2, level2, up2]) - drift**2
     level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
-    asked = np.array([level, level, stated[2]])
-    factors = np.sqrt(np.maximum(np.nan_to_num(seen), 0.0) / np.maximum(asked, 1e-12))
+    stated_variance = np.array([level, level, stated[2]])
+    factors = np.sqrt(np.maximum(np.nan_to_num(observed_variance), 0.0)
+                      / np.maximum(stated_variance, 1e-12))
     return np.where(factors > NOISIER_WORTH, factors, 1.0)
 
 

@@ -67,9 +67,9 @@ def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
-        sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
+        sigma, sigma_limit = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
         reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw uncertainty is {sigma:.3f} deg; '
-                              f'the limit is {asked:.3f} deg'))
+                              f'the limit is {sigma_limit:.3f} deg'))
     return tuple(reasons)
 
 

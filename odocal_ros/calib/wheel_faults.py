@@ -69,7 +69,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     of the counts minus one.   count : number of wheels in the mean.
     """
     two = wheels_on_grid(axle, imu, between, SLIP_GRID,
-               np.empty(0) if doubt_t is None else doubt_t)
+                         np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
     two = without_gyro_drift(two)
@@ -83,9 +83,9 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                            track_width)
     reasons += counter_reasons(two, ratio, track_width or abs(x[1]) * per_right, max_deviation)
     quantum_m = per_right * (1 + ratio) / 2
-    apart = (two.right - signals @ x) * per_right         # m, residual of turn and ratio
+    residual = (two.right - signals @ x) * per_right         # m, residual of turn and ratio
     width = track_width or abs(x[1]) * per_right
-    events, lasting = _events(two, apart, quantum_m, width)
+    events, lasting = _events(two, residual, quantum_m, width)
     found, change = find_ratio_change(_without_slips(two, events), signals, metres_per_unit, count)
     reasons += found
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
@@ -101,17 +101,17 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     return reasons + wheel_slip_reason(slips, two.names), slips
 
 
-def _without_slope(two: WheelPair, apart: Floats, quantum_m: float) -> Floats:
+def _without_slope(two: WheelPair, residual: Floats, quantum_m: float) -> Floats:
     """Return the difference of the paths, m, without its slope on most of the drive."""
     # slopes by rounding at a steady speed, at most two counts over a window, are not removed
     path, n = _mean_path(two), 200     # steps of a slope, 20 s: longer than most slips
-    run, climb = path[n:] - path[:-n], apart[n:] - apart[:-n]
+    run, climb = path[n:] - path[:-n], residual[n:] - residual[:-n]
     if len(run) < n:
-        return apart
+        return residual
     moves = run > max(np.median(run) / 2, 2 * two.quantum)
     slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
-    doubt = 2 * quantum_m * (two.quantum > 0) / max(np.median(run), 1e-9)
-    out: Floats = apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * path
+    slope_uncertainty = 2 * quantum_m * (two.quantum > 0) / max(np.median(run), 1e-9)
+    out: Floats = residual - np.sign(slope) * max(abs(slope) - slope_uncertainty, 0.0) * path
     return out
 
 
@@ -123,11 +123,11 @@ def _without_slips(two: WheelPair, events: list[Event]) -> WheelPair:
     return replace(two, known=known)
 
 
-def _events(two: WheelPair, apart: Floats, quantum_m: float,
+def _events(two: WheelPair, residual: Floats, quantum_m: float,
             width: float) -> tuple[list[Event], list[Event]]:
     """Return the jumps of the difference that end, and those that may change the ratio."""
-    apart = _without_slope(two, apart, quantum_m)
-    total = np.append(0.0, np.cumsum(apart))
+    residual = _without_slope(two, residual, quantum_m)
+    total = np.append(0.0, np.cumsum(residual))
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
     unknown = np.append(0, np.cumsum(~two.known))
     hits = np.zeros(len(two.t), bool)
@@ -145,12 +145,12 @@ def _events(two: WheelPair, apart: Floats, quantum_m: float,
     over: list[Event] = []
     lasting: list[Event] = []
     for a, b in runs(hits):
-        event = _measure_jump(two, apart, windows, a, b)
-        (over if _is_finished(two, apart, event) else lasting).append(event)
+        event = _measure_jump(two, residual, windows, a, b)
+        (over if _is_finished(two, residual, event) else lasting).append(event)
     return over, lasting
 
 
-def _is_finished(two: WheelPair, apart: Floats, event: Event) -> bool:
+def _is_finished(two: WheelPair, residual: Floats, event: Event) -> bool:
     """Return True if a slip ends: it is short, or its slope is absent before and after it."""
     path = _mean_path(two)
     begin, end = np.interp(event[:2], two.t, path)
@@ -158,7 +158,7 @@ def _is_finished(two: WheelPair, apart: Floats, event: Event) -> bool:
         return True
     at = np.searchsorted(two.t, event[:2]).clip(0, len(path) - 1)
     for a, b in ((0, at[0]), (at[1], len(path) - 1)):
-        would, does = _slope(two, event) * (path[b] - path[a]), apart[b] - apart[a]
+        would, does = _slope(two, event) * (path[b] - path[a]), residual[b] - residual[a]
         if abs(would) < 0.1 or abs(does) > abs(would) / 2:      # m, observable
             return False
     return True
@@ -196,8 +196,8 @@ def _jump_limits(two: WheelPair, jump: Floats, span: int, quantum_m: float,
     return out
 
 
-def _measure_jump(two: WheelPair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]],
-                  a: int, b: int) -> Event:
+def _measure_jump(two: WheelPair, residual: Floats,
+                  windows: list[tuple[int, Floats, Floats, Bools]], a: int, b: int) -> Event:
     """Return (begin, end, size) of the jump within steps a to b, by its best window."""
     found = (0.0, 0.0, 0, 0)
     for span, jump, limit, far in windows:
@@ -209,7 +209,7 @@ def _measure_jump(two: WheelPair, apart: Floats, windows: list[tuple[int, Floats
             if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / WHOLE_DRIVE_SIGMAS:
                 found = (float(jump[k]), float(limit[k]), k, span)
     size, _, k, span = found
-    inner = apart[k:k + span + MEAN_STEPS]
+    inner = residual[k:k + span + MEAN_STEPS]
     base = inner[:MEAN_STEPS].mean()
     share = (inner - base) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0

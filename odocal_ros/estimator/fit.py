@@ -174,7 +174,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     # the tails are constant
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
-    judged = 3 if about is None else 0 if problem.rows_per_independent else 1
+    sample_size_pass = 3 if about is None else 0 if problem.rows_per_independent else 1
     pace: dict[str, tuple[float, float]] = {}
     progress = _Progress(about is not None, frozen, tails + 2)
     count, state = 0, state.level()
@@ -189,7 +189,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             trace(count, state, levels, weighted, solved, progress.move)
         if progress.settled or count >= most:
             break
-        if count == judged:
+        if count == sample_size_pass:
             problem.rows_per_independent = find_rows_per_independent(problem, weighted)
         if not frozen:
             marginals = solved.marginals()
@@ -244,10 +244,10 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
     grown = np.concatenate([grown, np.full((len(grown), 1), jumped)], axis=1)
     z2 = noise**2 / np.maximum(found, 1e-12) / grown
     z2[found < LEAST_OBSERVED] = 0.0          # not observable in this interval
-    wanted = np.clip(variance_factors * z2 / TAIL_LIMITS, 1.0, 1e6)
+    new_factors = np.clip(variance_factors * z2 / TAIL_LIMITS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
-    wanted[:, :factor.JUMP] = np.sqrt(variance_factors * wanted)[:, :factor.JUMP]
-    return wanted
+    new_factors[:, :factor.JUMP] = np.sqrt(variance_factors * new_factors)[:, :factor.JUMP]
+    return new_factors
 
 
 def find_rows_per_independent(problem: Problem, weighted: Weighted) -> dict[str, float]:

@@ -18,7 +18,7 @@ import numpy as np
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.linked_legs import LinkedLegs
-from odocal_ros.calib.result import MethodResult, raised_if_wild
+from odocal_ros.calib.result import MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive
@@ -109,7 +109,7 @@ class GrowingFit:
     def _window(self, last: WarmStart | None, view: SmootherLeg, config: Config,
                 trace: Trace) -> RunningEstimate:
         try:
-            with raised_if_wild():
+            with raise_on_overflow():
                 problem = make_problem(view, config, make_imu_steps(view, SPACING))
                 best = self._fit(last, problem, config, trace)
                 if not best.settled:

@@ -75,21 +75,25 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     scale = legs[-1].estimates['scale_factor']
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
                     (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
-    estimates, why = estimate_constants(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates, refusals = estimate_constants(found.value[at], sigma, ratio, scale.unit,
+                                             nominal, config)
     estimates |= combine_as_sent(legs, estimates['scale_factor'])
     wheels = joined(legs)
     if wheels:
-        of_wheels, more = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
-        estimates, why = estimates | of_wheels, why + more
+        wheel_values, wheel_reasons = wheel_estimates(wheels, wheels, estimates['scale_factor'],
+                                                      config)
+        estimates, refusals = estimates | wheel_values, refusals + wheel_reasons
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
-    unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
-    if unsaid:
-        why.append(not_observable_reason(f'these {len(legs)} drives', unsaid))
+    undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
+    if undetermined:
+        refusals.append(not_observable_reason(f'these {len(legs)} drives', undetermined))
     sources = _error_sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
-    said = [_scale_change_reason(change, np.asarray(times_ns)[order], names) for change in changes]
-    return MethodResult('smoother', (*said, *_disagreement_reasons(found, names), *why), estimates,
+    reasons = [_scale_change_reason(change, np.asarray(times_ns)[order], names)
+               for change in changes]
+    return MethodResult('smoother', (*reasons, *_disagreement_reasons(found, names),
+                                     *refusals), estimates,
                         PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
                         | {'beside': additional_figures(found.value[at], C, grade)}
@@ -131,26 +135,26 @@ def _leg_name(number: int) -> str:
 
 def _disagreement_reasons(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
-    J, said = len(found.deviation), list[Reason]()
-    apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
+    J, reasons = len(found.deviation), list[Reason]()
+    unexplained = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
     # parameters correlated with a disputed one differ as well
-    worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
-    for name, z in apart.items():
+    worst = max((np.abs(z).max() for n, z in unexplained.items() if n in PARAMETERS), default=0.0)
+    for name, z in unexplained.items():
         k = int(np.argmax(np.abs(z)))
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
         who = f'; {_leg_name(numbers[k])} differs most ({z[k]:+z.1f} sigma from the others)' * (
             J > 2)
-        said.append(Reason(
+        reasons.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
     if found.factor > 1:
         of = ' in all parameters but scale, yaw and pitch' * bool(found.between)
-        said.append(Reason(
+        reasons.append(Reason(
             Code.LEGS_DISAGREE, f'the scatter of {J} legs{of} is {found.factor:.1f} times their '
             f'uncertainties; {_largest_deviation(found, numbers)}'))
-    return tuple(said)
+    return tuple(reasons)
 
 
 def _largest_deviation(found: Joint, numbers: list[int]) -> str:
@@ -180,8 +184,8 @@ def _error_sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[S
     shared = [Source(name, C[:PARAMETER_COUNT, i] / used[i], True) for name, i in SHARED.items()
               if correlation[i].max() > 1e-9]      # of a correlation: rounding
     shared += common
-    apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
-    return (*shared, Source('legs', root_of(C[:PARAMETER_COUNT, :PARAMETER_COUNT] - apart)),
+    unexplained = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    return (*shared, Source('legs', root_of(C[:PARAMETER_COUNT, :PARAMETER_COUNT] - unexplained)),
             Source('model', np.diag(MODEL_FLOOR)))
 
 

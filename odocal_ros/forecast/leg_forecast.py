@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.calib.choice import choose, deciding_methods
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
@@ -71,13 +71,13 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     """
     unusable = missing_force_cause(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.update_running(leg, config, smoother, is_needed)
-    only_smoother = deciding(config.method) == smoother_forecast.ONLY_SMOOTHER
+    only_smoother = deciding_methods(config.method) == smoother_forecast.ONLY_SMOOTHER
     if only_smoother or smoother_forecast.has_all_values(running):     # the end points add nothing
         forecast = Forecast(ParameterForecast(None, config.verdict.max_scale_sigma, None),
                             ParameterForecast(None, config.verdict.max_yaw_sigma, None))
     else:
         forecast = _forecast_by_end_points(leg, fix_rate, config, is_needed)
-        if smoother is not None and 'smoother' in deciding(config.method):
+        if smoother is not None and 'smoother' in deciding_methods(config.method):
             forecast = replace(forecast, scale=_without_refusal(forecast.scale))
             if not unusable:
                 forecast = replace(forecast, yaw=_without_refusal(forecast.yaw))

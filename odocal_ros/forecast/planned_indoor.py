@@ -175,14 +175,15 @@ def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
         rows = rows_of(robot.drive, robot.wheels)
         count = (d * [1.0, 1.0, robot.width / 2]) @ rows.T
         return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == settings.MECANUM)
-    apart = d[:, 2] * robot.width
+    wheel_difference = d[:, 2] * robot.width
     arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
 
-    def of(apart: Floats) -> Wheels:
-        return of_sides(d[:, 0] - apart / 2, d[:, 0] + apart / 2, robot.drive)
+    def of(wheel_difference: Floats) -> Wheels:
+        return of_sides(d[:, 0] - wheel_difference / 2, d[:, 0] + wheel_difference / 2,
+                        robot.drive)
     for _ in range(50 * (robot.drive == settings.SKID)):      # the width depends on the paths
-        apart = d[:, 2] / (1 / robot.width + arc * of(apart).straightness)
-    return of(apart), [arc] * (robot.drive == settings.SKID)
+        wheel_difference = d[:, 2] / (1 / robot.width + arc * of(wheel_difference).straightness)
+    return of(wheel_difference), [arc] * (robot.drive == settings.SKID)
 
 
 def _position_nodes(motion: RobotMotion, robot: Robot) -> Ints:

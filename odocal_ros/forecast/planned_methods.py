@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.choice import choose, deciding, relevant_reasons
+from odocal_ros.calib.choice import choose, deciding_methods, relevant_reasons
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.chain import NotPositive
@@ -130,16 +130,16 @@ def _sample_times(begin: float, end: float, rate: float, spacing: float) -> Floa
 def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
              ) -> dict[str, ExternalSamples]:
     """Return the external heading of the settings; none for a course or a gyrocompass."""
-    asked, sigma = config.alignment.source, config.alignment.heading_sigma
-    if asked == 'fixed':
+    source, sigma = config.alignment.source, config.alignment.heading_sigma
+    if source == 'fixed':
         t, noise = np.zeros(1), GIVEN_NOISE
-    elif asked in HEADING_TOPICS and sigma <= HEADING_LIMIT:
+    elif source in HEADING_TOPICS and sigma <= HEADING_LIMIT:
         t = _sample_times(t_begin, drive.duration, EXTERNAL_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * EXTERNAL_RATE))
     else:
         return {}
     yaw = np.interp(t, drive.t, drive.yaw)
-    return {'heading': Heading(t, yaw, np.full(len(t), noise), sigma, asked)}
+    return {'heading': Heading(t, yaw, np.full(len(t), noise), sigma, source)}
 
 
 def _true_state(motion: _Motion, key: Ints) -> State:
@@ -165,16 +165,16 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     few = too_few_samples_reason(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
         return refused_result([few], '1')
-    made = ideal_samples(drive, sigmas, keyframe_spacing(drive) if spacing is None else spacing)
-    problem = make_problem(made.leg, sigmas.config, made.imu)
-    levels = planned_noise_levels(problem, sigmas, made.fixes_in_one)
+    ideal = ideal_samples(drive, sigmas, keyframe_spacing(drive) if spacing is None else spacing)
+    problem = make_problem(ideal.leg, sigmas.config, ideal.imu)
+    levels = planned_noise_levels(problem, sigmas, ideal.fixes_in_one)
     try:
-        fit = fit_at_truth(problem, made, levels)
+        fit = fit_at_truth(problem, ideal, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
         reason = Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}. '
                         'Likely cause: too little data for the unknowns')
         return refused_result([reason], '1')
-    return make_result(made.leg, problem, fit, sigmas.config)
+    return make_result(ideal.leg, problem, fit, sigmas.config)
 
 
 def keyframe_spacing(drive: PlannedDrive) -> float:
@@ -210,9 +210,9 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
-def fit_at_truth(problem: Problem, made: IdealSamples, levels: Levels) -> Fit:
+def fit_at_truth(problem: Problem, ideal: IdealSamples, levels: Levels) -> Fit:
     """Return the fit at the true state, without any step."""
-    state, priors = made.state, problem.priors
+    state, priors = ideal.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, VARIANCE_FACTOR_COUNT)),
                True, False, 0,
@@ -264,7 +264,7 @@ class Plan:
         Those of the drive, of the smoother, and of methods that give a parameter; of the other
         methods the refusals only.
         """
-        said = list(self.two_point.of_drive)
+        reasons = list(self.two_point.of_drive)
         for name in self.methods:
             own = relevant_reasons(self.reasons_of(name), name, self.estimates)
             if name == 'smoother':
@@ -272,17 +272,16 @@ class Plan:
                             or r.code.name.endswith('_NOT_DETERMINED'))
             elif name not in self.giving:
                 own = tuple(r for r in own if r.code.severity is Verdict.REJECTED)
-            said += [r for r in own if r not in said]
-        return tuple(said)
+            reasons += [r for r in own if r not in reasons]
+        return tuple(reasons)
 
 
 def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = None) -> Plan:
     """Return the predictions of the configured methods; arguments as ``predict_smoother``."""
-    asked = sigmas.config.method
+    may_give = deciding_methods(sigmas.config.method)
     two_point = predict(drive, sigmas)
     methods = {'two_point': two_point.method}
-    if 'smoother' in deciding(asked):
+    if 'smoother' in may_give:
         methods = {'smoother': predict_smoother(drive, sigmas, spacing)} | methods
-    may_give = deciding(asked)
     estimates, _ = choose({name: methods[name] for name in may_give}, may_give)
     return Plan(two_point, methods, estimates, may_give)

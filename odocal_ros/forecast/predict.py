@@ -87,10 +87,10 @@ class Sigmas:
     @property
     def correlation_time(self) -> float:
         """Return the correlation time of fix errors, s; 0: white."""
-        asked = self.config.gnss.correlation_time
+        limit = self.config.gnss.correlation_time
         # s, default correlation time of fixes of one receiver
         correlation_time = 60.0
-        return correlation_time if np.isnan(asked) else asked
+        return correlation_time if np.isnan(limit) else limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,14 +121,14 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     alignment, found = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
     track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
                         Travel(drive.t, drive.travel, sigmas.quantum))
-    distance, said = check_drive(track, drive.duration, 1.0, config.leg)
+    distance, drive_reasons = check_drive(track, drive.duration, 1.0, config.leg)
     keep = track.t >= alignment.t - 1e-9
     track = Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
-    start, end = (_expected_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
+    start, end = (_expected_mark(t, track, drive, sigmas, spans, limit) for t, limit in (
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
     chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
                   np.zeros(3), _velocity_change(track, (start, end)), alignment)
-    reasons = (*found, *said)
+    reasons = (*found, *drive_reasons)
     refused = refusal_reasons(chord, 1.0)
     if refused:
         method = refused_result(refused, '1')
@@ -139,10 +139,10 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
                       float(np.linalg.norm((end.position_n - start.position_n)[:2])),
                       drive.duration,
                       (_rest_duration(0.0, spans), _rest_duration(drive.duration, spans)),
-                      tuple(r for r in said if r.code is not Code.LEG_NOT_STRAIGHT))
+                      tuple(r for r in drive_reasons if r.code is not Code.LEG_NOT_STRAIGHT))
 
 
-def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,
+def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, limit: float,
                             farthest: float = 1e5) -> float | None:
     """
     Return the straight distance, m, that brings a sigma down to its limit.
@@ -153,7 +153,7 @@ def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str,
     def enough(metres: float) -> bool:
         longer = drive.lengthen(metres) if metres else drive
         sigma = predict(longer, sigmas).sigma(parameter)
-        return sigma is not None and sigma <= asked
+        return sigma is not None and sigma <= limit
 
     if enough(0.0):
         return 0.0

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.choice import ABOUT, deciding, PLANAR
+from odocal_ros.calib.choice import ABOUT, deciding_methods, PLANAR
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.forecast.planned_drive import drive_from_rates
@@ -78,7 +78,7 @@ def find_observable(config: Config, received: Received) -> Observability:
     if not received.imu or drive != DIFFERENTIAL:
         return Observability(PLANAR_QUANTITIES[drive], (
             'yaw and pitch of the IMU' if received.imu else 'yaw and pitch (no IMU)',))
-    methods = [name for name in METHODS if name in deciding(config.method)
+    methods = [name for name in METHODS if name in deciding_methods(config.method)
                and (received.has_accelerometer or name != METHOD_WITHOUT_HEADING)]
     values = [(True, 'the scale'), _yaw_quantity(config, received, methods),
               (True, 'the pitch') if received.height else
@@ -109,7 +109,7 @@ def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) ->
 
 
 def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
-    if METHOD_WITHOUT_HEADING not in deciding(config.method):
+    if METHOD_WITHOUT_HEADING not in deciding_methods(config.method):
         return [(False, f'left and right wheel separately (method {config.method} uses their '
                  'mean)')]
     width = config.odometer.track_width
@@ -205,19 +205,19 @@ def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 def check_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str,
                                                                                           str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
-    doubted = {ABOUT[r.code] for r in calibration.reasons
-               if r.code in ABOUT and r.code.severity is not Verdict.ACCEPTED}
+    names_with_reason = {ABOUT[r.code] for r in calibration.reasons
+                         if r.code in ABOUT and r.code.severity is not Verdict.ACCEPTED}
     return check_estimates(calibration.estimates, config, two_wheels,
-                           calibration.verdict is not Verdict.REJECTED, doubted)
+                           calibration.verdict is not Verdict.REJECTED, names_with_reason)
 
 
 def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
-                    doubted: Set[str] = frozenset()) -> dict[str, str]:
+                    names_with_reason: Set[str] = frozenset()) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity: within its limit.
 
-    valid : False: no value is usable.   doubted : names of estimates with a reason against
-    their use.
+    valid : False: no value is usable.   names_with_reason : estimates with a reason against their
+    use.
     """
     planar = any(e.method == PLANAR for e in estimates.values())
     known: dict[str, float | None] = {}
@@ -230,7 +230,7 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
                 e is not None and e.value is not None for e in found):
             continue
         known[name] = max(_relative_sigma(e, quantity.relative) for e in found)
-        if not valid or doubted & set(quantity.estimates):
+        if not valid or names_with_reason & set(quantity.estimates):
             bad.add(name)
     return _check_sigmas(known, config) | dict.fromkeys(bad, NO)
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.choice import ABOUT, choose, deciding, PLANAR
+from odocal_ros.calib.choice import ABOUT, choose, deciding_methods, PLANAR
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData, OdocalError
@@ -47,12 +47,12 @@ DRIVE_ON = 'drive straights, and turn on the spot in both directions'
 def update_running(leg: Leg, config: Config, smoother: SmootherSoFar | None,
                    is_needed: Callable[[], bool]) -> RunningEstimate | None:
     """Return the running estimate, None without; raise OdocalError if no other method is used."""
-    if smoother is None or 'smoother' not in deciding(config.method):
+    if smoother is None or 'smoother' not in deciding_methods(config.method):
         return None
     try:
         return smoother.update(leg, config, is_needed)
     except OdocalError:
-        if deciding(config.method) == ONLY_SMOOTHER:
+        if deciding_methods(config.method) == ONLY_SMOOTHER:
             raise
         return None
 

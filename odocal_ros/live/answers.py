@@ -5,7 +5,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from odocal_ros.calib.choice import ABOUT, deciding
+from odocal_ros.calib.choice import ABOUT, deciding_methods
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import quantities
@@ -139,7 +139,7 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
         return quantities.check_calibration(session.calibration, now.config, now.two_wheels)
     if session.state is not State.COMPUTING and session.restored is not None:
         return quantities.check_estimates(session.restored.estimates, now.config,
-                                       now.two_wheels, session.restored.valid)
+                                          now.two_wheels, session.restored.valid)
     return quantities.all_unknown()
 
 
@@ -167,7 +167,7 @@ def manoeuvres(now: SessionView) -> list[str]:
                         f'({KMH * least:.0f} km/h)')
     if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
         required.append('call ~/mark at rest on each point')
-    if now.two_wheels and 'smoother' in deciding(now.session.config.method):
+    if now.two_wheels and 'smoother' in deciding_methods(now.session.config.method):
         required += _wheel_manoeuvres(now)
     return required + (now.forecast.manoeuvres if now.forecast else [])
 

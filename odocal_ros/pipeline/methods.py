@@ -10,9 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over
+from odocal_ros.calib.choice import (
+    choose,
+    deciding_methods,
+    disagreements,
+    rejected_method_reasons,
+)
 from odocal_ros.calib.drive import path_and_chord
-from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raised_if_wild
+from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
@@ -108,7 +113,7 @@ def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]
     inputs = prepared.inputs
     try:
         # divergence is detected by non-finite numbers, not by warnings
-        with raised_if_wild():
+        with raise_on_overflow():
             return work()
     except (OdocalError, MemoryError):
         raise
@@ -140,13 +145,14 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
-    computed = deciding(selected_method, shown=True)
+    computed = deciding_methods(selected_method, shown=True)
     names = [name for name in METHODS if name in computed]      # in the order of the output
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
     found = [*reasons_on_data(runs, prepared), *disagreements(methods)]
-    found += passed_over(methods, selected_method, {r.code for r in (*prepared.reasons, *found)})
+    found += rejected_method_reasons(methods, selected_method,
+                                     {r.code for r in (*prepared.reasons, *found)})
     estimates, _ = choose(methods, selected_method)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
@@ -168,7 +174,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     of_outliers = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
     found = [r for k, r in enumerate(found) if k not in of_outliers[1:]]
     return leg_result(leg, inputs, (*prepared.reasons, *found), methods,
-                      distance=prepared.distance, deciding=deciding(selected_method),
+                      distance=prepared.distance, deciding=deciding_methods(selected_method),
                       path_ratio=prepared.path_ratio, **track_fields)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.planar.result import refused, result_of
 from odocal_ros.calib.planar.run import Fit, Known, MECANUM_ROWS, of_sides, rows_of, Run, Wheels
-from odocal_ros.calib.result import failed, LegResult, MethodResult, raised_if_wild
+from odocal_ros.calib.result import failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
@@ -66,7 +66,7 @@ def _fit_guarded(run: Run, inputs: Inputs, config: settings.Config,
     def unknown(reason: Reason) -> MethodResult:
         return refused([reason], unit)
     try:
-        with raised_if_wild():
+        with raise_on_overflow():
             found = fit(run, known_values(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
             method = result_of(found, unit, nominal_scale(config, unit), config,

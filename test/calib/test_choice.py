@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over, relevant_reasons
+from odocal_ros.calib.choice import (
+    choose,
+    deciding_methods,
+    disagreements,
+    rejected_method_reasons,
+    relevant_reasons,
+)
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
 from odocal_ros.pipeline.combination import combine, inconsistent_legs
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -69,7 +75,7 @@ def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
     ('patent', ('smoother', 'two_point')), ('auto', ('smoother', 'two_point')),
     ('all', ('smoother', 'two_point'))])
 def test_the_operators_own_marks_are_always_computed(asked, run):
-    assert deciding(asked, shown=True) == run
+    assert deciding_methods(asked, shown=True) == run
 
 
 def test_reasons_about_a_value_that_another_method_gives_are_not_said():
@@ -81,18 +87,19 @@ def test_reasons_about_a_value_that_another_method_gives_are_not_said():
 
 def test_a_rejected_method_is_named_where_one_behind_it_gives():
     fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
-    found, = passed_over(several(method('two_point'), fell), 'auto')
+    found, = rejected_method_reasons(several(method('two_point'), fell), 'auto')
     assert found.code is Code.METHOD_REJECTED
     assert found.text == 'smoother is not used, because of CHORD_TOO_SHORT: a loop'
     # said by the leg already; behind the one that gives; nothing gives; not asked for
-    assert passed_over(several(method('two_point'), fell), 'auto', {REFUSED.code}) == []
+    assert rejected_method_reasons(several(method('two_point'), fell), 'auto',
+                                   {REFUSED.code}) == []
     loop = method('two_point', reasons=[REFUSED])
-    assert passed_over(several(loop, method('smoother')), 'auto') == []
-    assert passed_over(several(loop, fell), 'auto') == []
-    assert passed_over(several(method('two_point'), fell), 'two_point') == []
+    assert rejected_method_reasons(several(loop, method('smoother')), 'auto') == []
+    assert rejected_method_reasons(several(loop, fell), 'auto') == []
+    assert rejected_method_reasons(several(method('two_point'), fell), 'two_point') == []
     # that there is no second wheel is no fault of the drive
     none = method('smoother', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
-    assert passed_over(several(none, method('two_point')), 'all') == []
+    assert rejected_method_reasons(several(none, method('two_point')), 'all') == []
 
 
 @pytest.mark.parametrize(('other', 'text', 'cause'), [
@@ -155,7 +162,7 @@ def test_what_rejects_a_leg_is_said_once():
 def test_a_method_left_out_of_one_leg_of_two_is_said_once():
     fell = method('smoother', reasons=[REFUSED])
     one = leg(1, fell, method('two_point'),
-              reasons=passed_over(several(fell, method('two_point')), 'all'))
+              reasons=rejected_method_reasons(several(fell, method('two_point')), 'all'))
     said = combine([one, leg(2, method('smoother'), method('two_point'))], ALL).reasons
     assert [r.code for r in said if 'a loop' in r.text] == [Code.LEG_REJECTED]
     said = combine([one], ALL)

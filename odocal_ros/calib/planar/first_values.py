@@ -96,9 +96,9 @@ class _Alignment:
     """Fit of dead-reckoned paths to positions in windows; holds what is independent of wheels."""
 
     def __init__(self, run: Run, z: Complexes, windows: Ints, rough: float) -> None:
-        forward, side, apart = run.wheels.body(run.wheels.count).T
+        forward, side, wheel_difference = run.wheels.body(run.wheels.count).T
         self.node, self.windows, self.rough = run.node, windows, rough
-        self.left, self.right = forward - apart / 2, forward + apart / 2
+        self.left, self.right = forward - wheel_difference / 2, forward + wheel_difference / 2
         self.moved = forward + 1j * side
         self.count = np.diff(windows, axis=1)[:, 0]
         y = z - z.mean()

@@ -73,23 +73,23 @@ class Wheels:
     @property
     def path(self) -> Floats:
         """Return the path of a wheel, mean of both sides, plus sideways motion: (n,)."""
-        forward, side, apart = self.body(self.count).T
-        path: Floats = np.maximum(np.abs(forward), np.abs(apart) / 2) + np.abs(side)
+        forward, side, wheel_difference = self.body(self.count).T
+        path: Floats = np.maximum(np.abs(forward), np.abs(wheel_difference) / 2) + np.abs(side)
         return path
 
     @property
     def spins(self) -> Bools:
         """Return True for intervals with more turn than travel: (n,)."""
-        forward, side, apart = np.abs(self.body(self.count)).T
-        spins: Bools = apart > 2 * (forward + side)
+        forward, side, wheel_difference = np.abs(self.body(self.count)).T
+        spins: Bools = wheel_difference > 2 * (forward + side)
         return spins
 
     @property
     def straightness(self) -> Floats:
         """Return 0 for a turn on the spot, 1 - width / (2 radius) on an arc: (n,)."""
-        forward, _, apart = np.abs(self.body(self.count)).T
-        most = np.maximum(2 * forward, apart)
-        return 1 - np.where(most > 0, apart / np.maximum(most, 1e-30), 1.0)
+        forward, _, wheel_difference = np.abs(self.body(self.count)).T
+        most = np.maximum(2 * forward, wheel_difference)
+        return 1 - np.where(most > 0, wheel_difference / np.maximum(most, 1e-30), 1.0)
 
     def increments(self, c: Floats) -> tuple[Floats, Floats]:
         """
@@ -101,17 +101,17 @@ class Wheels:
         """
         w, table = self.count.shape[1], self.table
         scale, by, side = self._split(c)
-        forward, rolled, apart = self.body(self.count * scale).T
+        forward, rolled, wheel_difference = self.body(self.count * scale).T
         J = np.zeros((len(self.count), 3, len(self.names)))
         J[:, 0, :w] = self.count * table[0]
         J[:, 1, :w] = self.count * table[1] * side
         J[:, 2, :w] = self.count * table[2] * by[:, None]
-        J[:, 2, w] = apart
+        J[:, 2, w] = wheel_difference
         if self.kind == SKID:
-            J[:, 2, w + 1] = apart * self.straightness
+            J[:, 2, w + 1] = wheel_difference * self.straightness
         if self.kind == MECANUM:
             J[:, 1, w + 1] = rolled
-        return np.stack([forward, rolled * side, apart * by], -1), J
+        return np.stack([forward, rolled * side, wheel_difference * by], -1), J
 
     def _split(self, c: Floats) -> tuple[Floats, Floats, float]:
         """Return scales (w,), curvatures (n,), and the ratio of motion to rolling sideways."""

@@ -115,7 +115,8 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
         last = walk.surface()
         iterations += 1
     return Refined(space.T @ walk.q, walk.least, iterations, settled, walk.half,
-                   bool((walk.half > walk.asked).any()), bool(walk.on_edge.any()), first, last)
+                   bool((walk.half > walk.first_half).any()), bool(walk.on_edge.any()), first,
+                   last)
 
 
 class _Walk:
@@ -124,7 +125,7 @@ class _Walk:
     def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
                  x: Floats) -> None:
         self.value, self.space = value, space
-        self.asked = self.half = half
+        self.first_half = self.half = half
         self.first_width = np.abs(space.q_of(width) if space.held else
                                   np.array([width[:2].mean(), width[:2].sum(), width[2]]))
         self.w = self.first_width
@@ -150,7 +151,7 @@ class _Walk:
         move = np.linalg.solve(S, u * bound)
         there = float(self.value((self.space.T @ (self.q + move))[None])[0])
         settled = 1e-6    # share of the first half range, largest last step
-        small = np.abs(S @ move) <= settled * self.space.bounds(self.asked)
+        small = np.abs(S @ move) <= settled * self.space.bounds(self.first_half)
         # share of the criterion: the box is not shrunk if its curvature contributes less
         drowned = 1e-6
         shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < drowned * self.least)

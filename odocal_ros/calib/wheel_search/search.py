@@ -169,9 +169,9 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
             f'has not converged after {refined.iterations} response surfaces'
         found.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
     else:
-        apart = np.abs(refined.x - direct.x)
-        apart[2] = abs(wrap(apart[2]))
-        share = float((apart / ranges.half).max())
+        difference = np.abs(refined.x - direct.x)
+        difference[2] = abs(wrap(difference[2]))
+        share = float((difference / ranges.half).max())
         agree = 1e-3    # of the range: largest difference of surface and least squares
         if share > agree or not direct.settled:
             found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '

@@ -37,7 +37,7 @@ class Heading(ExternalSamples):
     yaw: Floats         # (m,) rad
     noise: Floats       # (m,) rad
     sigma: float        # rad, of the error that is constant over the leg
-    error_text: str        # the heading source, as in the settings
+    source_name: str        # the heading source, as in the settings
 
 
 class HeadingRows(ExternalRows):
@@ -49,38 +49,38 @@ class HeadingRows(ExternalRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
-        asked, alignment = config.alignment.heading_source, config.alignment
-        if not np.isnan(alignment.heading) and asked in ('auto', 'fixed'):
+        source, alignment = config.alignment.heading_source, config.alignment
+        if not np.isnan(alignment.heading) and source in ('auto', 'fixed'):
             yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
             return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN_NOISE),
                            alignment.heading_sigma, 'fixed')
-        if asked in ('auto', 'heading_topic'):
-            sent, t = inputs.outside['heading']
-            return _sent(inputs, t, sent.q_ni, sent.yaw_variance, alignment.heading_offset,
+        if source in ('auto', 'heading_topic'):
+            samples, t = inputs.outside['heading']
+            return _sent(inputs, t, samples.q_ni, samples.yaw_variance, alignment.heading_offset,
                          config, origin, np.eye(3), 'heading_topic')
-        if asked == 'imu_orientation':
+        if source == 'imu_orientation':
             return _sent(inputs, inputs.t_imu, inputs.q_ni, inputs.yaw_variance, 0.0, config,
                          origin, transpose(inputs.C_bi), 'imu_orientation')
         return None
 
     @staticmethod
-    def prior_sigmas(sent: Heading, config: Config) -> float:
-        return sent.sigma
+    def prior_sigmas(samples: Heading, config: Config) -> float:
+        return samples.sigma
 
     @classmethod
-    def details(cls, sent: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        return {'source': sent.error_text, 'sigma_stated': sent.sigma,
+    def details(cls, samples: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
+        return {'source': samples.source_name, 'sigma_stated': samples.sigma,
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        sent = problem.external['heading']
-        assert isinstance(sent, Heading)
+        samples = problem.external['heading']
+        assert isinstance(samples, Heading)
         state, points = point.state, point.points['heading']
         k = points.interval
         C = state.C_nb[k]
         x = (C @ points.R)[:, :, 0]
         level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
-        raw = wrap(sent.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
+        raw = wrap(samples.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
         turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
                           np.ones(len(k))], -1)
         J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
@@ -88,15 +88,15 @@ class HeadingRows(ExternalRows):
         by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
         J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
         c[:, 0, HEADING] = -1.0
-        return Rows(raw[:, None], J, c, 1 / sent.noise[:, None])
+        return Rows(raw[:, None], J, c, 1 / samples.noise[:, None])
 
     @staticmethod
-    def least(sent: Heading) -> dict[str, float]:
-        return {'heading': (LEAST.heading / float(np.median(sent.noise)))**2}
+    def least(samples: Heading) -> dict[str, float]:
+        return {'heading': (LEAST.heading / float(np.median(samples.noise)))**2}
 
 
 def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
-          origin: Origin, C_ib: Floats, error_text: str) -> Heading | None:
+          origin: Origin, C_ib: Floats, source_name: str) -> Heading | None:
     """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
@@ -110,4 +110,4 @@ def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
         return None
     C = matrix_from_quat(q) @ C_ib
     yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + convergence(inputs, t, origin)
-    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), error_text)
+    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source_name)

@@ -168,7 +168,7 @@ class SpeedSteps(PointRows):
         self.sigma = self.instants.sigma * leg.rough_scale
         self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the forward axis rotates, and an IMU beside the axle moves relative to the axle
-        self.gained = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
+        self.acceleration = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
             + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
             + np.cross(points.spin, arm_b) @ state.forward
         c = state.constants
@@ -177,9 +177,9 @@ class SpeedSteps(PointRows):
             self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
         ) - axle.means_by_path(point.intervals)
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
-        said = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
-        self.said = state.scale * self.scale_ratio * said
-        self.raw = (self.said - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
+        speed_by_wheel = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
+        self.speed_by_wheel = state.scale * self.scale_ratio * speed_by_wheel
+        self.raw = (self.speed_by_wheel - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
     def is_present(cls, problem: Problem) -> bool:
@@ -216,14 +216,15 @@ class SpeedSteps(PointRows):
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.scale_ratio
         # by the published value: the speed is anywhere in its step, so only the speed has an error
-        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.said, K * self.instants.side
-        c[:, layout.TYRES] = (self.said / self.scale_ratio)[:, None] * self.tyre_signals
+        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_by_wheel, K * self.instants.side
+        c[:, layout.TYRES] = (self.speed_by_wheel / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
-        c[:, layout.ODO_DELAY], c[:, layout.ODO_CLOCK] = self.gained, self.gained * self.instants.t
+        c[:, layout.ODO_DELAY], c[
+            :, layout.ODO_CLOCK] = self.acceleration, self.acceleration * self.instants.t
         c[:, layout.ODO_LAG2] = -self.by_lag
         c[:, layout.ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]

@@ -176,7 +176,7 @@ def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reas
     """Report an external heading that differs from that of the drive by more than its sigma."""
     if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
-    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.error_text}) differs by '
+    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source_name}) differs by '
                    f'{np.rad2deg(error):+z.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
                    'the heading estimated on this drive; it was down-weighted')]
 

@@ -88,13 +88,14 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             config: Config) -> list[Reason]:
     """Return reasons; sigma : (M,) of the constants; ratio : (M,) posterior to prior sigma."""
     c = fit.state.constants
-    said = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(fit),
-            *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
-            *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
-                              c[layout.FIX_TIME], sigma_by_wheels_in_map(problem, c, sigma)),
-            *(reason for name, i in CLOCKS.items()
-              for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
-            *_scale_variation_reasons(fit, sigma), *_change_reasons(fit), *_bias_step_reasons(fit)]
+    reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(fit),
+               *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
+               *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
+                                 c[layout.FIX_TIME], sigma_by_wheels_in_map(problem, c, sigma)),
+               *(reason for name, i in CLOCKS.items()
+               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
+               *_scale_variation_reasons(fit, sigma), *_change_reasons(fit),
+               *_bias_step_reasons(fit)]
     usual = imperfection_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
@@ -102,18 +103,18 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     skew = float(np.linalg.norm(off[AXES]))
     if skew > ANOTHER_IMU:
         seen = np.rad2deg(np.linalg.norm(c[AXES][off[AXES] > 0]))
-        said.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
-                           f'{seen:.2f} deg off perpendicular, '
-                           f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
-                           f'(limit {ANOTHER_IMU:g}); accounted for'))
+        reasons.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
+                              f'{seen:.2f} deg off perpendicular, '
+                              f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
+                              f'(limit {ANOTHER_IMU:g}); accounted for'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
     if off[worst] > ANOTHER_IMU:
         name = layout.CONSTANTS[worst].replace('_', ' ')
-        said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} '
-                           f'is {100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
-                           f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
-                           'accounted for'))
-    return said + _lever_arm_reasons(c, sigma, ratio, config)
+        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} is '
+                              f'{100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
+                              f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
+                              'accounted for'))
+    return reasons + _lever_arm_reasons(c, sigma, ratio, config)
 
 
 def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
@@ -143,60 +144,60 @@ def _outlier_reasons(fit: Fit) -> list[Reason]:
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
-    said = []
+    texts = []
     for i, span, what in ((layout.BY_SPEED, motion.tyre_signals[:, 0], 'from low to high speed'),
                           (layout.BY_TIME, motion.tyre_signals[:, 1], 'from start to end')):
-        change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
-        if abs(change) > max(REMARK_SIGMAS * doubt, LEAST_CHANGE):
-            said.append(f'{100 * change:+z.2f} ± {100 * doubt:.2f} % {what}')
-    if not said:
+        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(span)
+        if abs(change) > max(REMARK_SIGMAS * change_sigma, LEAST_CHANGE):
+            texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {what}')
+    if not texts:
         return []
-    less = said[0].startswith('-') and 'speed' in said[0]
-    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
+    less = texts[0].startswith('-') and 'speed' in texts[0]
+    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a bias that steps: the largest step of each sensor."""
-    said = []
-    for name, bias, column, unit, per in (
+    texts = []
+    for name, bias, column, unit, unit_factor in (
             ('gyro', fit.state.gyro_bias, GYRO_STEP, 'deg/s', np.rad2deg(1.0)),
             ('accelerometer', fit.state.accel_bias, ACCEL_STEP, 'm/s^2', 1.0)):
-        odd = np.r_[False, fit.variance_factors[:, column] > STEP_VARIANCE, False]
-        begin, end = np.flatnonzero(np.diff(odd.astype(int))).reshape(-1, 2).T
+        is_outlier = np.r_[False, fit.variance_factors[:, column] > STEP_VARIANCE, False]
+        begin, end = np.flatnonzero(np.diff(is_outlier.astype(int))).reshape(-1, 2).T
         size = np.linalg.norm(bias[end] - bias[begin], axis=1)
         if len(size):
             k = int(np.argmax(size))
-            said.append(f'the {name} bias changes by {per * size[k]:.2g} {unit} near '
-                        f't = {fit.state.t[begin[k]]:.0f} s')
-    return [Reason(Code.IMU_BIAS_STEP, '; '.join(said) + '; estimated before and after')
-            ] if said else []
+            texts.append(f'the {name} bias changes by {unit_factor * size[k]:.2g} {unit} near '
+                         f't = {fit.state.t[begin[k]]:.0f} s')
+    return [Reason(Code.IMU_BIAS_STEP, '; '.join(texts) + '; estimated before and after')
+            ] if texts else []
 
 
 def _change_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a scale or mounting that changes in the leg."""
-    said = []
+    texts = []
     for step in fit.steps:
         if step.is_certain and abs(step.size) > LEAST_CHANGE:
             what = layout.CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \
                 f'{np.rad2deg(step.size):+z.2f} deg'
-            said.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
-                        f'({abs(step.size) / step.sigma:.0f} sigma)')
-    return [Reason(Code.CHANGE_IN_LEG, '; '.join(said))] if said else []
+            texts.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
+                         f'({abs(step.size) / step.sigma:.0f} sigma)')
+    return [Reason(Code.CHANGE_IN_LEG, '; '.join(texts))] if texts else []
 
 
 def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
     """Return the axes of lever arms that the drive puts far from their setting, by index."""
     axes = (*range(layout.ODO_ARM.start, layout.ODO_ARM.stop - 1),      # not z of the odometer
             *range(layout.GNSS_ARM.start, layout.GNSS_ARM.stop))
-    worth = 0.3     # m
-    return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], worth)}
+    least_size = 0.3     # m
+    return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], least_size)}
 
 
 def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
-    said, do = [], []
+    texts, actions = [], []
     off = deviating_lever_arms(c, sigma)
     for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
                              ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
@@ -209,22 +210,22 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
             # not among the estimates
             rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
             if abs(found) > most:
-                said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
-                do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
+                texts.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
+                actions.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
             elif any(arm):
-                said.append(f'{name} {axis}: set to {value:+z.2f} m, estimated {text}{rough}')
-                do.append(f'Measure {name} {axis} again.')
+                texts.append(f'{name} {axis}: set to {value:+z.2f} m, estimated {text}{rough}')
+                actions.append(f'Measure {name} {axis} again.')
             else:
-                said.append(f'{name} {axis}: not set, estimated {text}{rough}')
-                do.append(f'Measure {name} {axis} and set it.')
-    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
-        [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []
+                texts.append(f'{name} {axis}: not set, estimated {text}{rough}')
+                actions.append(f'Measure {name} {axis} and set it.')
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for', ' '.join(
+        [*actions, SLIDES] if any('easure' in x for x in actions) else actions))] if texts else []
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     """Return FIXES_SMOOTHED if the filter constant of the receiver, s^2, is significant."""
-    worth = 0.1     # s: the age of a fix at 10 Hz is up to this
-    if abs(square) <= max(REMARK_SIGMAS * sigma, worth**2):
+    least_size = 0.1     # s: the age of a fix at 10 Hz is up to this
+    if abs(square) <= max(REMARK_SIGMAS * sigma, least_size**2):
         return ()
     what, time = ('averages its fixes', np.sqrt(square)) if square > 0 else (
         'filters position and velocity', np.sqrt(-square / 2))
@@ -234,8 +235,8 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def contains_odometer(share: float, sigma: float) -> bool:
     """Return True if the receiver has an odometer of its own, of this error."""
-    worth = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
-    return bool(abs(share) > max(FAULT_SIGMAS * sigma, worth))
+    least_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
+    return bool(abs(share) > max(FAULT_SIGMAS * sigma, least_size))
 
 
 def odometer_reasons(share: float, sigma: float, log_time: float,
@@ -262,8 +263,8 @@ def map_drift_sigma(share: float, log_time: float, duration: float) -> float:
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     """Return SPEED_FILTERED if the filter constant of the odometer, s^2, is significant."""
-    worth = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
-    if square <= max(REMARK_SIGMAS * sigma, worth**2):
+    least_size = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
+    if square <= max(REMARK_SIGMAS * sigma, least_size**2):
         return ()
     return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
                    f'constant of about {np.sqrt(square):.2f} s; accounted for'),)
@@ -271,8 +272,8 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
     """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
-    worth = 0.01        # s: the samples of most odometers are farther apart
-    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
+    least_size = 0.01        # s: the samples of most odometers are farther apart
+    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= least_size:
         return ()
     return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '
                    f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '

@@ -178,13 +178,13 @@ def describe_slip_level(fit: Fit, marginals: JointMarginals, count: float) -> st
 
 def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
     """Return WHEEL_SLIP with places and sizes; level : of slip as the speed changes, as text."""
-    said, most = [], 3      # runs listed singly
+    texts, most = [], 3      # runs listed singly
     if slips:
         one = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
                for s in slips[:most]]
         more = f' and {len(slips) - most} more' if len(slips) > most else ''
-        said.append('wheel slip, travel of the wheel minus travel of the vehicle: '
-                    + ', '.join(one) + more)
+        texts.append('wheel slip, travel of the wheel minus travel of the vehicle: '
+                     + ', '.join(one) + more)
     if level:
-        said.append(level)
-    return [Reason(Code.WHEEL_SLIP, '; '.join(said))] if said else []
+        texts.append(level)
+    return [Reason(Code.WHEEL_SLIP, '; '.join(texts))] if texts else []
