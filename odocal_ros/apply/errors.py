@@ -149,8 +149,8 @@ class Errors:
         """
         H = np.zeros((3, N))
         H[:, BG] = np.eye(3)
-        off = rate_b**2 > FAULT_SIGMAS**2 * (np.diag(self.cov)[BG] + variance)
-        self.cov[BIASES, BIASES] += np.where(off, rate_b**2, 0.0)
+        is_inconsistent = rate_b**2 > FAULT_SIGMAS**2 * (np.diag(self.cov)[BG] + variance)
+        self.cov[BIASES, BIASES] += np.where(is_inconsistent, rate_b**2, 0.0)
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
     def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:

@@ -91,10 +91,10 @@ def covariances(from_errors: Floats, by_delay: Sequence[float], along_n: Sequenc
     sigma of the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
     """
     x, y, z = map(math.sqrt, variances)
-    off = np.array([[by_delay, (*along_n, *NONE[3:]), NONE, NONE],
-                    [twist_by_turn, (x, *NONE[1:]), (0.0, y, *NONE[2:]),
-                     (0.0, 0.0, z, *NONE[3:])]])
-    return [cov.tobytes() for cov in from_errors + off.swapaxes(1, 2) @ off]
+    effects = np.array([[by_delay, (*along_n, *NONE[3:]), NONE, NONE],
+                        [twist_by_turn, (x, *NONE[1:]), (0.0, y, *NONE[2:]),
+                         (0.0, 0.0, z, *NONE[3:])]])
+    return [cov.tobytes() for cov in from_errors + effects.swapaxes(1, 2) @ effects]
 
 
 def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:

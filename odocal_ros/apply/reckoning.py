@@ -132,11 +132,11 @@ class Reckoning:
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)      # a cubic needs the samples before and after
         rows = imu.rows[low:last + 2]
-        own = rows[at - low:-1]
+        path_rows = rows[at - low:-1]
         t, w = [row.t for row in rows], [add_scaled(row.w_b, self.bias, -1.0) for row in rows]
-        f = [add_scaled(row.f_b, self.accel_bias, -1.0) for row in own]
-        s = [self.wheels.at(row.t) for row in own]
-        gaps = [b.t - a.t for a, b in pairwise(own)]
+        f = [add_scaled(row.f_b, self.accel_bias, -1.0) for row in path_rows]
+        s = [self.wheels.at(row.t) for row in path_rows]
+        gaps = [b.t - a.t for a, b in pairwise(path_rows)]
         dropped_travel, self._s = abs(s[0] - self._s), s[-1]
         C_nb, turn_b, travel_n, dv_n = self._C_nb, ZERO, ZERO, ZERO
         forward_n, f_n = rotate_vector(C_nb, self._forward_b), rotate_vector(C_nb, f[0])
@@ -157,13 +157,13 @@ class Reckoning:
                         self.wheels.variance_between(self._t, t[-2]))
         self._turned_velocity_n = add_scaled(self._turned_velocity_n, cross(turn_n, travel_n),
                                              1 / T)
-        self._add_turn_variance([row.implausible for row in own[1:]], gaps)
+        self._add_turn_variance([row.implausible for row in path_rows[1:]], gaps)
         if dropped_travel > self.wheels.quantum:
             self.errors.add_travel(dropped_travel)
         is_plausible = self._implausible_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
         self._force_is_usable &= is_plausible and math.isfinite(sum(dv_n))
         self._turn_b = add_scaled(self._turn_b, turn_b)
-        self._rates += [row.w_b for row in own[1:]]
+        self._rates += [row.w_b for row in path_rows[1:]]
         self._t, imu.at = t[-2], last
 
     def _rotated_by(self, phi: Vector, T: float) -> Matrix:

@@ -125,10 +125,10 @@ class SpikeScreen:
             return ()
         steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
                  for one, other in pairwise((*kept, *rows))]
-        own = steps.pop(ROWS_BESIDE)
+        current_step = steps.pop(ROWS_BESIDE)
         least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
         return tuple(size > max(least, SINGLE_TIMES * max(other_steps))
-                     for size, *other_steps in zip(own, *steps, strict=True))
+                     for size, *other_steps in zip(current_step, *steps, strict=True))
 
     def _is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
@@ -202,10 +202,10 @@ def is_single(rows: Sequence[Row]) -> bool:
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
     for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
-        far = abs(b - (a + c) / 2)
-        if far > least and abs(c - a) < EQUAL_NEIGHBOURS * far:
+        deviation = abs(b - (a + c) / 2)
+        if deviation > least and abs(c - a) < EQUAL_NEIGHBOURS * deviation:
             x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
-            if all(far > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
+            if all(deviation > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
                    for i in range(1, len(x) - 1)):
                 return True
     return False

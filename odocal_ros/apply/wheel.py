@@ -131,8 +131,8 @@ class Wheel:
     def _take(self, t: float, value: float) -> None:
         if self._value is None:
             self._value = value
-            whole = isinstance(value, int) and self.form.quantity != 'rate'
-            self.quantum = abs(self.scale) if whole else 0.0
+            is_count = isinstance(value, int) and self.form.quantity != 'rate'
+            self.quantum = abs(self.scale) if is_count else 0.0
             self._add(t, 0.0)
             return
         before = self._value
@@ -226,9 +226,9 @@ class Wheel:
             self._add_variance(deviation**2)
         self._refused = 0
         if self.form.quantity != 'rate':
-            late = min(deviation / max(abs(self.speed), 1.0),
-                       LATEST_ROW * self._jitter + LATE_FLOOR)
-            self._jitter += (late - self._jitter) / JITTER_ROWS
+            lateness = min(deviation / max(abs(self.speed), 1.0),
+                           LATEST_ROW * self._jitter + LATE_FLOOR)
+            self._jitter += (lateness - self._jitter) / JITTER_ROWS
         change = (step / dt - self.speed) * min(1.0, dt / self._speed_time())
         self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
 

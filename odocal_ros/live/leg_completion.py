@@ -216,8 +216,8 @@ class LegCompletion:
         """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
         if self._close_by_ns is None:
             return
-        late = time.monotonic_ns() > self._close_by_ns
-        if late or self._recording.has_passed(self.session.stop_ns):
+        is_time_up = time.monotonic_ns() > self._close_by_ns
+        if is_time_up or self._recording.has_passed(self.session.stop_ns):
             self._close_by_ns = None
             self._journal.end()
             self._snapshot = self._recording.snapshot()

@@ -108,9 +108,9 @@ def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
     groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
-        near = difflib.get_close_matches(name, settings, 1, 0.8)
-        if name not in settings and (near or dot and group in groups):
-            mean = f': did you mean {near[0]}?' if near else ''
+        similar = difflib.get_close_matches(name, settings, 1, 0.8)
+        if name not in settings and (similar or dot and group in groups):
+            mean = f': did you mean {similar[0]}?' if similar else ''
             node.get_logger().warning(f'no parameter {name}{mean or "."} It is ignored.')
 
 

@@ -58,8 +58,8 @@ class SettledNode(Node):
 
     def _check_namesakes(self) -> None:
         """Log once if another node has the same name."""
-        own = self.get_name(), self.get_namespace()
-        if self.get_node_names_and_namespaces().count(own) > 1:
+        own_name = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count(own_name) > 1:
             self._namesake_timer.cancel()
             self.get_logger().warning(
                 f'another node is called {self.get_fully_qualified_name()}: services, parameters '

@@ -169,5 +169,5 @@ def _axle(rest: Sequence[str]) -> str:
 
 def _list_text(keys: Sequence[str]) -> str:
     most_shown = 12
-    more = len(keys) - most_shown
-    return ', '.join(keys[:most_shown]) + (f' and {more} more' if more > 0 else '')
+    hidden_count = len(keys) - most_shown
+    return ', '.join(keys[:most_shown]) + (f' and {hidden_count} more' if hidden_count > 0 else '')

@@ -82,9 +82,9 @@ def table(found: list[Row]) -> str:
         if row.value is None:
             lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
             continue
-        off = '' if row.sigmas_off is None else f'{row.sigmas_off:+z.1f} sigma'
+        error_text = '' if row.sigmas_off is None else f'{row.sigmas_off:+z.1f} sigma'
         lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<32}{_truth(row):<20}'
-                     f'{off:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
+                     f'{error_text:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
     return '\n'.join(lines)
 
 

@@ -243,9 +243,9 @@ def _findings(found: dict[str, Any]) -> list[str]:
     lines = []
     for only, title in ((None, 'before calibrating'), (
             'two_point', 'affects the two-point method only')):
-        some = [reason for reason in found['findings'] if reason['only'] == only]
-        lines += [title] * bool(some)
-        for reason in some:
+        reasons = [reason for reason in found['findings'] if reason['only'] == only]
+        lines += [title] * bool(reasons)
+        for reason in reasons:
             lines += wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}')
     return lines
 

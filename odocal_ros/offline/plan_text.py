@@ -65,10 +65,11 @@ def _head(before: Planned) -> list[str]:
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in before.methods:
         slip = 1000 * sigmas.slip
-        own = ' needs no heading;' if a.heading_source in ('course', 'gyrocompass') else ''
+        no_heading_text = ' needs no heading;' if a.heading_source in ('course',
+                                                                       'gyrocompass') else ''
         white = f'; white part of the fix errors {100 * WHITE_SHARE:.0f} %' if tau else ''
-        lines.append(f'smoother:{own} wheel slip {slip:.2g} mm/√s, sway {sigmas.sway:.2g} m/s '
-                     f'(white at {SWAY_RATE:g} Hz){white}')
+        lines.append(f'smoother:{no_heading_text} wheel slip {slip:.2g} mm/√s, sway '
+                     f'{sigmas.sway:.2g} m/s (white at {SWAY_RATE:g} Hz){white}')
     return lines
 
 

@@ -185,8 +185,8 @@ def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespa
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)
     if acceptance is None:
-        bad = [Verdict.REJECTED, *([Verdict.CAUTION] if config.accept.strict else [])]
-        return REJECTED if calibration.verdict in bad else OK
+        failing_verdicts = [Verdict.REJECTED, *([Verdict.CAUTION] if config.accept.strict else [])]
+        return REJECTED if calibration.verdict in failing_verdicts else OK
     if not (args.quiet or args.json):
         print_text('\n' + '\n'.join(accept_words(acceptance)))
     if not args.json:

@@ -133,8 +133,8 @@ def _grid_step(latitude: Floats) -> float | None:
     if len(steps) < 10 or np.median(steps) < 0.005:
         return None
     step = float(steps.min())
-    whole = np.abs(steps / step - np.round(steps / step)) < 0.02
-    return step if step > 0.005 and whole.mean() > 0.95 else None
+    is_multiple = np.abs(steps / step - np.round(steps / step)) < 0.02
+    return step if step > 0.005 and is_multiple.mean() > 0.95 else None
 
 
 @dataclass(frozen=True)
@@ -192,8 +192,8 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     t = (t_ns - t_ns[0]) * 1e-9
     geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[use]
     fixes_n = median_origin(t, geodetic).to_n(geodetic)
-    near = find_reachable(t, fixes_n)
-    t, t_ns, fixes_n = t[near], t_ns[near], fixes_n[near, :2]
+    reachable = find_reachable(t, fixes_n)
+    t, t_ns, fixes_n = t[reachable], t_ns[reachable], fixes_n[reachable, :2]
     path_length = path_and_chord(t, fixes_n)[0]
     if path_length == 0:
         return None

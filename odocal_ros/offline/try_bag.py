@@ -109,10 +109,10 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
     _, config = likely_mapping(bag.topics, config, topics, still)
     found = []
     for slot in mapping.keys() - topics.keys():
-        rest = other_candidates(bag.topics, slot, config, mapping, still)
-        if rest and mapping[slot] in candidates(bag.topics, slot, config, {}):
-            reason = reason_for_choice(bag.topics, slot, mapping[slot], rest[0], still)
-            found.append(_Choice(slot, mapping[slot], rest, reason))
+        remaining = other_candidates(bag.topics, slot, config, mapping, still)
+        if remaining and mapping[slot] in candidates(bag.topics, slot, config, {}):
+            reason = reason_for_choice(bag.topics, slot, mapping[slot], remaining[0], still)
+            found.append(_Choice(slot, mapping[slot], remaining, reason))
     return sorted(found, key=lambda choice: list(INPUTS).index(choice.slot))
 
 

@@ -66,11 +66,11 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.severity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
-        own = [r for name in estimating_methods
-               for r in relevant_reasons(methods[name].reasons, name, estimates)
-               if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
-               or name in on_border and r.code in COMBINED_CODES]
-        reasons += [r for r in (*own, *check_limits(estimates, nominal, config))
+        own_reasons = [r for name in estimating_methods
+                       for r in relevant_reasons(methods[name].reasons, name, estimates)
+                       if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
+                       or name in on_border and r.code in COMBINED_CODES]
+        reasons += [r for r in (*own_reasons, *check_limits(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))
     reasons += inconsistent_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in usable])
@@ -87,12 +87,12 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
 def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],
                                 before: Carried | None) -> Carried | None:
     """Return the marginal information of legs for later ones, None without any."""
-    whole = methods.get(SMOOTHER)
+    combined = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
-    if whole is None or whole.border is None or not times:
+    if combined is None or combined.border is None or not times:
         return None
-    return Carried(whole.border, whole.estimates['scale_factor'].unit,
+    return Carried(combined.border, combined.estimates['scale_factor'].unit,
                    before.first_ns if before else min(times), max(times),
                    len(times) + (before.legs if before else 0))
 
@@ -131,13 +131,13 @@ def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], 
     """Return a method's combination of the legs without rejection; of all if all have one."""
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
-    whole = combine_results(name, list(results), times_ns, config, numbers,
-                            carried if usable else None)
+    combined = combine_results(name, list(results), times_ns, config, numbers,
+                               carried if usable else None)
     if usable or len(results) == 1:
-        return whole
+        return combined
     rejections = dict.fromkeys(r for one in results for r in one.reasons
                                if r.code.severity is Verdict.REJECTED)
-    return replace(whole, reasons=(*whole.reasons, *rejections))
+    return replace(combined, reasons=(*combined.reasons, *rejections))
 
 
 def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
@@ -150,11 +150,11 @@ def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         methods = [leg.methods[name] for name in estimating_methods if name in leg.methods]
-        own = [*leg.reasons, *(r for m in methods
-                               for r in relevant_reasons(_additional_reasons(m, leg), m.name,
-                                                         estimates)
-                               if is_single or r.code not in SINGLE_LEG_CODES
-                               and not (m.border and r.code in COMBINED_CODES))]
+        own_reasons = [*leg.reasons, *(r for m in methods
+                                       for r in relevant_reasons(_additional_reasons(m, leg),
+                                                                 m.name, estimates)
+                                       if is_single or r.code not in SINGLE_LEG_CODES
+                                       and not (m.border and r.code in COMBINED_CODES))]
         if leg in overlapping:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
         elif usable and leg not in usable:
@@ -166,7 +166,7 @@ def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
             refused = [m for m in methods if usable and m.verdict is Verdict.REJECTED]
             reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
                                + _rejection_text(m.reasons)) for m in refused]
-            reasons += [replace(r, text=prefix + r.text) for r in own
+            reasons += [replace(r, text=prefix + r.text) for r in own_reasons
                         if not any(r in m.reasons for m in refused)
                         and not (refused and r.code is Code.METHOD_REJECTED)]
     return reasons
@@ -208,18 +208,18 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
                           for unit in units)
         return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
                        f'cannot be combined: {which}'),)
-    far = _significant_extremes(scales)
-    if far and (more := far[1].value / far[0].value - 1) > TYRE_SPREAD:
-        low, high = far
+    extremes = _significant_extremes(scales)
+    if extremes and (more := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
+        low, high = extremes
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
     yaws = _values_by_leg('yaw_mounting_angle', estimates)
     # of a reversed IMU they are near +-180 deg
-    far = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
-                                 for yaw in yaws])
+    extremes = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
+                                      for yaw in yaws])
     # rad, 5 deg: mountings bend less
-    if far and (more := far[1].value - far[0].value) > 0.087:
-        low, high = far
+    if extremes and (more := extremes[1].value - extremes[0].value) > 0.087:
+        low, high = extremes
         found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
                      f'that of leg {low.leg}')
     return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: larger than changes of one vehicle '

@@ -201,14 +201,16 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
     """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
     if not between.any():
         return between, ()
-    off = np.hypot(*track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))[:, :2].T)
-    usual = max(float(np.median(off[between])), prepared.fix_sigma)
+    residuals = track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
+    distances = np.hypot(*residuals[:, :2].T)
+    usual_distance = max(float(np.median(distances[between])), prepared.fix_sigma)
     track_outlier = 20.0    # times the usual distance from the track: a certain outlier
-    far = off > track_outlier * usual
+    is_outlier = distances > track_outlier * usual_distance
     found = (Reason(
-        Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes are '
-        f'more than {track_outlier * usual:.0f} m from the track; not used in the check'),)
-    return ~far, found if (far & between).any() else ()
+        Code.BAD_ROWS_DROPPED, f'{int((is_outlier & between).sum())} of {int(between.sum())} '
+        f'fixes are more than {track_outlier * usual_distance:.0f} m from the track; not used in '
+        'the check'),)
+    return ~is_outlier, found if (is_outlier & between).any() else ()
 
 
 def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
@@ -219,28 +221,30 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if start is None:
         return {}, ()
     t = prepared.track.t[::max(1, len(prepared.track.t) // KEPT_ROWS)]
-    more: dict[str, Any] = {
+    fields: dict[str, Any] = {
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}
     if not prepared.origin.local:       # else the position on the Earth is unknown
-        more |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
-                            prepared.origin.height)}
+        fields |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
+                              prepared.origin.height)}
     pin, between, path_length, found = _compared_section(prepared, after, start)
-    more['reference_n'] = prepared.fixes_n[between]
+    fields['reference_n'] = prepared.fixes_n[between]
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
-        return more, found
+        return fields, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    more |= {name: track_statistics(track_residuals(path, pin, fixes), path_length)
-             for name, path in (('before', before), ('after', after))}
+    fields |= {name: track_statistics(track_residuals(path, pin, fixes), path_length)
+               for name, path in (('before', before), ('after', after))}
     path_at = np.interp(fixes[0], *path_length_over_time(prepared))
     off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
-    more['per_distance'] = errors_per_distance(path_at, off_before, off_after)
-    kept, far = without_outliers(prepared, after, start, between)
-    found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)), *far)
-    seen = evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept, start,
-                    paths, prepared.config, prepared.t_fit, prepared.covered)
-    found += counter_change_reasons(seen.sections, seen.t_fix, seen.fix_distance)
-    return more | {'evidence': seen}, found
+    fields['per_distance'] = errors_per_distance(path_at, off_before, off_after)
+    kept, outlier_reasons = without_outliers(prepared, after, start, between)
+    found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)),
+              *outlier_reasons)
+    leg_evidence = evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
+                            start, paths, prepared.config, prepared.t_fit, prepared.covered)
+    found += counter_change_reasons(leg_evidence.sections, leg_evidence.t_fix,
+                                    leg_evidence.fix_distance)
+    return fields | {'evidence': leg_evidence}, found
 
 
 def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:

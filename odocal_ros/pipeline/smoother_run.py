@@ -85,8 +85,8 @@ def _attitude(prepared: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats
     t_key, C_nb = details['key_t'], details['key_C_nb']
     t, q_nb = attitude_of(prepared.inputs, prepared.origin, t_key[0], quat_from_matrix(C_nb[0]),
                           details['gyro_bias'])
-    off = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
-    return t, quat_multiply(quat_at(t, t_key, off), q_nb)
+    correction = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
+    return t, quat_multiply(quat_at(t, t_key, correction), q_nb)
 
 
 def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Path:

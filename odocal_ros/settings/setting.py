@@ -126,8 +126,9 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     settings = settings_of(type(config))
     for name, value in changes.items():
         if name not in settings:
-            near = difflib.get_close_matches(name, settings, 3, 0.5)
-            hint = f'did you mean {" or ".join(near)}?' if near else 'docs/settings.md lists all'
+            similar = difflib.get_close_matches(name, settings, 3, 0.5)
+            hint = (f'did you mean {" or ".join(similar)}?' if similar else
+                    'docs/settings.md lists all')
             raise BadConfig(f'no setting {name!r}; {hint}')
         group, _, leaf = name.rpartition('.')
         groups.setdefault(group, {})[leaf] = settings[name].checked(value)
