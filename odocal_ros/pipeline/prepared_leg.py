@@ -203,13 +203,12 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
         return between, ()
     residuals = track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
     distances = np.hypot(*residuals[:, :2].T)
-    usual_distance = max(float(np.median(distances[between])), prepared.fix_sigma)
+    usual_m = max(float(np.median(distances[between])), prepared.fix_sigma)
     track_outlier = 20.0    # times the usual distance from the track: a certain outlier
-    is_outlier = distances > track_outlier * usual_distance
+    is_outlier = distances > track_outlier * usual_m
     found = (Reason(
-        Code.BAD_ROWS_DROPPED, f'{int((is_outlier & between).sum())} of {int(between.sum())} '
-        f'fixes are more than {track_outlier * usual_distance:.0f} m from the track; not used in '
-        'the check'),)
+        Code.BAD_ROWS_DROPPED, f'{int((is_outlier & between).sum())} of {int(between.sum())} fixes '
+        f'are more than {track_outlier * usual_m:.0f} m from the track; not used in the check'),)
     return ~is_outlier, found if (is_outlier & between).any() else ()
 
 
