@@ -205,11 +205,11 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
     distances = np.hypot(*residuals[:, :2].T)
     usual_m = max(float(np.median(distances[between])), prepared.fix_sigma)
     track_outlier = 20.0    # times the usual distance from the track: a certain outlier
-    is_outlier = distances > track_outlier * usual_m
+    is_far = distances > track_outlier * usual_m
     found = (Reason(
-        Code.BAD_ROWS_DROPPED, f'{int((is_outlier & between).sum())} of {int(between.sum())} fixes '
+        Code.BAD_ROWS_DROPPED, f'{int((is_far & between).sum())} of {int(between.sum())} fixes '
         f'are more than {track_outlier * usual_m:.0f} m from the track; not used in the check'),)
-    return ~is_outlier, found if (is_outlier & between).any() else ()
+    return ~is_far, found if (is_far & between).any() else ()
 
 
 def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
