@@ -8,7 +8,6 @@ import errno
 import os
 
 from odocal_ros.bagio import segments
-from odocal_ros.output import folder
 from odocal_ros.safe_io import atomic_files
 
 
@@ -34,7 +33,7 @@ class Refusing:
 
     def put_in(self, monkeypatch) -> 'Refusing':
         """Take the place of the disk."""
-        for module in (atomic_files, segments, folder):
+        for module in (atomic_files, segments):
             monkeypatch.setattr(module, 'disk', self)
         return self
 

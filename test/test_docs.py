@@ -75,7 +75,7 @@ def printed(words, capfd, code=0):
 def undrawn(request, monkeypatch):
     """Draw the report for the README alone: that is half the time of a replay."""
     if 'README.md' not in request.node.name:
-        monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: ('', ''))
+        monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: ('', ''))
 
 
 @pytest.fixture(scope='module')
@@ -197,8 +197,8 @@ def test_the_figures_of_the_page_are_those_that_are_drawn():
     table = page_of('docs/report.md').partition('| figure |')[2].partition('\n\n')[0]
     told = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
     source = ''.join((ROOT / 'odocal_ros' / 'output' / name).read_text()
-                     for name in ('plots.py', 'plots_scale.py'))
-    drawn = re.findall(r"return '([^']+)', says", source)
+                     for name in ('plots.py', 'scale_plots.py'))
+    drawn = re.findall(r"return '([^']+)', text", source)
     assert told == drawn
     assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()
 

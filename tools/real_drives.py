@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 from odocal_ros.offline.cli import main as odocal
-from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.value_text import with_sigma
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'recordings.md'
@@ -103,11 +103,11 @@ def _stated(reference: dict[str, float]) -> str:
 def gallery(data: Path, pictures: Path) -> str:
     """Return the page of all drives in a folder; write a map of each."""
     from odocal_ros.library.export_pictures import map_figure
-    from odocal_ros.output.drawing import look, save_figure
+    from odocal_ros.output.plot_style import apply_style, save_figure
     page = GALLERY_HEAD
     for folder in sorted(path.parent for path in data.glob('*/truth.yaml')):
         said = io.StringIO()
-        with tempfile.TemporaryDirectory() as out, look():
+        with tempfile.TemporaryDirectory() as out, apply_style():
             with contextlib.redirect_stdout(said):
                 odocal(['try', str(folder / 'bag'), '--no-browser', '--output', out])
             shapes = json.loads((Path(out) / 'track.geojson').read_text(encoding='utf-8'))

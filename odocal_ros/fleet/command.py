@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.engine import dashboard, engine
     from odocal_ros.fleet.fleet_results import exit_code, run_settings, summary_text, write_outcome
     from odocal_ros.fleet.kpi import write_kpi
-    from odocal_ros.output.figures import counted
+    from odocal_ros.output.value_text import counted
     from odocal_ros.settings.config import Config, with_settings
     if not args.task_timeout > 0:
         raise BadUsage(f'--task-timeout {args.task_timeout:g}: required: seconds above 0')

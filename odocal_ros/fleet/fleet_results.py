@@ -26,7 +26,7 @@ from odocal_ros.fleet.bags import FleetBag, local_copy
 from odocal_ros.fleet.engine import task_results
 from odocal_ros.fleet.page import fleet_page, remarks
 from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
-from odocal_ros.output.figures import counted
+from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.atomic_files import locked, write_text
 from odocal_ros.safe_io.text_formats import for_table

@@ -20,7 +20,7 @@ from typing import Any
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.fleet.tables import LEGS, VALUES
-from odocal_ros.output.figures import table_row
+from odocal_ros.output.value_text import table_row
 from odocal_ros.pipeline.acceptance import decide_value, Decision
 from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.atomic_files import locked, write_text

@@ -21,10 +21,20 @@ from odocal_ros.fleet.tables import (
     LEGS,
     needs_inspection,
 )
-from odocal_ros.output.drawing import BLUE, evenly, GREEN, GREY, look, PINK, RED, sheet, svg
-from odocal_ros.output.figures import with_sigma
-from odocal_ros.output.report import rendered
+from odocal_ros.output.plot_style import (
+    apply_style,
+    BLUE,
+    even_rows,
+    GREEN,
+    GREY,
+    new_figure_column,
+    PINK,
+    RED,
+    svg,
+)
+from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
+from odocal_ros.output.value_text import with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
 MOST_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
@@ -35,7 +45,7 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
     """Return (svg, title, description) of each figure that has data."""
     drawn = []
-    with look():
+    with apply_style():
         for name in COMPARED:
             rows = [row for row in vehicles if row[name] is not None
                     and row[f'{COMPARED[name]}_deviate'] is not None]
@@ -49,7 +59,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
 def _population_figure(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Draw each vehicle's value against its model's median, one column a model."""
     models = sorted({row['model'] for row in rows})
-    figure, (ax,) = sheet(2.8)
+    figure, (ax,) = new_figure_column(2.8)
     is_scale, points = name == 'scale_factor', []
     for k, model in enumerate(models):
         same_model = [row for row in rows if row['model'] == model]
@@ -59,7 +69,7 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> tuple[str, str,
         median = np.median(x)
         deviation, error = ((x / median - 1) * 100, sigma / median * 100) if is_scale else (
             (x - median) * DEG, sigma * DEG)
-        keep = np.union1d(evenly(len(x), MOST_POINTS // len(models)), np.flatnonzero(outlier))
+        keep = np.union1d(even_rows(len(x), MOST_POINTS // len(models)), np.flatnonzero(outlier))
         position = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
         for which, colour in ((~outlier, BLUE), (outlier, RED)):
             shown = keep[which[keep]]
@@ -101,7 +111,7 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str
     points = _read_points(legs, set(base), set(named))
     if not points:
         return None
-    figure, (ax,) = sheet(3.4)
+    figure, (ax,) = new_figure_column(3.4)
     rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in points
                      if vehicle not in named]).reshape(-1, 2)
     ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
@@ -150,7 +160,7 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     """Return the page of a fleet with its rows in ``output``, the worst vehicle first."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     most_rows = 2000    # vehicles in the table
-    return rendered(
+    return render_page(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model(*kind, rows) for kind, rows in sorted(
             group_by_model(row for row in vehicles if row['legs']).items())],

@@ -22,8 +22,8 @@ from odocal_ros.fleet.statistics import covariance, History, history
 from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.rotations import wrap
-from odocal_ros.output.figures import accept_line, iso
 from odocal_ros.output.stored import known_imu
+from odocal_ros.output.value_text import accept_line, iso
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Reason, Verdict

@@ -55,7 +55,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     Raises BadUsage, BadBag, BadData, BadConfig: a bag cannot be read or used, or an argument is
     invalid.
     """
-    from odocal_ros.output.ros_files import framed
+    from odocal_ros.output.program_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
     collected = Notes(listener or Listener())

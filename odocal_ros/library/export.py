@@ -28,7 +28,7 @@ from odocal_ros.library.series import (
     states,
     trajectory,
 )
-from odocal_ros.output.drawing import PICTURES
+from odocal_ros.output.plot_style import PICTURES
 from odocal_ros.safe_io.atomic_files import whole_file
 
 RERUN = 'pip install rerun-sdk'

@@ -14,8 +14,8 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.calib.scale_variation import SpeedScale
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.series import Series
-from odocal_ros.output.drawing import BLUE, GREY, look, new_figure, RED, save_figure
-from odocal_ros.output.geojson import features
+from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure
+from odocal_ros.output.program_files import features
 
 POINTS = 400     # judgement: of a line or of the fixes, for a small file
 LOCAL = ('the positions are in a local frame, which has no place on a map; use trajectory.csv or '
@@ -33,7 +33,7 @@ def draw_map(result: Calibration, path: Path) -> None:
               for feature in features(number, leg, POINTS)]
     if not shapes:
         raise BadUsage(f'export: {path}: {LOCAL}')
-    with look():
+    with apply_style():
         save_figure(map_figure(shapes), path)
 
 
@@ -119,7 +119,7 @@ def scale_by_speed(result: Calibration) -> Series:
 
 def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
-    from odocal_ros.output.plots_scale import draw_by_speed, fit_text
+    from odocal_ros.output.scale_plots import draw_by_speed, fit_text
     most = 8     # legs in one picture, the newest
     found = _legs_with_speed_scale(result)[-most:]
     figure = new_figure(7.0, 3.2 * len(found))

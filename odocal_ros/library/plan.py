@@ -20,7 +20,7 @@ from odocal_ros.forecast.planned_methods import keyframe_spacing, Plan, plan_met
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.arguments import config_of, Settings
-from odocal_ros.output.figures import length, time_span
+from odocal_ros.output.value_text import length, time_span
 from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
 

@@ -22,8 +22,8 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import answers
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
-from odocal_ros.output.figures import iso
-from odocal_ros.output.stored import replacing, stored_in
+from odocal_ros.output.stored import objection_to_folder, stored_in
+from odocal_ros.output.value_text import iso
 from odocal_ros.safe_io.atomic_files import locked, new_folder
 from odocal_ros.settings.config import Config
 
@@ -62,7 +62,7 @@ class ResultFolders:
         with locked(folder.parent):         # another node may write there, too
             _remove_remains(folder.parent)
             before = _link_target(link)
-            reason = '' if force else replacing(stored_in(link), folder)
+            reason = '' if force else objection_to_folder(stored_in(link), folder)
             if reason:
                 return reason
             _set_link(link, folder.name)
@@ -205,7 +205,7 @@ class Filing:
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
         """Write files into a folder named by the time; return it, and why ``latest`` stays."""
         from odocal_ros.output.files import Results
-        from odocal_ros.output.ros_files import framed
+        from odocal_ros.output.program_files import framed
         calibration, config = framed(calibration, config, imu_frame)
         root = output_root(config, self._node)
         try:

@@ -23,7 +23,7 @@ from odocal_ros.live.messages import message_class
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input, StaticTransforms
-from odocal_ros.output.figures import iso
+from odocal_ros.output.value_text import iso
 from odocal_ros.safe_io.text_formats import for_shell, parameter_block
 from odocal_ros.settings.config import Config, flat
 

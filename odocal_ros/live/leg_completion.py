@@ -26,7 +26,7 @@ from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, SessionView, State
-from odocal_ros.output.figures import iso
+from odocal_ros.output.value_text import iso
 from odocal_ros.pipeline.floor_marks import settings_with_marks
 from odocal_ros.settings.config import Config
 

@@ -15,8 +15,8 @@ from odocal_ros.live import answers, worker
 from odocal_ros.live.filing import LATEST, output_root
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.session import Refused, State
-from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import Stored, stored_in
+from odocal_ros.output.value_text import iso
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITHIN
 from odocal_ros.reasons import Code

@@ -28,7 +28,7 @@ from odocal_ros.live.messages import LATCHED
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.live.worker import Paths
-from odocal_ros.output.figures import iso
+from odocal_ros.output.value_text import iso
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.text_formats import date_text

@@ -24,7 +24,7 @@ from std_msgs.msg import String
 
 from odocal_ros.forecast.forecast import PREDICTED_REST_S, three_digits
 from odocal_ros.live.messages import LATCHED
-from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.value_text import with_sigma
 from odocal_ros.safe_io.text_formats import brief_line
 
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}

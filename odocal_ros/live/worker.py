@@ -23,7 +23,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live import answers
 from odocal_ros.live.session import LEGS_HELD, MARKED_LEGS_HELD
-from odocal_ros.output.drawing import evenly
+from odocal_ros.output.plot_style import even_rows
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import add_to_carried, rejecting_reason
 from odocal_ros.pipeline.calibrate import calibrate_parts, combine
@@ -114,7 +114,7 @@ def _path(track_n: Floats | None, header: Header) -> PathMessage:
     return PathMessage(header=header, poses=[
         PoseStamped(header=header, pose=Pose(
             position=Point(x=float(x), y=float(y), z=float(z)), orientation=upright))
-        for x, y, z in track_n[evenly(len(track_n), MOST_POSES)]])
+        for x, y, z in track_n[even_rows(len(track_n), MOST_POSES)]])
 
 
 class Worker:

@@ -18,8 +18,8 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.cli import print_text, warn
-from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
+from odocal_ros.output.value_text import with_sigma
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
-    from odocal_ros.output.figures import columns, counted
-    from odocal_ros.output.stored import said as value_text
+    from odocal_ros.output.stored import estimate_text as value_text
+    from odocal_ros.output.value_text import columns, counted
     stored = found.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '

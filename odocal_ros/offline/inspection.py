@@ -26,8 +26,8 @@ from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import inspect_drive, missing_input_reasons
 from odocal_ros.offline.suggest import likely_mapping, replay_command, replay_refusal
 from odocal_ros.offline.survey import fix_path, FixPath, Match
-from odocal_ros.output.figures import counted
 from odocal_ros.output.files import plain
+from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import is_impossible
 from odocal_ros.screening.leg_kind import settings_by_frame

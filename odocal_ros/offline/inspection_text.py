@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output.figures import counted, wrapped
+from odocal_ros.output.value_text import counted, wrapped
 from odocal_ros.safe_io.text_formats import for_shell, one_line
 
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',

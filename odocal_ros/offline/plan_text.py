@@ -10,8 +10,8 @@ from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
-from odocal_ros.output.figures import length, share, table_row, time_span, wrapped
 from odocal_ros.output.tables import budget_lines
+from odocal_ros.output.value_text import length, share, table_row, time_span, wrapped
 
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 

@@ -153,15 +153,15 @@ def _terminal_size(stream: Any) -> tuple[int, int | None]:
 
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
-    from odocal_ros.output.stored import replacing, stored_in
+    from odocal_ros.output.stored import objection_to_folder, stored_in
     screen = _Screen(args)
     existing = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
                       calibration.created)
-    with results.said_when_interrupted():
+    with results.name_results_when_interrupted():
         with screen.phase('writing the results'):
             written = results.write(args.force)
-        if worse := replacing(existing, output):
+        if worse := objection_to_folder(existing, output):
             screen.note(f'{output}: --force replaced a better calibration: {worse}')
         write_error = None if args.quiet or args.json else _show(calibration.result, args)
         with screen.phase('drawing the report'):
@@ -180,7 +180,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.output.figures import accept_line, accept_words
+    from odocal_ros.output.value_text import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)

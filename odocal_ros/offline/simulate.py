@@ -267,7 +267,7 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
 
 
 def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
-    from odocal_ros.output.figures import iso
+    from odocal_ros.output.value_text import iso
     last = drives[-1].truth
     return {
         'vehicle': vehicle.name, 'model': vehicle.model.name,

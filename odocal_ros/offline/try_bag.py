@@ -159,7 +159,7 @@ def _user_options(args: argparse.Namespace) -> list[str]:
 def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
               own_settings: Collection[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
-    from odocal_ros.output.figures import wrapped
+    from odocal_ros.output.value_text import wrapped
     because = {choice.slot: f', because {choice.reason}; other candidates: '
                f'{", ".join(choice.other_candidates)} ({topic_option(choice.slot)})'
                for choice in choices}

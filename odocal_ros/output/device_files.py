@@ -11,8 +11,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.output.figures import counted, inverse, known, with_sigma
 from odocal_ros.output.summary import sentence
+from odocal_ros.output.value_text import counted, inverse, known, with_sigma
 from odocal_ros.safe_io.text_formats import for_comment, one_line, parameter_block
 from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
 from odocal_ros.settings.levels import INFORMED_SHARE
@@ -202,8 +202,8 @@ def _table(noise: 'TwistNoise') -> str:
         for name, column in (('x', 0), ('y', 1), ('yaw', 3)) if column < 3 or noise.has_turn_rate}
         for k, rate in enumerate(rates)}
     return parameter_block({'period': float(f'{noise.period:.4g}'),
-                       'speed': [float(f'{v:.3g}') for v in speeds], **rows},
-                      'wheel_odometry_covariance')
+                            'speed': [float(f'{v:.3g}') for v in speeds], **rows},
+                           'wheel_odometry_covariance')
 
 
 def imu_errors(calibration: Calibration, config: Config,

@@ -16,11 +16,11 @@ import numpy as np
 from odocal_ros import __version__
 from odocal_ros.calib.result import Calibration, LegResult, MethodResult, TrackCheck
 from odocal_ros.errors import BadUsage
-from odocal_ros.output import ros_files
-from odocal_ros.output.folder import ResultFolder
-from odocal_ros.output.report import NAME as REPORT, report_or_why
+from odocal_ros.output import program_files
+from odocal_ros.output.report import NAME as REPORT, report_or_error_page
 from odocal_ros.output.tables import in_pieces, overall
 from odocal_ros.pipeline.acceptance import accept
+from odocal_ros.safe_io.atomic_files import ResultFolder
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1    # format: version of calibration.json
@@ -41,7 +41,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     Returns plain dicts and lists, no NaN: a missing number is None.
     """
     result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
-                    for name, unit in ALWAYS.items()}
+                              for name, unit in ALWAYS.items()}
     result |= {name: e.as_dict() | {'method': e.method or None}
                for name, e in calibration.estimates.items()}
     giving = calibration.methods.get(result['scale_factor']['method'])
@@ -128,10 +128,10 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
     Raises KeyboardInterrupt: its text names the written results, if any.
     """
     results = Results(calibration, config, directory, inputs, created)
-    with results.said_when_interrupted():
+    with results.name_results_when_interrupted():
         written = results.write(force)
-        if why := results.draw():
-            tell(f'{results.report[0]}: could not be drawn: {why}')
+        if cause := results.draw():
+            tell(f'{results.report[0]}: could not be drawn: {cause}')
     return written + results.report
 
 
@@ -148,14 +148,14 @@ class Results:
         self.has_report = 'report' in config.output.formats
         self.report = [self.directory / REPORT] * self.has_report
         self.folder = ResultFolder(self.directory, MAIN,
-                                   frozenset(ros_files.NAMES | {MAIN, REPORT}))
-        self._of = calibration, config, as_json(calibration, config, inputs, created)
+                                   frozenset(program_files.NAMES | {MAIN, REPORT}))
+        self._arguments = calibration, config, as_json(calibration, config, inputs, created)
 
     def write(self, force: bool = False) -> list[Path]:
         """Write all but the report; return the paths."""
-        texts = {MAIN: json.dumps(self._of[2], indent=2, allow_nan=False) + '\n'}
-        texts |= ros_files.texts(*self._of)
-        with self._said():
+        texts = {MAIN: json.dumps(self._arguments[2], indent=2, allow_nan=False) + '\n'}
+        texts |= program_files.texts(*self._arguments)
+        with self._bad_usage_for_disk():
             self.folder.put(texts, force)
         return [self.directory / name for name in texts]
 
@@ -163,13 +163,13 @@ class Results:
         """Add the report, if requested; return why it cannot be drawn."""
         if not self.has_report:
             return ''
-        page, why = report_or_why(*self._of)
-        with self._said():
+        page, cause = report_or_error_page(*self._arguments)
+        with self._bad_usage_for_disk():
             self.folder.add(REPORT, page)
-        return why
+        return cause
 
     @contextmanager
-    def _said(self) -> Iterator[None]:
+    def _bad_usage_for_disk(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -178,7 +178,7 @@ class Results:
                 'that can (--output, or output.directory of the node)') from None
 
     @contextmanager
-    def said_when_interrupted(self) -> Iterator[None]:
+    def name_results_when_interrupted(self) -> Iterator[None]:
         """Let an interruption name the written results, if any."""
         try:
             yield

@@ -11,61 +11,60 @@ import numpy as np
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output import drawing
-from odocal_ros.output.plots_scale import by_speed, by_window
+from odocal_ros.output import plot_style as style
+from odocal_ros.output.scale_plots import by_speed, by_window
 
-PAUSE = {'no fix used': drawing.PINK, 'no IMU': drawing.RED, 'no odometer': drawing.GREEN}
-STATUS = {-1: ('no fix (-1)', 'x', drawing.GREY), 0: ('fix (0)', 'o', drawing.BLUE),
-          1: ('satellite based aid, SBAS (1)', 's', drawing.GREEN),
-          2: ('ground based aid, GBAS or RTK (2)', '^', drawing.PINK)}
+PAUSE = {'no fix used': style.PINK, 'no IMU': style.RED, 'no odometer': style.GREEN}
+STATUS = {-1: ('no fix (-1)', 'x', style.GREY), 0: ('fix (0)', 'o', style.BLUE),
+          1: ('satellite based aid, SBAS (1)', 's', style.GREEN),
+          2: ('ground based aid, GBAS or RTK (2)', '^', style.PINK)}
 
 
-def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
+def leg_figures(evidence: Evidence, name: str, scale_sigma: float | None = None,
                 before_word: str = 'as configured',
-                smoothed: dict[str, Any] | None = None) -> list[drawing.Drawing]:
+                smoothed: dict[str, Any] | None = None) -> list[style.Drawing]:
     """
     Draw a leg.
 
-    found : of the leg.   name : prefix of the ids of each figure.   scale_sigma : relative sigma
-    of the leg's scale: the band about zero of the sections.   before_word : label of the track
-    before the correction.   smoothed : details of the smoother: slips, and biases at its
-    keyframes.
+    name : prefix of the ids of each figure.   scale_sigma : relative sigma of the leg's scale: the
+    band about zero of the sections.   before_word : label of the track before the correction.
+    smoothed : details of the smoother: slips, and biases at its keyframes.
 
     Returns (title, description, svg element) of each figure; to be called under
-    ``drawing.look``.
+    ``plot_style.apply_style``.
     """
-    if not len(found.t):
+    if not len(evidence.t):
         return []
     smoothed = smoothed or {}
-    figures = [_track(found, name, before_word, smoothed.get('slips', ()))]
-    if len(found.t_fix):
-        figures.append(_residuals(found, name, before_word))
-    if np.isfinite(found.sections.ratio).any():
-        figures.append(_sections(found, name, scale_sigma))
-    if len(found.by_speed.bins):
-        figures.append(by_speed(found.by_speed, name))
-    if len(found.by_window):
-        figures.append(by_window(found.by_window, name))
-    figures.append(_motion(found, name))
-    if len(found.t_fix) or len(found.t_excluded):
-        figures.append(_fixes(found, name))
+    figures = [_track(evidence, name, before_word, smoothed.get('slips', ()))]
+    if len(evidence.t_fix):
+        figures.append(_residuals(evidence, name, before_word))
+    if np.isfinite(evidence.sections.ratio).any():
+        figures.append(_sections(evidence, name, scale_sigma))
+    if len(evidence.by_speed.bins):
+        figures.append(by_speed(evidence.by_speed, name))
+    if len(evidence.by_window):
+        figures.append(by_window(evidence.by_window, name))
+    figures.append(_motion(evidence, name))
+    if len(evidence.t_fix) or len(evidence.t_excluded):
+        figures.append(_fixes(evidence, name))
     if np.any(smoothed.get('key_biases', 0.0)):
         figures.append(_biases(smoothed['key_t'], smoothed['key_biases'], name))
     return figures
 
 
-def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
+def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
                slips: list[dict[str, float]] | tuple[Any, ...] = ()) -> None:
     """Draw on axes the track as configured and as calibrated over the fixes."""
-    start = found.track_n[0]
-    factor, unit = drawing.lengths(np.ptp(found.track_n[:, :2], axis=0).max())
+    start = evidence.track_n[0]
+    factor, unit = style.length_unit(np.ptp(evidence.track_n[:, :2], axis=0).max())
     after, before, fixes = (factor * (x - start)[:, :2] for x in (
-        found.track_n, found.track_before_n, found.fix_n))
-    few = drawing.evenly(len(fixes))
+        evidence.track_n, evidence.track_before_n, evidence.fix_n))
+    few = style.even_rows(len(fixes))
     ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
-    ax.plot(*before[drawing.thinned(before)].T, '--', color=drawing.RED, label=before_word,
+    ax.plot(*before[style.peak_rows(before)].T, '--', color=style.RED, label=before_word,
             linewidth=1.2)
-    ax.plot(*after[drawing.thinned(after)].T, '-', color=drawing.BLUE, label='as calibrated')
+    ax.plot(*after[style.peak_rows(after)].T, '-', color=style.BLUE, label='as calibrated')
     ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
     ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
     middle = after.mean(axis=0)
@@ -74,171 +73,173 @@ def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
         side, up = np.where(point < middle, -1, 1)
         ax.annotate(word, point, xytext=(7 * side, 6 * up), textcoords='offset points',
                     ha='right' if side < 0 else 'left', va='top' if up < 0 else 'bottom')
-    _marks(ax, found, lambda t: np.stack([np.interp(t, found.t, x) for x in after.T]), slips)
-    axes = ('x from', 'y from') if (found.fix_status == LOCAL).any() else ('east of', 'north of')
+    _marks(ax, evidence, lambda t: np.stack([np.interp(t, evidence.t, x) for x in after.T]), slips)
+    is_local = (evidence.fix_status == LOCAL).any()
+    axes = ('x from', 'y from') if is_local else ('east of', 'north of')
     ax.set(xlabel=f'{axes[0]} the start, {unit}', ylabel=f'{axes[1]} the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.06)
 
 
-def _track(found: Evidence, name: str, before_word: str,
+def _track(evidence: Evidence, name: str, before_word: str,
            slips: list[dict[str, float]] | tuple[Any, ...]) -> tuple[str, str, str]:
-    figure, (ax,) = drawing.sheet(5.2)
-    draw_track(ax, found, before_word, slips)
-    drawing.key(figure, ax)
-    says = ('Dead reckoning over the fixes. Both tracks start at the start mark; the calibrated '
+    figure, (ax,) = style.new_figure_column(5.2)
+    draw_track(ax, evidence, before_word, slips)
+    style.add_legend(figure, ax)
+    text = ('Dead reckoning over the fixes. Both tracks start at the start mark; the calibrated '
             'track should cover the fixes.')
-    return 'Track', says, drawing.svg(figure, f'{name}-track', says)
+    return 'Track', text, style.svg(figure, f'{name}-track', text)
 
 
-def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
+def _marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
            slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
     """Mark unused fixes, gaps, slips and the end of the fit on the track."""
-    few = found.t_excluded[drawing.evenly(len(found.t_excluded))]
+    few = evidence.t_excluded[style.even_rows(len(evidence.t_excluded))]
     if len(few):
-        ax.plot(*at(few), '.', color=drawing.GREY, markersize=3, zorder=4, label='fix not used')
-    step = np.diff(found.t_fix)
+        ax.plot(*at(few), '.', color=style.GREY, markersize=3, zorder=4, label='fix not used')
+    step = np.diff(evidence.t_fix)
     gap = 5.0    # median intervals between fixes: more is marked
-    gaps = [('no fix used', found.t_fix[k], found.t_fix[k + 1]) for k in np.flatnonzero(
+    gaps = [('no fix used', evidence.t_fix[k], evidence.t_fix[k + 1]) for k in np.flatnonzero(
         step > max(gap * np.median(step), 1.0))] if len(step) else []
-    gaps += [(f'no {name}', begin, end) for name, begin, end in found.gaps]
-    said = set()
+    gaps += [(f'no {name}', begin, end) for name, begin, end in evidence.gaps]
+    labelled = set()
     for label, begin, end in gaps:
-        ends = np.clip((begin, end), found.t[0], found.t[-1])
+        ends = np.clip((begin, end), evidence.t[0], evidence.t[-1])
         ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=PAUSE[label], linewidth=4,
-                alpha=0.6, zorder=1, solid_capstyle='butt', label=None if label in said else label)
+                alpha=0.6, zorder=1, solid_capstyle='butt',
+                label=None if label in labelled else label)
         if label != 'no fix used':       # its ends also show short ones
             ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
-        said.add(label)
-    if found.t_fit < found.t[-1]:
-        ax.plot(*at(np.array([found.t_fit])), 'D', color='black', markersize=6,
-                markerfacecolor=drawing.PINK, zorder=5, label='fitted to here')
+        labelled.add(label)
+    if evidence.t_fit < evidence.t[-1]:
+        ax.plot(*at(np.array([evidence.t_fit])), 'D', color='black', markersize=6,
+                markerfacecolor=style.PINK, zorder=5, label='fitted to here')
     if len(slips):
         ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
-                markersize=6, markerfacecolor=drawing.GREEN, zorder=5, label='slip')
+                markersize=6, markerfacecolor=style.GREEN, zorder=5, label='slip')
 
 
-def draw_residuals(ax: Any, found: Evidence) -> None:
+def draw_residuals(ax: Any, evidence: Evidence) -> None:
     """Draw on axes dead reckoning minus fix along and across, as calibrated."""
-    factor, unit = drawing.lengths(found.distance[-1])
-    path_length = factor * found.fix_distance
-    _band(ax, path_length, found.fix_sigma)
-    rows = drawing.thinned(found.residual)
-    for column, colour, word in zip(found.residual.T, (drawing.BLUE, drawing.RED),
+    factor, unit = style.length_unit(evidence.distance[-1])
+    path_length = factor * evidence.fix_distance
+    _band(ax, path_length, evidence.fix_sigma)
+    rows = style.peak_rows(evidence.residual)
+    for column, colour, word in zip(evidence.residual.T, (style.BLUE, style.RED),
                                     ('along', 'across'), strict=True):
         ax.plot(path_length[rows], column[rows], '-', color=colour, linewidth=0.9, label=word)
     ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning minus fix, m')
 
 
 def _band(ax: Any, path_length: Floats, sigma: Floats) -> None:
-    band = drawing.evenly(len(path_length))
-    ax.fill_between(path_length[band], -sigma[band], sigma[band], color=drawing.BAND, linewidth=0,
+    band = style.even_rows(len(path_length))
+    ax.fill_between(path_length[band], -sigma[band], sigma[band], color=style.BAND, linewidth=0,
                     label='± sigma of a fix')
-    ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
+    ax.axhline(0.0, color=style.GREY, linewidth=0.8)
     for edge in (-sigma[band], sigma[band]):      # visible through noise in the band
         ax.plot(path_length[band], edge, '--', color='black', linewidth=0.6)
 
 
-def _residuals(found: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
-    factor, unit = drawing.lengths(found.distance[-1])
-    path_length = factor * found.fix_distance
-    figure, axes = drawing.sheet(5.2, 3)
-    rows = drawing.thinned(found.residual)
-    for ax, column, word in zip(axes, found.residual.T, ('along', 'across'), strict=False):
-        _band(ax, path_length, found.fix_sigma)
-        ax.plot(path_length[rows], column[rows], '-', color=drawing.BLUE, linewidth=0.9,
+def _residuals(evidence: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
+    factor, unit = style.length_unit(evidence.distance[-1])
+    path_length = factor * evidence.fix_distance
+    figure, axes = style.new_figure_column(5.2, 3)
+    rows = style.peak_rows(evidence.residual)
+    for ax, column, word in zip(axes, evidence.residual.T, ('along', 'across'), strict=False):
+        _band(ax, path_length, evidence.fix_sigma)
+        ax.plot(path_length[rows], column[rows], '-', color=style.BLUE, linewidth=0.9,
                 label='as calibrated')
         ax.set_ylabel(f'{word}, m')
-    rows = drawing.thinned(found.residual_before)
-    for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
+    rows = style.peak_rows(evidence.residual_before)
+    for column, dash, word in zip(evidence.residual_before.T, ('--', ':'), ('along', 'across'),
                                   strict=True):
-        axes[2].plot(path_length[rows], column[rows], dash, color=drawing.RED, linewidth=1.3,
+        axes[2].plot(path_length[rows], column[rows], dash, color=style.RED, linewidth=1.3,
                      label=f'{before_word}, {word}')
-    axes[2].axhline(0.0, color=drawing.GREY, linewidth=0.8)
+    axes[2].axhline(0.0, color=style.GREY, linewidth=0.8)
     axes[2].set(xlabel=f'distance driven, {unit}', ylabel=f'{before_word}, m')
     axes[2].legend(loc='lower center', bbox_to_anchor=(0.5, 0.97), ncols=2, borderaxespad=0.0)
     figure.subplots_adjust(hspace=0.24)
-    drawing.key(figure, axes[0])
+    style.add_legend(figure, axes[0])
     figure.align_ylabels(axes)
-    says = ('Dead reckoning minus fix. Along > 0: ahead of the fix; across > 0: left of the fix. '
+    text = ('Dead reckoning minus fix. Along > 0: ahead of the fix; across > 0: left of the fix. '
             'A slope along indicates a scale error, a curve across a heading drift.')
-    return 'Residuals', says, drawing.svg(figure, f'{name}-residuals', says)
+    return 'Residuals', text, style.svg(figure, f'{name}-residuals', text)
 
 
-def _sections(found: Evidence, name: str, scale_sigma: float | None) -> tuple[str, str, str]:
-    part = found.sections
-    factor, unit = drawing.lengths(found.distance[-1])
+def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> tuple[str, str, str]:
+    part = evidence.sections
+    factor, unit = style.length_unit(evidence.distance[-1])
     middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
     off = part.ratio - 1
-    times, word = drawing.relative(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
-    figure, (ax,) = drawing.sheet(2.7)
+    times, word = style.relative_unit(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
+    figure, (ax,) = style.new_figure_column(2.7)
     if scale_sigma:
-        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=drawing.BAND, linewidth=0,
+        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=style.BAND, linewidth=0,
                    label='± sigma of the result')
-    ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
-    ax.hlines(off * times, middle - half, middle + half, color=drawing.BLUE, linewidth=1.1)
-    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=drawing.BLUE,
+    ax.axhline(0.0, color=style.GREY, linewidth=0.8)
+    ax.hlines(off * times, middle - half, middle + half, color=style.BLUE, linewidth=1.1)
+    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=style.BLUE,
                 markersize=4.5, capsize=3, linewidth=1.1, label='section, ± its sigma')
     ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale minus result, {word}')
-    ax.set_xlim(0.0, factor * found.distance[-1])
-    drawing.key(figure, ax)
-    says = ('Length from the fixes divided by the calibrated dead-reckoned length, in sections '
+    ax.set_xlim(0.0, factor * evidence.distance[-1])
+    style.add_legend(figure, ax)
+    text = ('Length from the fixes divided by the calibrated dead-reckoned length, in sections '
             'of equal path length. Bars: one sigma of the fixes. Slip, an odometer delay (at '
             'starts and stops) or bad fixes appear as outlier sections. Bars do not include fix '
             'errors that change more slowly than a section.')
-    return 'Scale by section', says, drawing.svg(figure, f'{name}-sections', says)
+    return 'Scale by section', text, style.svg(figure, f'{name}-sections', text)
 
 
-def _motion(found: Evidence, name: str) -> tuple[str, str, str]:
-    figure, (upper, lower) = drawing.sheet(3.6, 2)
-    for ax, x in ((upper, 3.6 * found.speed), (lower, np.rad2deg(found.yaw_rate))):
-        rows = drawing.thinned(x)
-        ax.plot(found.t[rows], x[rows], '-', color=drawing.BLUE, linewidth=1.0)
-        ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
+def _motion(evidence: Evidence, name: str) -> tuple[str, str, str]:
+    figure, (upper, lower) = style.new_figure_column(3.6, 2)
+    for ax, x in ((upper, 3.6 * evidence.speed), (lower, np.rad2deg(evidence.yaw_rate))):
+        rows = style.peak_rows(x)
+        ax.plot(evidence.t[rows], x[rows], '-', color=style.BLUE, linewidth=1.0)
+        ax.axhline(0.0, color=style.GREY, linewidth=0.8)
     upper.set_ylabel('speed, km/h')
     lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')
     figure.align_ylabels([upper, lower])
-    says = ('Speed from the calibrated odometer (negative: reversing) and turn rate from the '
+    text = ('Speed from the calibrated odometer (negative: reversing) and turn rate from the '
             'gyro (positive: left), averaged over one second.')
-    return 'Speed and turn rate', says, drawing.svg(figure, f'{name}-motion', says)
+    return 'Speed and turn rate', text, style.svg(figure, f'{name}-motion', text)
 
 
-def _fixes(found: Evidence, name: str) -> tuple[str, str, str]:
-    figure, (ax,) = drawing.sheet(2.7)
-    for status in np.unique(found.fix_status):
-        rows = np.flatnonzero(found.fix_status == status)
-        rows = rows[drawing.evenly(len(rows), drawing.MOST_MARKS // 2)]
-        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', drawing.GREY))
-        ax.plot(found.t_fix[rows], found.fix_sigma[rows], shape, color=colour, markersize=3.5,
-                markeredgewidth=0 if shape != 'x' else 1, label=label)
-    rows = drawing.evenly(len(found.t_excluded))
+def _fixes(evidence: Evidence, name: str) -> tuple[str, str, str]:
+    figure, (ax,) = style.new_figure_column(2.7)
+    for status in np.unique(evidence.fix_status):
+        rows = np.flatnonzero(evidence.fix_status == status)
+        rows = rows[style.even_rows(len(rows), style.MOST_MARKS // 2)]
+        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', style.GREY))
+        ax.plot(evidence.t_fix[rows], evidence.fix_sigma[rows], shape, color=colour,
+                markersize=3.5, markeredgewidth=0 if shape != 'x' else 1, label=label)
+    rows = style.even_rows(len(evidence.t_excluded))
     if len(rows):
-        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), '.', color=drawing.GREY, markersize=3,
-                clip_on=False, zorder=5, label='not used')
+        ax.plot(evidence.t_excluded[rows], np.zeros(len(rows)), '.', color=style.GREY,
+                markersize=3, clip_on=False, zorder=5, label='not used')
     ax.set(xlabel='time since the start mark, s', ylabel='sigma of a fix, m')
-    top = float(found.fix_sigma.max(initial=0.0))
+    top = float(evidence.fix_sigma.max(initial=0.0))
     ax.set_ylim(0.0, 1.25 * top if top else 1.0)
-    drawing.key(figure, ax)
-    says = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
+    style.add_legend(figure, ax)
+    text = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
             'Dots at the bottom: fixes not used.')
-    return 'Fix quality', says, drawing.svg(figure, f'{name}-fixes', says)
+    return 'Fix quality', text, style.svg(figure, f'{name}-fixes', text)
 
 
 def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
     # without an accelerometer its bias is zero throughout
     shown = [one for one in zip(biases, (np.rad2deg(3600.0), 1e3), (
         'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True) if np.any(one[0])]
-    figure, axes = drawing.sheet(1.8 * len(shown), len(shown))
+    figure, axes = style.new_figure_column(1.8 * len(shown), len(shown))
     for ax, (columns, factor, word) in zip(axes, shown, strict=True):
         for column, colour, dash, axis in zip(
-                columns.T, (drawing.BLUE, drawing.RED, drawing.GREEN), ('-', '--', ':'), 'xyz',
+                columns.T, (style.BLUE, style.RED, style.GREEN), ('-', '--', ':'), 'xyz',
                 strict=True):
-            rows = drawing.thinned(column)
+            rows = style.peak_rows(column)
             ax.plot(t[rows], factor * column[rows], dash, color=colour, linewidth=1.2, label=axis)
         ax.set_ylabel(word)
     axes[-1].set_xlabel('time since the start mark, s')
-    drawing.key(figure, axes[0])
+    style.add_legend(figure, axes[0])
     figure.align_ylabels(axes)
-    says = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '
+    text = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '
             'a step, or a drift far beyond the grade, indicates a fault.')
-    return 'Biases', says, drawing.svg(figure, f'{name}-biases', says)
+    return 'Biases', text, style.svg(figure, f'{name}-biases', text)

@@ -12,10 +12,10 @@ from typing import Any
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.drawing import Drawing, look
-from odocal_ros.output.figures import known, length, shared, time_span
+from odocal_ros.output.plot_style import apply_style, Drawing
 from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
+from odocal_ros.output.value_text import join_same_reasons, known, length, time_span
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -34,16 +34,16 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
 
     Raises ImportError: matplotlib or jinja2 is missing.
     """
-    legs, compared, missing = _drawn(calibration)
+    legs, compared, missing = _draw_figures(calibration)
     # the first track is shown next to the verdict instead
     first = legs[0]['figures'][:1] if legs else []
     if first:
         legs[0]['figures'] = legs[0]['figures'][1:]
-    return rendered('output', NAME, legs=legs, compared=compared, missing=missing, first=first,
-                    **_context(calibration, config, content))
+    return render_page('output', NAME, legs=legs, compared=compared, missing=missing,
+                       first=first, **_context(calibration, config, content))
 
 
-def rendered(room: str, name: str, **content: Any) -> str:
+def render_page(room: str, name: str, **content: Any) -> str:
     """Return the page of a template in ``templates`` of a package, with the style of reports."""
     from jinja2 import Environment, StrictUndefined
     home = files('odocal_ros')
@@ -54,8 +54,8 @@ def rendered(room: str, name: str, **content: Any) -> str:
     return template.render(style=style, **content) + '\n'
 
 
-def report_or_why(calibration: Calibration, config: Config,
-                  content: dict[str, Any]) -> tuple[str, str]:
+def report_or_error_page(calibration: Calibration, config: Config,
+                         content: dict[str, Any]) -> tuple[str, str]:
     """
     Return the page, and the reason if it cannot be drawn, else empty.
 
@@ -64,17 +64,17 @@ def report_or_why(calibration: Calibration, config: Config,
     try:
         return report_html(calibration, config, content), ''
     except ImportError as error:
-        why = f'{error.name or error} cannot be imported; install matplotlib and jinja2'
+        cause = f'{error.name or error} cannot be imported; install matplotlib and jinja2'
     except Exception as error:     # noqa: BLE001 the numbers are written in any case
-        why = f'{type(error).__name__}: {error}; please report it'
+        cause = f'{type(error).__name__}: {error}; please report it'
     return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>No report</title>'
-            f'</head><body><p>The report could not be drawn: {escape(why)}. All numbers are in '
-            'calibration.json.</p></body></html>\n', why)
+            f'</head><body><p>The report could not be drawn: {escape(cause)}. All numbers are in '
+            'calibration.json.</p></body></html>\n', cause)
 
 
 def _context(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, Any]:
     legs = calibration.legs
-    methods = _leading(calibration.methods, calibration.estimates)
+    methods = _by_number_of_values(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
         'title': content['vehicle'] or ', '.join(bags) or 'live drive',
@@ -84,7 +84,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'driven': driven(legs),
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
-        'why': _why(calibration.reasons), 'rotation': rotation_text(calibration),
+        'why': _main_reason(calibration.reasons), 'rotation': rotation_text(calibration),
         'reasons': grouped(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
         'inputs': content['inputs'],
@@ -93,7 +93,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'digits': tables.full_digits(content)}
 
 
-def _why(reasons: tuple[Reason, ...]) -> Reason | None:
+def _main_reason(reasons: tuple[Reason, ...]) -> Reason | None:
     """Return the most severe reason against acceptance, or None; those on a value first."""
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
@@ -103,13 +103,13 @@ def _why(reasons: tuple[Reason, ...]) -> Reason | None:
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
-    groups = [(v.value, title, [r for r in shared(reasons) if r.code.severity is v])
+    groups = [(v.value, title, [r for r in join_same_reasons(reasons) if r.code.severity is v])
               for v, title in TITLES.items()]
     return [group for group in groups if group[2]]
 
 
-def _leading(methods: dict[str, MethodResult],
-             estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
+def _by_number_of_values(methods: dict[str, MethodResult],
+                         estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
     """Return methods in order of the number of values that the result has from them."""
     given = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
@@ -128,19 +128,20 @@ def _budgets(methods: dict[str, MethodResult]) -> list[tuple[str, dict[str, Any]
     return [(name, table) for name, table in found if table]
 
 
-def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
+def _draw_figures(
+        calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
     """
     Return the content of each leg, the figure of all legs, and the legs without figures.
 
     If figures exceed MOST_BYTES, only those of the newest legs are shown.
     """
     from odocal_ros.output.plots import leg_figures
-    from odocal_ros.output.plots_scale import compared
+    from odocal_ros.output.scale_plots import comparison_figure
     numbered, size = list(enumerate(calibration.legs, 1)), 0
     figures: dict[int, list[Drawing]] = {}
     shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]
-    with look():
-        together = compared(calibration, 'all')
+    with apply_style():
+        together = comparison_figure(calibration, 'all')
         for number, leg, evidence in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
             if figures and size > MOST_BYTES:
                 break
@@ -159,7 +160,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
 
 def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> dict[str, Any]:
     rows, findings = tables.left_out(leg)
-    methods = _leading(leg.methods, leg_estimates(leg))
+    methods = _by_number_of_values(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
             'start': _utc(leg.start_ns), 'stop': _utc(leg.stop_ns), 'figures': figures,
             'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),

@@ -11,7 +11,8 @@ import numpy as np
 
 from odocal_ros.calib import result
 from odocal_ros.output import tables
-from odocal_ros.output.figures import (
+from odocal_ros.output.summary import DEG, DEG_PER_HOUR
+from odocal_ros.output.value_text import (
     beyond_one,
     COUNTS,
     inverse,
@@ -21,7 +22,6 @@ from odocal_ros.output.figures import (
     two_digits,
     with_sigma,
 )
-from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 from odocal_ros.calib.border import Carried, carried_from
 from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
-from odocal_ros.output.figures import with_sigma, with_unit
 from odocal_ros.output.files import MAIN, plain, SCHEMA
+from odocal_ros.output.value_text import with_sigma, with_unit
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.limits import read_bytes
 from odocal_ros.settings.config import Config, flat
@@ -180,7 +180,7 @@ def _shares(methods: dict[str, dict[str, Any]], method: str | None,
             and math.isfinite(row[parameter])}
 
 
-def is_worse(old: Stored, new: Stored) -> str:
+def objection(old: Stored, new: Stored) -> str:
     """
     Return the objection to replacing an old calibration silently, empty without one.
 
@@ -210,18 +210,18 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
     if old is None or old.value is None or not old.sigma:
         return ''
     if new is None or new.value is None:
-        return f'the new result has no {label}, the old one has {said(old)}'
+        return f'the new result has no {label}, the old one has {estimate_text(old)}'
     clearly = 2.0    # times the sigma: four times as many such legs would be needed
     larger = (new.sigma or 0.0) / old.sigma
     if old.unit != 'rad' and new.value:      # relative: the vehicles may differ
         larger *= abs(old.value / new.value)
     if new.unit == old.unit and larger > clearly:
         return (f'the uncertainty of the {label} is {larger:.1f} times larger: '
-                f'{said(new)}, the old result has {said(old)}')
+                f'{estimate_text(new)}, the old result has {estimate_text(old)}')
     return ''
 
 
-def said(estimate: Estimate) -> str:
+def estimate_text(estimate: Estimate) -> str:
     """Return a value with sigma and unit as text; angles in deg."""
     if estimate.unit == 'rad':
         return with_sigma(estimate.value, estimate.sigma, math.degrees(1.0), signed=True) + ' deg'
@@ -236,7 +236,7 @@ def stored_in(folder: Path) -> Stored | None:
         return None
 
 
-def replacing(old: Stored | None, new: Path) -> str:
-    """Return ``is_worse`` of a calibration and a result folder, empty without either."""
+def objection_to_folder(old: Stored | None, new: Path) -> str:
+    """Return ``objection`` of a calibration and a result folder, empty without either."""
     found = stored_in(new)
-    return is_worse(old, found) if old and found else ''
+    return objection(old, found) if old and found else ''

@@ -12,8 +12,7 @@ import numpy as np
 from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, PLANAR
 from odocal_ros.output import tables
-from odocal_ros.output.figures import (
-    bag_lines,
+from odocal_ros.output.value_text import (
     beyond_one,
     columns,
     counted,
@@ -21,6 +20,7 @@ from odocal_ros.output.figures import (
     inverse,
     known,
     length,
+    lines_of_bags,
     reason_lines,
     share,
     time_span,
@@ -253,7 +253,7 @@ def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     if width < WIDTH:        # without the date, the duration and the number of fixes
         rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
                 for row in rows]
-    return columns(rows) + bag_lines(legs, width) if legs else []
+    return columns(rows) + lines_of_bags(legs, width) if legs else []
 
 
 def _method_table(calibration: result.Calibration) -> list[str]:

@@ -20,7 +20,7 @@ from odocal_ros.calib.result import (
     TrackCheck,
     wheel_factors,
 )
-from odocal_ros.output.figures import iso, known, length, table_row, two_digits
+from odocal_ros.output.value_text import iso, known, length, table_row, two_digits
 from odocal_ros.pipeline.combination import overlapping_legs
 from odocal_ros.reasons import Verdict, verdict_of
 from odocal_ros.safe_io.text_formats import for_table

@@ -19,7 +19,7 @@ def picture_of(args: argparse.Namespace) -> Path | None:
     """Return the file to draw into, None without --plot; check that it can be drawn."""
     if args.plot is None:
         return None
-    from odocal_ros.output.drawing import PICTURES  # it imports numpy: not for help
+    from odocal_ros.output.plot_style import PICTURES  # it imports numpy: not for help
     path = Path(args.plot)
     if path.suffix.lower() not in PICTURES:
         raise BadUsage(f'--plot {path}: required: a name that ends in {", ".join(PICTURES)}')

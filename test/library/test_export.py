@@ -18,7 +18,7 @@ from odocal_ros import OdocalError
 from odocal_ros.library.export import KNOWN
 from odocal_ros.library.export_pictures import map_figure
 from odocal_ros.offline.cli import main
-from odocal_ros.output.geojson import features
+from odocal_ros.output.program_files import features
 
 
 @pytest.fixture(scope='module')

@@ -81,7 +81,7 @@ def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
 
 def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_path, monkeypatch):
     gate, worker, done = threading.Event(), filing.worker, []
-    monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: (
+    monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: (
         gate.wait(20), ('<html></html>', ''))[1])
     filing.save(GOOD, tmp_path)
     assert (tmp_path / 'latest' / 'calibration.json').exists()
@@ -135,7 +135,7 @@ def make(tmp_path, monkeypatch):
     """Return a function that makes a result folder; a folder named bad is worse than others."""
     monkeypatch.setattr(module, 'stored_in',
                         lambda path: path.resolve().name if path.exists() else None)
-    monkeypatch.setattr(module, 'replacing', lambda old, new: (
+    monkeypatch.setattr(module, 'objection_to_folder', lambda old, new: (
         'it is rejected' if old and 'bad' not in old and 'bad' in new.name else ''))
 
     def folder(name):
@@ -157,7 +157,7 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
         automatic, usable = of.get(path.resolve().name, (False, False))
         return SimpleNamespace(config={'leg.automatic': automatic}, usable=usable)
     monkeypatch.setattr(module, 'stored_in', stored)
-    monkeypatch.setattr(module, 'replacing',
+    monkeypatch.setattr(module, 'objection_to_folder',
                         lambda old, new: '' if of[new.name][1] else 'it is rejected')
     folders = ResultFolders()
     for day, made in enumerate([(False, True), *[(True, True)] * 3, *[(True, False)] * 4], 1):

@@ -23,7 +23,7 @@ from odocal_ros.live.odometry import transform_of
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.output.files import as_json
-from odocal_ros.output.ros_files import texts
+from odocal_ros.output.program_files import texts
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.settings.node_configs import OdomFrames
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -15,7 +15,7 @@ import pytest
 from odocal_ros.live import answers
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import PATIENCE_S
-from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.value_text import with_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate

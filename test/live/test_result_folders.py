@@ -24,8 +24,8 @@ OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1
         'from faults import obey_permissions; obey_permissions()\n')
 # a report that takes as long as that of a long leg on a busy machine
 SLOW = ('import odocal_ros.output.files as f\n'
-        'draw = f.report_or_why\n'
-        'f.report_or_why = lambda *a: [draw(*a) for _ in range(60)][-1]\n')
+        'draw = f.report_or_error_page\n'
+        'f.report_or_error_page = lambda *a: [draw(*a) for _ in range(60)][-1]\n')
 
 
 @pytest.fixture(scope='module')

@@ -14,7 +14,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.live import worker
 from odocal_ros.live.session import LEGS_HELD, Refused, Session, State
 from odocal_ros.output.files import as_json
-from odocal_ros.output.geojson import geojson
+from odocal_ros.output.program_files import geojson
 from odocal_ros.output.report import report_html
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Reason

@@ -67,8 +67,8 @@ def test_the_two_point_method_waits_for_nothing_it_does_not_use(bag, tmp_path):
 
 def test_the_verdict_does_not_wait_for_the_report(drive, bag, tmp_path, monkeypatch, capsys):
     warnings = []
-    given = files.report_or_why
-    monkeypatch.setattr(files, 'report_or_why',
+    given = files.report_or_error_page
+    monkeypatch.setattr(files, 'report_or_error_page',
                         lambda *args: warnings.append(capsys.readouterr().out) or given(*args))
     assert replay(bag, *known(drive), '--method', 'two_point', '--output', tmp_path / 'out',
                   '--set', 'output.formats=[params, report]') == 0

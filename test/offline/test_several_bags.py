@@ -151,8 +151,9 @@ def interrupted(*_, **__):
 
 @pytest.mark.parametrize(('where', 'last_line'), [
     ('odocal_ros.pipeline.calibrate.combine', 'odocal: interrupted, nothing written\n'),
-    ('odocal_ros.output.folder._which', 'odocal: interrupted, nothing written\n'),
-    ('odocal_ros.output.files.report_or_why', 'the results are in {out}/, report.html is not\n'),
+    ('odocal_ros.safe_io.atomic_files._identity', 'odocal: interrupted, nothing written\n'),
+    ('odocal_ros.output.files.report_or_error_page',
+     'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.screen', 'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.sentence', 'the results are in {out}/\n')])
 def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where,

@@ -16,7 +16,7 @@ from odocal_ros.calib.result import (
     Source,
     TrackCheck,
 )
-from odocal_ros.output import ros_files
+from odocal_ros.output import program_files
 from odocal_ros.output.files import as_json
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
@@ -31,7 +31,7 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])    # Rz(-9
 def texts(calibration, **changes):
     """Return the files for other programs by name; changes of settings as group__name."""
     config = with_settings(Config(), {k.replace('__', '.'): v for k, v in changes.items()})
-    return ros_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
+    return program_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
 
 
 def with_estimates(calibration, **changed):

@@ -16,9 +16,8 @@ from faults import Refusing
 import pytest
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.output import folder as module
-from odocal_ros.output.folder import ResultFolder
 from odocal_ros.safe_io import atomic_files
+from odocal_ros.safe_io.atomic_files import ResultFolder
 
 MAIN, OURS = 'main.json', frozenset({'main.json', 'a.txt', 'b.txt', 'late.html'})
 
@@ -196,7 +195,7 @@ def test_a_kill_leaves_one_result_or_none_and_the_next_clears_away(tmp_path, for
 def test_without_an_exchange_in_one_step_it_is_done_in_two(tmp_path, monkeypatch):
     class Old:
         renameat2 = None
-    monkeypatch.setattr(module.ctypes, 'CDLL', lambda *_, **__: Old)
+    monkeypatch.setattr(atomic_files.ctypes, 'CDLL', lambda *_, **__: Old)
     put(tmp_path / 'out', 'one')
     put(tmp_path / 'out', 'two')
     assert held(tmp_path / 'out') == texts('two')
@@ -210,12 +209,12 @@ def test_without_an_exchange_in_one_step_it_is_done_in_two(tmp_path, monkeypatch
 
 def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
     put(tmp_path / 'out', 'one')
-    swap = module._swap
+    swap = atomic_files._swap
 
     def interrupted(*paths):
         os.kill(os.getpid(), signal.SIGINT)
         swap(*paths)
-    monkeypatch.setattr(module, '_swap', interrupted)
+    monkeypatch.setattr(atomic_files, '_swap', interrupted)
     # a shell's background jobs have it ignored
     signal.signal(signal.SIGINT, signal.default_int_handler)
     one = ResultFolder(tmp_path / 'out', MAIN, OURS)

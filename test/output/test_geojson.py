@@ -14,7 +14,7 @@ import pytest
 
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output.files import as_json
-from odocal_ros.output.geojson import geojson, MOST, TRACK
+from odocal_ros.output.program_files import geojson, MOST_TRACK_POINTS as MOST, TRACK
 from odocal_ros.output.tables import leg_table
 from odocal_ros.settings.config import Config
 

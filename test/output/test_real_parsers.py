@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.output import ros_files
+from odocal_ros.output import program_files
 from odocal_ros.safe_io.text_formats import yaml_number
 
 SIZES = {'wheels__pulses_per_revolution': 60.0, 'odometer__nominal_scale': 0.04,
@@ -111,7 +111,7 @@ def test_without_a_yaw_there_is_no_transform(good):
 
 
 def test_every_file_written_is_known_for_removal(smoothed):
-    assert set(texts(smoothed)) == ros_files.NAMES
+    assert set(texts(smoothed)) == program_files.NAMES
 
 
 @pytest.mark.parametrize('value', [1e-5, 1e22, -3e-7, 0.1, 0.0, 1.0, -123456.789])

@@ -19,12 +19,12 @@ import pytest
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, MethodResult, Source
 from odocal_ros.calib.scale_variation import Sections, SpeedScale
-from odocal_ros.output import plots_scale, report
-from odocal_ros.output.drawing import look
+from odocal_ros.output import report, scale_plots
 from odocal_ros.output.files import as_json, write_results
+from odocal_ros.output.plot_style import apply_style
 from odocal_ros.output.plots import _biases, leg_figures
-from odocal_ros.output.plots_scale import by_speed, by_window
-from odocal_ros.output.report import report_html, report_or_why
+from odocal_ros.output.report import report_html, report_or_error_page
+from odocal_ros.output.scale_plots import by_speed, by_window
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.slow
@@ -229,7 +229,7 @@ def test_names_from_outside_are_text_not_markup(good):
 def test_what_is_odd_is_marked_on_the_track(good):
     def words(found):
         smoothed = {'slips': [{'t': 50.0, 'duration': 1.0}]}
-        with look():
+        with apply_style():
             return unescape(leg_figures(found, 'one', smoothed=smoothed)[0][2])
     plain = evidence()
     odd = replace(plain, gaps=(('IMU', 100.0, 103.0), ('odometer', 200.0, 201.0),
@@ -246,7 +246,7 @@ def test_what_is_odd_is_marked_on_the_track(good):
 
 def test_many_legs_stay_within_the_size(good, monkeypatch):
     # room for the figures of one leg and a half
-    one = sum(len(drawing) for leg in report._drawn(drawn(good))[0]
+    one = sum(len(drawing) for leg in report._draw_figures(drawn(good))[0]
               for *_, drawing in leg['figures'])
     monkeypatch.setattr(report, 'MOST_BYTES', 3 * one // 2)
     leg = replace(good.legs[0], evidence=evidence())
@@ -255,15 +255,16 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
     assert 'figures of the newest legs only, none of legs 1, 2.' in text
     # one alone is shown however large it is: the newest
     monkeypatch.setattr(report, 'MOST_BYTES', 10)
-    told, _, missing = report._drawn(replace(good, legs=legs))
+    told, _, missing = report._draw_figures(replace(good, legs=legs))
     assert [bool(leg['figures']) for leg in told] == [False, False, True]
     assert missing == [1, 2]
 
 
 def test_of_many_legs_the_newest_are_side_by_side(good, monkeypatch):
-    monkeypatch.setattr(plots_scale, 'MOST_LEGS', 2)
-    with look():
-        (_, says, drawing), = plots_scale.compared(replace(good, legs=good.legs[:1] * 3), 'all')
+    monkeypatch.setattr(scale_plots, 'MOST_LEGS', 2)
+    with apply_style():
+        result = replace(good, legs=good.legs[:1] * 3)
+        (_, says, drawing), = scale_plots.comparison_figure(result, 'all')
     assert 'Of 3 legs, the newest 2.' in says
     assert [f'leg {k}, two' in drawing for k in (1, 2, 3)] == [False, True, True]
 
@@ -296,7 +297,7 @@ def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error)
     assert (tmp_path / 'calibration.json').exists()
     assert len(told) == 1
     assert 'report.html: could not be drawn' in told[0]
-    page, why = report_or_why(good, Config(), {})
+    page, why = report_or_error_page(good, Config(), {})
     assert 'calibration.json' in page
     assert '<odd>' not in page
     assert why in told[0]
@@ -375,18 +376,18 @@ def test_the_four_most_important_values_stand_under_the_verdict_of_a_result(good
 def test_the_scale_against_speed_is_drawn_with_its_fit(good):
     bins = np.array([[5.0, 1.01, 1e-3, 12], [15.0, 0.99, 1e-3, 12]])
     found = SpeedScale(bins, (0.98, 1e-3), (0.14, 0.02), (-0.35, 0.03))
-    with look():
+    with apply_style():
         title, says, drawn = by_speed(found, 'leg1')
     assert title == 'Scale against speed'
     assert 'the odometer reads 0.140 ± 0.020 m/s low and is 0.350 ± 0.030 s earlier' in says
     assert drawn.startswith('<svg')
-    with look():
+    with apply_style():
         assert 'No fit: the speed varies too little' in by_speed(SpeedScale(bins), 'leg1')[1]
 
 
 def test_the_scale_against_the_length_of_the_window_is_drawn():
     found = np.array([[2.0, 4e-3, 1e-3, 300], [20.0, 1e-3, 1e-3, 30], [200.0, 0.0, 1e-3, 12]])
-    with look():
+    with apply_style():
         title, says, drawn = by_window(found, 'leg1')
     assert title == 'Scale against the length of the window'
     assert 'the fixes contain an odometer' in says
@@ -395,7 +396,7 @@ def test_the_scale_against_the_length_of_the_window_is_drawn():
 
 def test_a_panel_without_data_is_not_drawn():
     biases = np.stack([np.full((5, 3), 1e-4), np.zeros((5, 3))])
-    with look():
+    with apply_style():
         assert 'accelerometer bias' not in _biases(np.arange(5.0), biases, 'leg1')[2]
         biases[1] += 0.01
         assert 'accelerometer bias' in _biases(np.arange(5.0), biases, 'leg1')[2]

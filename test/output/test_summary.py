@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
-from odocal_ros.output.figures import beyond_one, length, shared, time_span, with_sigma
 from odocal_ros.output.summary import screen, sentence
 from odocal_ros.output.tables import budget_lines, overall
+from odocal_ros.output.value_text import (
+    beyond_one,
+    join_same_reasons,
+    length,
+    time_span,
+    with_sigma,
+)
 from odocal_ros.reasons import Code, Reason
 
 pytestmark = pytest.mark.core
@@ -196,7 +202,7 @@ def test_what_many_legs_say_in_other_figures_is_one_reason(good):
     reasons = [Reason(Code.LEG_TOO_SHORT, f'leg {n}: {60 + n} m between the marks')
                for n in range(1, 36) if n not in (4, 30)]
     reasons += [Reason(Code.WHEEL_SLIP, f'leg {n}: slip of {n} m') for n in (2, 9)]
-    told = [r.text for r in shared((*reasons, GAP))]
+    told = [r.text for r in join_same_reasons((*reasons, GAP))]
     assert told == ['legs 1 to 3, 5 to 29 and 31 to 35; of leg 1: 61 m between the marks',
                     'leg 2: slip of 2 m', 'leg 9: slip of 9 m', GAP.text]
 

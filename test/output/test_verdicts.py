@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from odocal_ros.output import report_tables
-from odocal_ros.output.figures import shared
 from odocal_ros.output.files import as_json
 from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
 from odocal_ros.output.tables import leg_verdicts, shown_verdict
+from odocal_ros.output.value_text import join_same_reasons
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
@@ -83,6 +83,6 @@ def test_what_several_legs_share_is_said_once():
     slip, dead = Code.WHEEL_SLIP, Code.WHEEL_DEAD
     said = ((slip, 'leg 1: it spun'), (slip, 'leg 3: it spun'), (slip, 'leg 2: it slid'),
             (slip, 'it spun'), (dead, 'leg 2: it spun'), (slip, 'leg 4: it spun'))
-    assert [(r.code, r.text) for r in shared(tuple(Reason(*one) for one in said))] == [
+    assert [(r.code, r.text) for r in join_same_reasons(tuple(Reason(*one) for one in said))] == [
         (slip, 'legs 1, 3 and 4: it spun'), (slip, 'leg 2: it slid'), (slip, 'it spun'),
         (dead, 'leg 2: it spun')]

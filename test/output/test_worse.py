@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output.files import write_results
-from odocal_ros.output.stored import is_worse, read_stored, replacing, stored_in
+from odocal_ros.output.stored import objection, objection_to_folder, read_stored, stored_in
 from odocal_ros.settings.config import Config
 
 
@@ -20,9 +20,9 @@ def why(tmp_path):
     def run(old, new):
         for name, one in (('old', old), ('new', new)):
             write_results(one, Config(), tmp_path / name, [], CREATED, force=True)
-        assert is_worse(read_stored(tmp_path / 'old'), read_stored(tmp_path / 'new')) \
-            == replacing(stored_in(tmp_path / 'old'), tmp_path / 'new')
-        return replacing(stored_in(tmp_path / 'old'), tmp_path / 'new')
+        assert objection(read_stored(tmp_path / 'old'), read_stored(tmp_path / 'new')) \
+            == objection_to_folder(stored_in(tmp_path / 'old'), tmp_path / 'new')
+        return objection_to_folder(stored_in(tmp_path / 'old'), tmp_path / 'new')
     return run
 
 
@@ -78,8 +78,8 @@ def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):
     why(good, good)
     (tmp_path / 'old' / 'calibration.json').write_text('{}')
     assert stored_in(tmp_path / 'old') is stored_in(tmp_path / 'gone') is None
-    assert replacing(None, tmp_path / 'new') == ''
-    assert replacing(stored_in(tmp_path / 'new'), tmp_path / 'gone') == ''
+    assert objection_to_folder(None, tmp_path / 'new') == ''
+    assert objection_to_folder(stored_in(tmp_path / 'new'), tmp_path / 'gone') == ''
 
 
 def test_a_result_of_the_method_wheels_is_read_and_replaced(why, good):

@@ -14,9 +14,9 @@ import yaml
 
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import BadConfig
-from odocal_ros.output import ros_files
+from odocal_ros.output import program_files
 from odocal_ros.output.files import as_json
-from odocal_ros.output.ros_files import framed
+from odocal_ros.output.program_files import framed
 from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.reasons import Code
 from odocal_ros.safe_io import atomic_files, text_formats
@@ -44,7 +44,7 @@ def texts(frame='imu_link', bag='drive', config=None):
     made, config = framed(calibration(), config or Config(), frame)
     inputs = [{'bag': bag, 'sha256': None, 'topics': {}}]
     content = as_json(made, config, inputs, '2026-01-02T03:04:05+00:00')
-    return made, ros_files.texts(made, config, content)
+    return made, program_files.texts(made, config, content)
 
 
 @pytest.mark.parametrize('frame', ATTACKS)

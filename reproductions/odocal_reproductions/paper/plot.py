@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_reproductions.paper.tables import PaperTables
-from odocal_ros.output.drawing import new_figure, save_figure
+from odocal_ros.output.plot_style import new_figure, save_figure
 
 # Okabe and Ito's colours, distinguishable with colour blindness
 STYLES = {'phi_U0': ('#0072B2', '-'), 'all': ('#000000', '--'), 'eps_z': ('#D55E00', '-'),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_reproductions.patent.embodiment import Embodiment, LEVELS, RADIUS_STEP
-from odocal_ros.output.drawing import new_figure, save_figure
+from odocal_ros.output.plot_style import new_figure, save_figure
 
 # marker and colour (Okabe and Ito) by the first words of a line's name
 MARKS = {'printed as best': ('*', '#D55E00'), 'printed': ('x', 'black'),

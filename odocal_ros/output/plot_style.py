@@ -23,7 +23,7 @@ GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, description, SVG
 MOST_POINTS = 1200   # judgement: of a line
 MOST_MARKS = 400     # judgement: of single marks
-LOOK: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
     'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
     'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
@@ -33,15 +33,15 @@ PICTURES = ('.png', '.svg', '.pdf')
 
 
 @contextmanager
-def look() -> Iterator[None]:
+def apply_style() -> Iterator[None]:
     """Apply the style while figures are made and written."""
     from matplotlib import rc_context
-    with rc_context(LOOK):
+    with rc_context(STYLE):
         yield
 
 
-def sheet(height: float, rows: int = 1, sharex: bool = True,
-          heights: list[float] | None = None) -> tuple[Any, NDArray[Any]]:
+def new_figure_column(height: float, rows: int = 1, sharex: bool = True,
+                      heights: list[float] | None = None) -> tuple[Any, NDArray[Any]]:
     """Return a figure of ``height`` inch and its axes in a column, of relative ``heights``."""
     from matplotlib.figure import Figure
     width = 5.6    # inch
@@ -54,19 +54,19 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
     return figure, axes
 
 
-def key(figure: Any, axes: Any) -> None:
+def add_legend(figure: Any, axes: Any) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,
                       handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
 
 
-def svg(figure: Any, name: str, says: str) -> str:
+def svg(figure: Any, name: str, description: str) -> str:
     """
     Return a figure as an svg element.
 
-    figure : made under ``look``.   name : prefix of each id: a page has many figures.
-    says : text alternative.
+    figure : made under ``apply_style``.   name : prefix of each id: a page has many figures.
+    description : text alternative.
     """
     from html import escape
 
@@ -82,10 +82,10 @@ def svg(figure: Any, name: str, says: str) -> str:
     text = re.sub(r'((?:xlink:)?href="|url\()#', rf'\1#{name}-', text)
     head, _, rest = text.partition('>')
     box = re.findall(r'viewBox="[^"]*"', head)[0]
-    return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
+    return f'<svg {box} role="img" aria-label="{escape(description, quote=True)}">{rest}'
 
 
-def thinned(y: Floats) -> Ints:
+def peak_rows(y: Floats) -> Ints:
     """
     Return row numbers of a line that keep its peaks and both ends: (m,) int.
 
@@ -104,18 +104,18 @@ def thinned(y: Floats) -> Ints:
     return np.array(sorted(keep))
 
 
-def evenly(n: int, most: int = MOST_MARKS) -> Ints:
+def even_rows(n: int, most: int = MOST_MARKS) -> Ints:
     """Return at most ``most`` row numbers of n, both ends included: (m,) int."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else \
         np.empty(0, int)
 
 
-def lengths(metres: float) -> tuple[float, str]:
+def length_unit(metres: float) -> tuple[float, str]:
     """Return the factor and the unit for lengths up to ``metres``."""
     return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
 
 
-def relative(most: float) -> tuple[float, str]:
+def relative_unit(most: float) -> tuple[float, str]:
     """Return the factor and the unit for relative values up to ``most``."""
     return (100.0, '%') if most > 0.005 else (1e6, 'ppm')
 

@@ -138,7 +138,7 @@ def table_row(cells: Sequence[str], widths: Sequence[int]) -> str:
     return f'  {name}{"".join(numbers)}'
 
 
-def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
+def join_same_reasons(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     """Return reasons; those of several legs that differ only in the leg are joined."""
     joined: dict[tuple[Any, ...], list[str]] = {}
     for reason in reasons:
@@ -179,7 +179,7 @@ def _legs(numbers: list[str]) -> str:
     return f'legs {", ".join(said[:-1])} and {said[-1]}' if len(said) > 1 else f'legs {said[0]}'
 
 
-def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
+def lines_of_bags(legs: tuple[LegResult, ...], width: int) -> list[str]:
     """Return the text that lists the legs of each bag, empty for a single bag."""
     of_bag: dict[str, list[str]] = {}
     for number, leg in enumerate(legs, 1):
@@ -195,7 +195,7 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[s
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
                            (Verdict.ACCEPTED, 'notes')):
-        found = [r for r in shared(reasons) if r.code.severity is verdict]
+        found = [r for r in join_same_reasons(reasons) if r.code.severity is verdict]
         if brief and found and verdict is Verdict.ACCEPTED:
             codes = ', '.join(dict.fromkeys(r.code.name for r in found))
             lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)
