@@ -22,8 +22,7 @@ import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Estimate, Source
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_row, by_step
+from odocal_ros.data.arrays import by_row, by_step, Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import A

@@ -20,9 +20,8 @@ from odocal_ros.calib.scale_variation import (
     SpeedScale,
     window_scale,
 )
-from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
+from odocal_ros.data.arrays import Bools, by_row, chunks, Complexes, Floats, Ints
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer

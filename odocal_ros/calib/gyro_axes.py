@@ -17,8 +17,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.track_check import ONE_MOTION_RATIO
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_row
+from odocal_ros.data.arrays import by_row, Floats
 from odocal_ros.nav.geodesy import GNSS_MOVES
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.time_series import gaps_longer, integral_at, twice_integral_at

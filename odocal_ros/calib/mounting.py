@@ -9,8 +9,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from odocal_ros.data.arrays import Complexes, Floats
-from odocal_ros.data.pieces import medians
+from odocal_ros.data.arrays import Complexes, Floats, medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason

@@ -23,8 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.pieces import by_row
+from odocal_ros.data.arrays import Bools, by_row, Floats, Ints
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel

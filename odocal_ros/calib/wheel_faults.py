@@ -36,8 +36,7 @@ from odocal_ros.calib.wheel_pair_regression import (
     WHOLE_DRIVE_SIGMAS,
     without_gyro_drift,
 )
-from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.arrays import Bools, Floats, runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import robust_sigma

@@ -13,8 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import robust_fit, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH

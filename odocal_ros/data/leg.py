@@ -14,9 +14,8 @@ from typing import Any, final
 import numpy as np
 
 from odocal_ros.data import samples as kinds
-from odocal_ros.data.arrays import Ints
+from odocal_ros.data.arrays import by_row, Ints, runs
 from odocal_ros.data.inputs import INPUTS, OUTSIDE, WHEELS
-from odocal_ros.data.pieces import by_row, runs
 from odocal_ros.data.samples import (
     FixSamples,
     ImuSamples,

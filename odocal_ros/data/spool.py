@@ -5,7 +5,8 @@
 Rows of a topic: up to MEMORY_BYTES in memory, more of them in an unnamed file.
 
 Two hours of an IMU at 1 kHz are 0.8 GB. The file is mapped: for readers its rows are normal
-arrays, and ``mapped.let_go`` releases their memory. If the disk is full, rows stay in memory.
+arrays, and ``release_mapped_memory`` releases their memory. If the disk is full, rows stay in
+memory.
 """
 
 from collections.abc import Callable
@@ -16,8 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools
-from odocal_ros.data.mapped import mapped, nameless
+from odocal_ros.data.arrays import Bools, map_file, unnamed_file
 from odocal_ros.data.samples import columns_of, join, of_columns, Samples, take
 
 MEMORY_BYTES = 2**24    # judgement: bytes of a topic's rows in memory before a file is used
@@ -119,7 +119,7 @@ class _Columns:
     def __init__(self, like: Samples) -> None:
         self._kind = type(like)
         self._files: list[tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = [
-            (nameless(), column.dtype, column.shape[1:]) for column in columns_of(like)]
+            (unnamed_file(), column.dtype, column.shape[1:]) for column in columns_of(like)]
 
     def write(self, block: Samples, at: int) -> int:
         for (file, dtype, shape), column in zip(self._files, columns_of(block), strict=True):
@@ -132,7 +132,7 @@ class _Columns:
     def rows(self, stop: int) -> Samples:
         """Return the rows before row ``stop``, mapped."""
         return of_columns(self._kind, *(
-            np.frombuffer(mapped(file, 0, mmap.ACCESS_READ), dtype,
+            np.frombuffer(map_file(file, 0, mmap.ACCESS_READ), dtype,
                           stop * math.prod(shape)).reshape(stop, *shape)
             for file, dtype, shape in self._files))
 

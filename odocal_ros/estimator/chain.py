@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.mapped import blocks, room, stepping
+from odocal_ros.data.arrays import blocks, Floats, Ints, iterate_releasing, work_array
 from odocal_ros.errors import OdocalError
 
 
@@ -41,8 +40,8 @@ class Normal:
     """
 
     def __init__(self, N: int, n: int, m: int) -> None:
-        self.diagonal = room(N, n, n)
-        self.wide = room(N, n, n + m + 1)           # right-hand sides of the elimination
+        self.diagonal = work_array(N, n, n)
+        self.wide = work_array(N, n, n + m + 1)           # right-hand sides of the elimination
         self.beside = self.wide[:-1, :, :n]
         self.border = self.wide[:, :, n:n + m]
         self.g = self.wide[:, :, n + m]
@@ -80,7 +79,7 @@ class Solved:
         z[n:, :n] = z[:n, n:].T
         z[:n, :n] = own[N - 1] - z[:n, n:] @ H.T
         own[N - 1], wide[N - 1, :, n:n + m] = z[:n, :n], z[:n, n:]
-        for k in stepping(range(N - 2, -1, -1)):
+        for k in iterate_releasing(range(N - 2, -1, -1)):
             G = wide[k][:, :n + m]
             across = -G @ z
             own[k] -= across @ G.T
@@ -114,7 +113,7 @@ class Solved:
         square = np.zeros((chain.shape[2],) * 2)
         rest = border * self._scale_border[:, None]
         y = np.zeros((n, chain.shape[2]))
-        for k in stepping(range(N)):
+        for k in iterate_releasing(range(N)):
             y = chain[k] * self._scale[k][:, None] - y
             square += y.T @ own[k] @ y
             eliminated = wide[k][:, :n + m].T @ y
@@ -230,7 +229,7 @@ def solve(normal: Normal) -> Solved:
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
     x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
                         for rows in blocks(N)])
-    for k in stepping(range(N - 2, -1, -1)):
+    for k in iterate_releasing(range(N - 2, -1, -1)):
         x[k] -= wide[k][:, :n] @ x[k + 1]
     absent = normal.absent
     return Solved(
@@ -263,7 +262,7 @@ def _eliminate(normal: Normal, corner: Floats) -> Floats:
     diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape
     D, roots = diagonal[0], np.empty((N, n))
-    for k in stepping(range(N)):
+    for k in iterate_releasing(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
             raise NotPositive(f'the data do not determine block {k} of {N}', k)

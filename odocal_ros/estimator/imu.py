@@ -14,9 +14,15 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_row, by_step, median
+from odocal_ros.data.arrays import (
+    Bools,
+    by_row,
+    by_step,
+    Floats,
+    Ints,
+    median,
+    release_mapped_memory,
+)
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.nav.rotations import (
@@ -97,7 +103,7 @@ class ImuSteps(Steps):
             last = min(max(last, first + 1), len(edges) - 1)
             parts.append(_summed(leg, edges[first:last + 1]))
             first = last
-            let_go()
+            release_mapped_memory()
         sums = {f.name: np.concatenate([getattr(part, f.name) for part in parts])
                 for f in fields(Steps)}
         return cls(**sums, t=leg.t_imu[edges], key=np.searchsorted(edges, key))

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import room
+from odocal_ros.data.arrays import Floats, work_array
 
 CORRELATED_LEVELS = ('slow', 'slow_up')
 
@@ -92,7 +91,7 @@ class LevelRightHandSides:
 
     def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
         self.names = tuple(names)
-        self.chain = room(N, n, len(self.names))
+        self.chain = work_array(N, n, len(self.names))
         self.border = np.zeros((m, len(self.names)))
         self.square = np.zeros((len(self.names),) * 2)
 

@@ -17,8 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.mapped import let_go
+from odocal_ros.data.arrays import Floats, Ints, release_mapped_memory
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.imu import ImuSteps
 from odocal_ros.nav.rotations import (
@@ -122,7 +121,7 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
         part.cut(steps)
         out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], steps, owner[mine] - first, first))
-        let_go()
+        release_mapped_memory()
     return _joined(Intervals, out), _joined(Points, points)
 
 

@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import running_integral

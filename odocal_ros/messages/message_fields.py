@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data import samples
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, reduce_columns
 from odocal_ros.data.inputs import WHEELS
-from odocal_ros.data.pieces import across
 from odocal_ros.errors import BadData
 from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config, OdometerConfig
@@ -201,7 +200,7 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
     """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
     is_sent = of_roll.view(np.int64)[:, 0] != NOT_SENT_BITS
-    has_orientation = across(np.logical_or, q_ni != 0) & is_sent
+    has_orientation = reduce_columns(np.logical_or, q_ni != 0) & is_sent
     return np.where(has_orientation, of_yaw[:, 0], np.nan)
 
 

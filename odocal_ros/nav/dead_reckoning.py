@@ -15,9 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import room
-from odocal_ros.data.pieces import chunks
+from odocal_ros.data.arrays import chunks, Floats, work_array
 from odocal_ros.nav import geodesy
 from odocal_ros.nav.geodesy import C_en, GNSS_MOVES, gravity
 from odocal_ros.nav.odometer import Travel
@@ -94,7 +92,7 @@ class Track:
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """Return the track, attitude over travel by the trapezoid rule: docs/method.md (T1)."""
     s = travel.at(t)
-    half, P = (np.diff(s) / 2)[:, None, None], room(len(t), 3, 3)
+    half, P = (np.diff(s) / 2)[:, None, None], work_array(len(t), 3, 3)
     for rows in chunks(len(t) - 1):
         C_nb = matrix_from_quat(q_nb[rows.start:rows.stop + 1])
         sums = C_nb[:-1] + C_nb[1:]

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats, Values
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.arrays import Bools, Floats, runs, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason

@@ -7,8 +7,7 @@ from functools import reduce
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_step, runs
+from odocal_ros.data.arrays import Bools, by_step, Floats, reduce_columns, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import integral_at
 
@@ -81,7 +80,7 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
         dt = np.diff(t_imu)
         unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
         seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # no data within a gap
-    return mean, across(np.logical_and, spread < REST_TURN) & seen
+    return mean, reduce_columns(np.logical_and, spread < REST_TURN) & seen
 
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
@@ -93,4 +92,4 @@ def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> 
     rest = min(means, key=np.linalg.norm)
     if np.abs(rest).max() > MOST_BIAS:
         return np.zeros_like(quiet)
-    return across(np.logical_and, np.abs(rate - rest) < REST_TURN)
+    return reduce_columns(np.logical_and, np.abs(rate - rest) < REST_TURN)

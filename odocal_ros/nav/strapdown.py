@@ -11,9 +11,7 @@ without any per-sample loop.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Complexes, Floats
-from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_row
+from odocal_ros.data.arrays import by_row, Complexes, Floats, release_mapped_memory
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 # judgement: quaternions that a scan multiplies in sequence; 40 to 800 are equally fast
@@ -41,7 +39,7 @@ def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None 
     for first in range(begin, end, SAMPLES_AT_A_TIME):
         last = min(first + SAMPLES_AT_A_TIME, end)
         phi[:, first - begin:last - begin] = _increments(t, w_b, first, last)
-        let_go()
+        release_mapped_memory()
     return phi
 
 
@@ -157,7 +155,7 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
         for k in range(1, every):
             c, d = _times(c, d, C[:, k], D[:, k])
         a[g:g + step], b[g:g + step] = c, d
-        let_go()
+        release_mapped_memory()
     return a, b
 
 

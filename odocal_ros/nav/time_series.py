@@ -12,8 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_step, pieces
+from odocal_ros.data.arrays import by_step, enclosing_slices, Floats
 
 
 class Integral:
@@ -62,7 +61,7 @@ def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Fl
 def _at(times: Sequence[Floats], t: Floats, x: Floats,
         over: Callable[[Floats, Floats], Floats]) -> list[Floats]:
     found = [np.empty((len(each), *x.shape[1:])) for each in times]
-    for parts in zip(*(pieces(each, t) for each in times), strict=True):
+    for parts in zip(*(enclosing_slices(each, t) for each in times), strict=True):
         rows = parts[0][1]
         integral = over(t[rows], x[rows])
         for each, (where, _), out in zip(times, parts, found, strict=True):

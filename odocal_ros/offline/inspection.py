@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, medians
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.errors import OdocalError
 from odocal_ros.library.topics import REFERENCES

@@ -15,9 +15,8 @@ from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.two_point import LEAST_CHORD_SHARE
 from odocal_ros.calib.value_limits import far_from_nominal
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, lengths, medians
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.arguments import EACH_STOP, LegSpan
 from odocal_ros.library.find_legs import find_legs, marked_legs, standstills_of

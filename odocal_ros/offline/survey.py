@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_chord
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.pieces import across, lengths, median, medians
+from odocal_ros.data.arrays import Floats, Ints, lengths, median, medians, reduce_columns
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
 from odocal_ros.screening.fix_screen import has_position, median_origin, usable_fixes
@@ -81,7 +80,7 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
     axis = int(np.argmax(np.abs(mean)))
     fast = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
     has_orientation = ~np.isnan(samples.yaw_variance)
-    turned = has_orientation & (across(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
+    turned = has_orientation & (reduce_columns(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
     variance = samples.yaw_variance[turned]
     known = variance[variance > 0]
     return {

@@ -17,10 +17,8 @@ import numpy as np
 from odocal_ros.calib.drive import ferry_intervals
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import by_step, Floats, Ints, release_mapped_memory
 from odocal_ros.data.leg import Leg, part_of
-from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
@@ -108,7 +106,7 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     moved = gravity_turn_reasons(inputs)
     sanity, z_down = (moved, False) if moved else (sanity or unit_change_reasons(inputs), z_down)
     reasons += tuple(with_axes(sanity, inputs))
-    let_go()
+    release_mapped_memory()
     if z_down:      # forward-right-down: rotated to forward-left-up
         C = matrix_from_rpy([np.pi, 0.0, 0.0])
         inputs = replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)

@@ -19,8 +19,8 @@ from odocal_ros.calib.choice import (
 from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.calib.two_point import refused_result
+from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.beyond_model import (
     delay_notes,
@@ -72,7 +72,7 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
     runs = {}
     for name in names:
         report_pass = report_start(name)
-        let_go()
+        release_mapped_memory()
         runs[name] = _run_guarded(name, prepared, partial(METHODS[name], prepared, report_pass))
     return {name: _run_guarded(name, prepared, partial(_add_model_errors, run, prepared))
             for name, run in runs.items()}

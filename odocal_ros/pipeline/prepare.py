@@ -18,8 +18,8 @@ from odocal_ros.calib.drive import (
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
+from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.pipeline.align import align, with_observed_walk
@@ -48,7 +48,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     distance out of the fit.
     """
     placed = place(inputs, config)
-    let_go()
+    release_mapped_memory()
     refusal_reasons = _missing_drive_reasons(inputs, placed)
     if refusal_reasons is not None:
         return None, (*reasons, *refusal_reasons)
@@ -78,7 +78,7 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
     if alignment is None:
         alignment, alignment_reasons = align(inputs, spans, placed.rough, placed.fixes_n,
                                              placed.origin, config)
-    let_go()
+    release_mapped_memory()
     gap_reasons = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
     epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     if is_own_alignment:

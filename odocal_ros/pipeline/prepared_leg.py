@@ -23,9 +23,8 @@ from odocal_ros.calib.track_check import (
     track_statistics,
     worse_check_reasons,
 )
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, by_row, Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import (
     forward_b,

@@ -16,8 +16,7 @@ from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
 from odocal_ros.calib.wheel_search.search import search, SearchResult
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import let_go
+from odocal_ros.data.arrays import Floats, release_mapped_memory
 from odocal_ros.estimator import make_smoother_leg, smooth
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
@@ -99,9 +98,9 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
         onward = 0.2    # s of extrapolation beyond the data, for the delay
         before = track.at(inside - np.copysign(onward, beyond))
         P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
-        let_go()        # releases the sums before the attitudes are read
+        release_mapped_memory()        # releases the sums before the attitudes are read
         at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
-        let_go()
+        release_mapped_memory()
         return at
     return path
 

@@ -16,10 +16,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import (
+    bin_means,
+    Bools,
+    by_step,
+    enclosing_slices,
+    Floats,
+    Ints,
+    median,
+)
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import bin_means, by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs, Placed
@@ -109,7 +116,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         return np.interp(seconds(arrival_ns), arrival, lag)
     order = np.argsort(arrival_ns, kind='stable')
     times_ns, found = arrival_ns[order], np.empty(len(order))
-    for where, rows in pieces(times_ns, imu.received_ns):
+    for where, rows in enclosing_slices(times_ns, imu.received_ns):
         found[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
                                         _lag(take(imu, rows)))
     return found

@@ -15,9 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.mapped import room
-from odocal_ros.data.pieces import chunks, PIECE_ROWS, runs
+from odocal_ros.data.arrays import chunks, Floats, Ints, PIECE_ROWS, runs, work_array
 
 BLOCK_TIME = 1.0          # s, judgement: of rows whose mean shows a lost row
 WINDOW_BLOCKS = 20        # judgement: duration of a mean; at 100 Hz jitter / sqrt(2000) remains
@@ -101,7 +99,7 @@ class _EvenTimes:
 
     def times(self, t: Floats) -> Floats:
         """Return the times of all rows, rising, also between even times and stamps."""
-        found, last = room(len(t)), -np.inf
+        found, last = work_array(len(t)), -np.inf
         for rows in chunks(len(t)):
             own = np.arange(rows.start, rows.stop)
             part = np.maximum.accumulate(np.maximum(self.at(t, own) - LEAST_STEP * own, last))

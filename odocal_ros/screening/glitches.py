@@ -10,8 +10,17 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_row, by_step, columns, lengths, median, runs
+from odocal_ros.data.arrays import (
+    Bools,
+    by_row,
+    by_step,
+    columns,
+    Floats,
+    lengths,
+    median,
+    reduce_columns,
+    runs,
+)
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -56,7 +65,7 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
         # 1e-68 of a value in axes of exact zeros
         least_value = 1e-80
         usable = (size <= most) & ((size >= least_value) | (size == 0))
-        return ~(usable if x.ndim == 1 else across(np.logical_and, usable))
+        return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
         return by_row(odd, column)
 
@@ -102,7 +111,7 @@ def find_spikes(t: Floats, x: Floats, least: float) -> Bools:
     All False if so many rows jump that it is normal for the sensor.
     """
     found = np.zeros(len(x), bool)
-    bound = by_step(lambda x: across(np.maximum, np.abs(np.diff(x, axis=0))), x)
+    bound = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
     far = np.flatnonzero(bound > least)
     if not len(far):
         return found
@@ -142,7 +151,7 @@ def isolated_outliers(x: Floats, least: float) -> Bools:
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
         is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
                          & (apart < EQUAL_NEIGHBOURS * at))
-        return across(np.logical_or, is_off)
+        return reduce_columns(np.logical_or, is_off)
 
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
@@ -178,8 +187,8 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
-    same = by_step(lambda w: across(np.logical_and, w[1:] == w[:-1])
-                   & across(np.logical_or, w[1:] != 0), w)
+    same = by_step(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
+                   & reduce_columns(np.logical_or, w[1:] != 0), w)
     where = runs(same)
     begin, end = t[where].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)

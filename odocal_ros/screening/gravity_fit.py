@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Complexes, Floats
-from odocal_ros.data.pieces import bin_means
+from odocal_ros.data.arrays import bin_means, Bools, Complexes, Floats
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import G
 

@@ -7,9 +7,8 @@ from collections import Counter
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, medians
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import medians
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import Accelerations, orientation_of

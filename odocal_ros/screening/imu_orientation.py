@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import Complexes, Floats
-from odocal_ros.data.pieces import bin_means, by_row, chunks, lengths, medians
+from odocal_ros.data.arrays import bin_means, by_row, chunks, Complexes, Floats, lengths, medians
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import wrap

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import medians
+from odocal_ros.data.arrays import Floats, medians
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north
 from odocal_ros.nav.odometer import Travel

@@ -12,8 +12,7 @@ rhythm. Rows of a burst that are not on it get times by their travel.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.pieces import median, runs
+from odocal_ros.data.arrays import Bools, Floats, Ints, median, runs
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.even_imu_times import LEAST_STEP, TESTED_ROWS

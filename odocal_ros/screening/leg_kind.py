@@ -19,9 +19,8 @@ import math
 import numpy as np
 
 from odocal_ros.data import samples
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import chunks, Floats, thinned
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import chunks, thinned
 from odocal_ros.nav.geodesy import LARGEST_FRAME, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason

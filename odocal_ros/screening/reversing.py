@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.pieces import runs
+from odocal_ros.data.arrays import Floats, Ints, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.reasons import Code, Reason

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Bools, by_step, chunks, Floats, Ints, work_array
 from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.mapped import room
-from odocal_ros.data.pieces import by_step, chunks
 from odocal_ros.data.samples import Samples, take
 from odocal_ros.nav.geodesy import LARGEST_FRAME
 from odocal_ros.nav.time_series import gaps_in_rhythm
@@ -69,7 +67,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     clean = _spread_packets(clean, found) if slot == 'imu' else clean
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
-    t = room(len(clean.stamp_ns))
+    t = work_array(len(clean.stamp_ns))
     for some in chunks(len(t)):
         t[some] = (clean.stamp_ns[some] - leg.start_ns) * 1e-9 + offset
     spikes = np.zeros(len(t), bool)

@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import by_row, Floats, median, release_mapped_memory
 from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_row, median
 from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import integral_at
@@ -80,7 +78,7 @@ def screen(leg: Leg, config: Config,
                                        (0.0, inputs.t_stop))
             found += why
         inputs = replace(inputs, **_travel(leg, wheels))
-    let_go()
+    release_mapped_memory()
     if check_faults and not local:
         inputs = _without_dead_reckoned(inputs, config, found)
     return (inputs if levelled else _without_reversing(inputs, config, found)), tuple(found)
@@ -138,7 +136,7 @@ def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -
     imu, t_imu = rows('imu')
     t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
     outside = {slot: rows(slot) for slot in OUTSIDE}
-    let_go()
+    release_mapped_memory()
     travelled = travel_of_wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]

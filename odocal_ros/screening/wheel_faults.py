@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import medians, runs
+from odocal_ros.data.arrays import Bools, Floats, medians, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import GAP_INTERVALS, integral_at, robust_sigma
 from odocal_ros.reasons import Code, Reason

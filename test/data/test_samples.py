@@ -12,10 +12,17 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from odocal_ros.data import mapped, samples as s, spool
+from odocal_ros.data import arrays, samples as s, spool
+from odocal_ros.data.arrays import (
+    lengths,
+    median,
+    medians,
+    PIECE_ROWS,
+    reduce_columns,
+    release_mapped_memory,
+    thinned,
+)
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS, thinned
 from odocal_ros.data.samples import ImuSamples, take
 from odocal_ros.errors import BadData
 from odocal_ros.nav.time_series import integral_at, integrals_at, twice_integral_at
@@ -90,7 +97,7 @@ def wild(*shape):
 def test_across_is_what_numpy_reduces_rows_to(ufunc, columns):
     x = np.abs(wild(1000, columns))
     x = x > 1 if ufunc in (np.logical_and, np.logical_or) else x
-    np.testing.assert_array_equal(across(ufunc, x), ufunc.reduce(x, axis=1))
+    np.testing.assert_array_equal(reduce_columns(ufunc, x), ufunc.reduce(x, axis=1))
 
 
 @pytest.mark.parametrize('columns', [3, 4])
@@ -145,7 +152,7 @@ def small(monkeypatch):
     for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
                        ('MERGED_BYTES', 20_000)):
         monkeypatch.setattr(spool, name, size)
-    monkeypatch.setattr(mapped, 'HELD_BYTES', 0)
+    monkeypatch.setattr(arrays, 'HELD_BYTES', 0)
 
 
 def fed(recorder, imu, first, last):
@@ -160,7 +167,7 @@ def test_rows_of_a_file_are_those_that_came(imu):
     fed(recorder, imu, 9_050, 15_000)
     rows = copy.rows('imu')
     assert_same(rows, imu, 0, 9_050)
-    let_go()
+    release_mapped_memory()
     assert_same(rows, imu, 0, 9_050)
     assert_same(recorder.rows('imu'), imu, 0, 15_000)
     # the pre-roll of the next leg is what is left, and the copy is as it was
@@ -170,26 +177,26 @@ def test_rows_of_a_file_are_those_that_came(imu):
 
 
 def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
-    monkeypatch.setattr(mapped, 'ROOM_BYTES', 4_000)
+    monkeypatch.setattr(arrays, 'WORK_ARRAY_BYTES', 4_000)
     for dtype in (float, bool, np.int64):
-        array = mapped.room(1000, 5, dtype=dtype)
+        array = arrays.work_array(1000, 5, dtype=dtype)
         assert array.dtype == dtype
         assert not array.any()
         assert not array.flags.owndata
         array[3:] = 1
-        let_go()
+        release_mapped_memory()
         assert array.sum() == 997 * 5
-    whole = mapped.room(10)
+    whole = arrays.work_array(10)
     assert whole.flags.owndata
 
     def full(*_):
         raise OSError(28, 'no space left on device')
-    monkeypatch.setattr(mapped.os, 'posix_fallocate', full)
-    assert mapped.room(1000, 5).sum() == 0.0        # in memory, then
+    monkeypatch.setattr(arrays.os, 'posix_fallocate', full)
+    assert arrays.work_array(1000, 5).sum() == 0.0        # in memory, then
 
 
 def test_arrays_in_files_are_let_go_once_they_are_large(monkeypatch):
-    array = mapped.room(mapped.ROOM_BYTES // 8)
+    array = arrays.work_array(arrays.WORK_ARRAY_BYTES // 8)
     array[:] = 1
 
     def resident():
@@ -197,11 +204,11 @@ def test_arrays_in_files_are_let_go_once_they_are_large(monkeypatch):
                               Path('/proc/self/smaps').read_text(), re.MULTILINE)
         return int(block) * 1024
 
-    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes)
-    let_go()
+    monkeypatch.setattr(arrays, 'HELD_BYTES', array.nbytes)
+    release_mapped_memory()
     assert resident() == array.nbytes
-    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes - 1)
-    let_go()
+    monkeypatch.setattr(arrays, 'HELD_BYTES', array.nbytes - 1)
+    release_mapped_memory()
     assert resident() == 0
     assert array.sum() == len(array)
 

@@ -11,8 +11,7 @@ change the path length.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import stepping
+from odocal_ros.data.arrays import Floats, iterate_releasing
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
@@ -28,7 +27,8 @@ def mean_rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
     """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
     first = np.searchsorted(t, at - RATE_WINDOW / 2)
     last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
-    return np.stack([w_b[first[k]:last[k]].mean(axis=0) for k in stepping(range(len(at)))])
+    return np.stack([w_b[first[k]:last[k]].mean(axis=0)
+                     for k in iterate_releasing(range(len(at)))])
 
 
 class Axle:

@@ -18,8 +18,7 @@ from typing import ClassVar
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import blocks
+from odocal_ros.data.arrays import blocks, Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points

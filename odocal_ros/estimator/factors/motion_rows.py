@@ -8,8 +8,7 @@ from weakref import ref
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.mapped import blocks, room
+from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import (
@@ -70,8 +69,8 @@ class MotionRows(Factor):
     def weigh(self, levels: Levels) -> None:
         """Whiten rows and derivatives, J (K, 18, 2n + M), by the covariance's Cholesky factor."""
         self._found: tuple[ref[JointMarginals], Floats, Floats] | None = None
-        self.whiten = room(len(self.raw), ROWS, ROWS)
-        self.J = room(*self.raw.shape, 2 * self.n + self.m)
+        self.whiten = work_array(len(self.raw), ROWS, ROWS)
+        self.J = work_array(*self.raw.shape, 2 * self.n + self.m)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
             units = self.noise.columns(rows) * self.roots()
@@ -165,7 +164,7 @@ class MotionRows(Factor):
         and C' R^-1 r, (c p,), of the columns C; those of one constant are adjacent.
         """
         n, L = self.n, len(at) * len(constants)
-        chain, border = room(len(self.r) + 1, n, L), np.zeros((self.m, L))
+        chain, border = work_array(len(self.r) + 1, n, L), np.zeros((self.m, L))
         square, score = np.zeros((L, L)), np.zeros(L)
         for rows in blocks(len(self.r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)

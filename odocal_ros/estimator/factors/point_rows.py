@@ -18,8 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.mapped import blocks, room
+from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.leg import ExternalSamples
@@ -97,7 +96,7 @@ class PointRows(Factor):
     def J(self) -> Floats:
         """Return the whitened derivatives: (m, d, n + M)."""
         rows, constants = self.jacobians(self.n)
-        out = room(*self.raw.shape, self.n + self.m)
+        out = work_array(*self.raw.shape, self.n + self.m)
         for some in blocks(len(out)):
             out[some, :, :self.n] = self.whiten(rows[some], some)
             out[some, :, self.n:] = self.whiten(constants[some, :, :self.m], some)

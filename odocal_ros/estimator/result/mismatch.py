@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import Array, by_row, thinned
+from odocal_ros.data.arrays import Array, by_row, Floats, thinned
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.heading import Heading

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import blocks
+from odocal_ros.data.arrays import blocks, Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import Weighted
 from odocal_ros.estimator.factors.gnss import Fixes

@@ -26,8 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.pieces import by_row
+from odocal_ros.data.arrays import by_row, Floats, Ints
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
