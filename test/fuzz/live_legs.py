@@ -150,10 +150,10 @@ class AtOnce:
 
     def submit(self, job, then):
         """Run a job and hand on its result."""
-        look = job()
-        if look[-1] is not None and not isinstance(look[-1], OdocalError):
-            self.raised.append(repr(look[-1]))
-        then(look, None)
+        update = job()
+        if update.error is not None and not isinstance(update.error, OdocalError):
+            self.raised.append(repr(update.error))
+        then(update, None)
 
 
 def received(drive, rows, config):

@@ -17,7 +17,7 @@ from ros_bags import T0
 import ros_messages as make
 
 from odocal_ros.calib.mounting import mounting, remedy
-from odocal_ros.library import legs
+from odocal_ros.library import find_legs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
@@ -273,7 +273,7 @@ def test_a_drive_is_screened_once(inspect_drive, capsys, monkeypatch):
     """The legs are found in what was screened for the rest: with nothing to screen, the same."""
     expected = inspect_drive(drive())
     assert expected[0]['legs']
-    monkeypatch.setattr(legs, 'screen', None)
+    monkeypatch.setattr(find_legs, 'screen', None)
     assert inspect(expected[0]['path'], capsys) == expected
 
 
