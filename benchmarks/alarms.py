@@ -134,7 +134,7 @@ def run_drive(seed, duration):
     """Draw, drive, calibrate; return a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
-    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.scenarios import simulate
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
     code, grade = RUNS[e], GRADES[k % len(GRADES)]
@@ -144,7 +144,7 @@ def run_drive(seed, duration):
     else:
         _, kind, options, real, settings, change = FAULTS[code]
     own = CHEAP | {'duration': duration} | options
-    made, _ = drawn(seed, kind, own.get('imu_grade', grade), (), real=real, **own)
+    made, _ = draw_vehicle(seed, kind, own.get('imu_grade', grade), (), real=real, **own)
     drive = simulate(made)
     config = with_settings(configured(drive), settings)
     leg = drive.leg() if change is None else change(drive.leg(), np.random.default_rng(seed))

@@ -16,7 +16,7 @@ from harness import configured, parsed
 import numpy as np
 
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.sim.draw import drawn, EFFECTS, ODOMETER_EFFECTS
+from odocal_ros.sim.draw import draw_vehicle, EFFECTS, ODOMETER_EFFECTS
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.wheels import wheels_of
 
@@ -30,8 +30,8 @@ CELLS = {'steered': {'front_steers': True, 'all': False},
 def errors_of(seed, cell):
     """Return name -> (error, sigma) pairs of a drive, and the codes of its reasons."""
     effects = [name for name in EFFECTS if name not in ODOMETER_EFFECTS] * cell['all']
-    made = simulate(drawn(seed, 'town', GRADES[seed % 2], effects, duration=600.0, wheels=4,
-                          odometer='angle', front_steers=cell['front_steers'])[0])
+    made = simulate(draw_vehicle(seed, 'town', GRADES[seed % 2], effects, duration=600.0, wheels=4,
+                                 odometer='angle', front_steers=cell['front_steers'])[0])
     config = configured(made)
     leg = calibrate(made.leg(), config)
     method = leg.methods['smoother']

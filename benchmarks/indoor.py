@@ -7,7 +7,7 @@ Small robots indoors, without GNSS: does the sigma hold for each kind of positio
     python benchmarks/indoor.py [--drives 40] [--only KIND] [--jobs 1] [--file F]
 
 Differential robots with two counters on a level floor, 30 s to 3 min at 0.2 to 1.2 m/s with turns
-on the spot (odocal_ros/sim/routes.py), references with their usual errors (sim/references.py).
+on the spot (odocal_ros/sim/routes.py), references with their usual errors (sim/options.py).
 IMUs are those of the zoo (docs/zoo.md) with their effects, by turns consumer and industrial; each
 wheel has a random slip of 1 mm/sqrt(s). Settings are the defaults, except for the grade of the
 IMU and the nominal scale. Drive k of kind e has seed 193_000_000 + 1_000_000 e + k, fixed before
@@ -57,7 +57,7 @@ FIGURES = (('scale', 'ppm', 1e6), ('ratio', 'ppm', 1e6), ('width', 'ppm', 1e6),
 
 def options_of(seed):
     """Return the SimOptions of a drive."""
-    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.noise import stream
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_KIND)
     rng = stream(seed, 'robot')
@@ -75,10 +75,10 @@ def options_of(seed):
         own['wheels'] = 3 + k % 2
     if robot in PLANAR:       # the first sideways move of a robot ends within a minute
         own |= PLANAR[robot] | {'imu': False, 'duration': max(own['duration'], SHORTEST[robot])}
-    return drawn(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
-                 slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0), antenna_lever_arm=(0.0, 0.0, 0.0),
-                 slip_walk=SLIP, reference=reference,
-                 **dict.fromkeys(('fix_rate', 'fix_noise', 'fix_sigma')))[0]
+    return draw_vehicle(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
+                        slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0),
+                        antenna_lever_arm=(0.0, 0.0, 0.0), slip_walk=SLIP, reference=reference,
+                        **dict.fromkeys(('fix_rate', 'fix_noise', 'fix_sigma')))[0]
 
 
 def run_drive(seed):

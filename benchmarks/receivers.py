@@ -169,11 +169,11 @@ def run_drive(seed):
 def driven(seed, k, run):
     """Return the outcome of drive k of a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
-    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.scenarios import simulate
     kind, (grade, fixes) = run.kinds[k // 2 % len(run.kinds)], VEHICLES[k % len(VEHICLES)]
-    made, _ = drawn(seed, kind, grade, run.effects, real=run.real,
-                    **{'duration': 300.0, **fixes, **run.options})
+    made, _ = draw_vehicle(seed, kind, grade, run.effects, real=run.real,
+                           **{'duration': 300.0, **fixes, **run.options})
     drive = simulate(made)
     config, leg = configured(drive), drive.leg()
     if run.change:

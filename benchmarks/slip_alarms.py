@@ -121,7 +121,7 @@ def spins_of(made, drive):
 def run_drive(seed, duration):
     """Draw, drive, calibrate; return a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
-    from odocal_ros.sim.draw import drawn, EFFECTS
+    from odocal_ros.sim.draw import draw_vehicle, EFFECTS
     from odocal_ros.sim.scenarios import simulate
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
     run = list(RUNS)[e]
@@ -129,7 +129,7 @@ def run_drive(seed, duration):
     effects = tuple(n for n in EFFECTS if n not in NOT_OF_ZOO) if run == 'zoo' else ()
     kind, (grade, fixes) = kinds[k % len(kinds)], VEHICLES[k % len(VEHICLES)]
     own = CHEAP | fixes | {'duration': duration} | options
-    made, _ = drawn(seed, kind, grade, effects, **own)
+    made, _ = draw_vehicle(seed, kind, grade, effects, **own)
     drive = simulate(made)
     config = configured(drive)
     leg = drive.leg() if change is None else change(

@@ -35,7 +35,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from harness import configured, parsed, read_rows, run_missing
 from zoo_table import print_tables
 
-from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, RARE
+from odocal_ros.sim.draw import draw_vehicle, EFFECTS, GRADES, KINDS, RARE
 
 CLEAN = 'clean'
 RUNS = ('all', *EFFECTS, CLEAN, *RARE)     # in the order of their seeds
@@ -70,8 +70,8 @@ def run_drive(seed, duration=None):
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
     run, kind, grade = RUNS[e], kind_of(k), grade_of(k)
     effects = None if run == 'all' else () if run == CLEAN else (run,)
-    options, there = drawn(seed, kind, grade, effects,
-                           **{} if duration is None else {'duration': duration})
+    options, there = draw_vehicle(seed, kind, grade, effects,
+                                  **{} if duration is None else {'duration': duration})
     begin = time.process_time()
     drive = simulate(options)
     row = {'seed': seed, 'run': run, 'kind': kind, 'grade': grade, 'effects': list(there),

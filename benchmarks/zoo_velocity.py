@@ -43,11 +43,11 @@ def run_drive(seed, asked):
     """Return rows of a drive without and with the velocity."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
-    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.scenarios import simulate
     k, error = seed - FIRST_SEED, error_of(seed, asked)
-    options, _ = drawn(seed, kind_of(k), grade_of(k), None, velocity_sigma=SIGMA,
-                       **ERRORS[error])
+    options, _ = draw_vehicle(seed, kind_of(k), grade_of(k), None, velocity_sigma=SIGMA,
+                              **ERRORS[error])
     drive = simulate(options)
     row = {'seed': seed, 'error': error, 'kind': kind_of(k), 'grade': grade_of(k)}
     for name, use in (('without', False), ('with', True)):

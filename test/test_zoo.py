@@ -7,7 +7,7 @@ from drives import configured
 import pytest
 
 from odocal_ros.pipeline.calibrate import calibrate, combine
-from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = [pytest.mark.core, pytest.mark.slow]
@@ -39,8 +39,8 @@ def error_in_sigmas(estimate, true):
 @pytest.mark.parametrize(('seed', 'row'), list(enumerate(ZOO, FIRST_SEED)))
 def test_a_drawn_vehicle_has_its_verdict_and_errors(seed, row):
     kind, grade, *_ = row
-    options, _ = drawn(seed, kind, grade, imu_rate=50.0,
-                       duration=320.0 if kind == 'out_and_back' else 240.0)
+    options, _ = draw_vehicle(seed, kind, grade, imu_rate=50.0,
+                              duration=320.0 if kind == 'out_and_back' else 240.0)
     made = simulate(options)
     config, truth = configured(made), made.truth
     whole = combine([calibrate(made.leg(), config)], config)

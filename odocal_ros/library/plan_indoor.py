@@ -22,8 +22,7 @@ from odocal_ros.forecast.planned_indoor import (
 )
 from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.settings.config import DRIVES, HOLONOMIC, SKID
-from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.references import REFERENCES
+from odocal_ros.sim.options import REFERENCES, SimOptions
 from odocal_ros.sim.scenarios import motion_of
 from odocal_ros.sim.wheels import effective_width, STRAIGHT
 

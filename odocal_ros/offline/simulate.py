@@ -170,7 +170,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
 
 def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
     """Return SimOptions of the given options, the random vehicle and the requested figures."""
-    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real import parsed, Real
     figures = dict(parsed(text) for text in args.figures)
@@ -185,7 +185,7 @@ def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOpti
     seed = options.pop('seed', SimOptions.seed)
     grade = options.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
     kind = options.pop('scenario')
-    return drawn(seed, kind, grade, effects, **options, real=figures)[0]
+    return draw_vehicle(seed, kind, grade, effects, **options, real=figures)[0]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -251,13 +251,13 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
     """Write a bag; return its row of the manifest, and its drive with options and truth."""
     from odocal_ros.bagio.write import drive_topics, write_bag
     from odocal_ros.library.simulate import write_yaml
-    from odocal_ros.sim.fleet import as_driven, drive_options, MODELS
+    from odocal_ros.sim.fleet import drive_options, MODELS, with_broken_counter
     from odocal_ros.sim.scenarios import simulate
     from odocal_ros.sim.truth import settings
     drive = simulate(drive_options(vehicle, number, bag, options))
     name = f'{vehicle.name}/bag_{bag + 1:02d}'
-    write_bag(out / name, drive_topics(as_driven(drive, vehicle.broken(bag))), args.storage,
-              args.compression, args.force)
+    recorded = with_broken_counter(drive, vehicle.broken(bag))
+    write_bag(out / name, drive_topics(recorded), args.storage, args.compression, args.force)
     config = f'{vehicle.model.name}.yaml'
     if number < len(MODELS) and not bag:      # one of each model
         write_yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},

@@ -42,9 +42,9 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
     chord, chord_by = hills.chord(s, wheelbase) if wheelbase else (here, here_by)
     forward = speed.derivative().mean(t) + G * here
     # nose up is a negative pitch; in a turn to the left the left side goes up
-    roll, roll_rate = sprung(real.body_roll * side_force(speed, yaw_rate, lean, t)
-                             + real.kneeling * kneels(speed, t), step)
-    pitch, pitch_rate = sprung(-real.squat * forward, step)
+    roll, roll_rate = sprung_response(real.body_roll * side_force(speed, yaw_rate, lean, t)
+                                      + real.kneeling * kneeling_degree(speed, t), step)
+    pitch, pitch_rate = sprung_response(-real.squat * forward, step)
     if lean:
         roll, roll_rate = roll + lean(t), roll_rate + lean.derivative()(t)
     return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - here),
@@ -56,7 +56,7 @@ def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Float
     return speed(t) * yaw_rate(t) + (G * np.sin(lean(t)) if lean else 0.0)
 
 
-def kneels(speed: Profile, t: Floats) -> Floats:
+def kneeling_degree(speed: Profile, t: Floats) -> Floats:
     """Return the degree of kneeling of a bus at its stops, 0 to 1: (n,)."""
     still = np.concatenate([[0], np.abs(speed(t)) < STILL, [0]]).astype(int)
     begin, end = (np.flatnonzero(np.diff(still) == sign) for sign in (1, -1))
@@ -66,7 +66,7 @@ def kneels(speed: Profile, t: Floats) -> Floats:
     return down
 
 
-def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
+def road_lean(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
     """Return the lean of the road to the right by time, rad."""
     step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
@@ -76,7 +76,7 @@ def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
     return hermite(t, lean, np.gradient(lean, step))
 
 
-def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
+def sprung_response(push: Floats, step: float) -> tuple[Floats, Floats]:
     """Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u``, u linear between rows (n,)."""
     w, z = FREQUENCY, DAMPING
     wd = w * np.sqrt(1 - z**2)
@@ -96,8 +96,8 @@ def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
     return y, dy
 
 
-def drift(speed: Profile, yaw_rate: Profile, sideslip: float, lean: Profile | None,
-          t: Floats) -> Floats:
+def lateral_velocity(speed: Profile, yaw_rate: Profile, sideslip: float, lean: Profile | None,
+                     t: Floats) -> Floats:
     """Return the velocity to the left at times t, m/s: against the force of the tyres."""
     return -sideslip * side_force(speed, yaw_rate, lean, t) * np.abs(speed(t))
 
@@ -108,8 +108,8 @@ def rotation(motion: Motion, t: Floats) -> Floats:
     return matrix_from_rpy(np.stack([roll, pitch, np.zeros_like(roll)], -1))
 
 
-def measured(motion: Motion, state: State,
-         lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
+def imu_output(motion: Motion, state: State,
+               lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Return turn rate, rad/s, specific force, m/s^2, in body axes; arm m, body level."""
     w_v, f_v = inertial_v(state, lever_arm)
     if not motion.tilt:

@@ -18,14 +18,14 @@ from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
+from odocal_ros.sim.zoo import flat, GRADES, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each needs an odometer of its own
 
 
-def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None,
-          **given: Any) -> tuple[SimOptions, tuple[str, ...]]:
+def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None,
+                 **given: Any) -> tuple[SimOptions, tuple[str, ...]]:
     """
     Return SimOptions of a drawn vehicle, and the names of the effects that it has.
 
@@ -82,7 +82,7 @@ def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict
         'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
         'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,
         'mounting_rpy': (0.0, 0.0, quarter * math.pi / 2),
-        'antenna_lever_arm': plain(antenna), 'imu_lever_arm': plain(imu),
+        'antenna_lever_arm': flat(antenna), 'imu_lever_arm': flat(imu),
         'odometer_lever_arm': (0.0, 0.0, -0.1 if robot else -0.3),
         'odometer_rate': 50.0, 'fix_rate': float(rng.choice([1.0, 5.0, 10.0])),
         'fix_noise': 'rtk' if rtk else 'white', 'fix_sigma': 0.02 if rtk else 1.5,

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from odocal_ros.settings.nominal import GRADES
-from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, MG, plain, Vehicle
+from odocal_ros.sim.zoo import DEG, Drawn, flat, G, KMH, lognormal, MG, Vehicle
 
 
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -21,19 +21,19 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
         # a data sheet limits it to three sigmas
         np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
                          * np.clip(rng.standard_normal(3), -3.0, 3.0))
-        figures[name] = plain(M)
+        figures[name] = flat(M)
     return {}, figures
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    return {}, {'g_sensitivity': plain(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
+    return {}, {'g_sensitivity': flat(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
 
 
 def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw turn-on biases by the vehicle's class, and their drift during the run."""
     return {}, {
-        'gyro_bias': plain(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
-        'accel_bias': plain(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
+        'gyro_bias': flat(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
+        'accel_bias': flat(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
         'gyro_wander': vehicle.size('gyro wander'),
         'accel_wander': vehicle.size('accelerometer wander')}
 
@@ -46,7 +46,7 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
         median, spread = vehicle.row(f'{sensor} slope')
         sign = rng.choice([-1, 1], 3)
-        figures[name] = plain(sign * (median * np.exp(spread * rng.standard_normal(3))))
+        figures[name] = flat(sign * (median * np.exp(spread * rng.standard_normal(3))))
     least, most = vehicle.row('warmth')
     rise = rng.uniform(least, most) * math.exp(-since / tau)
     return {}, figures | {'warm_rise': float(rise), 'warm_time': tau}
@@ -138,7 +138,7 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     for name in ('imu', 'antenna', 'odometer'):
         off = vehicle.size('arm error') * rng.standard_normal(3)
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
-        real[f'{name}_arm_error'] = plain(-arm if zero else off)
+        real[f'{name}_arm_error'] = flat(-arm if zero else off)
     return {}, real
 
 
@@ -245,8 +245,8 @@ def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 def bias_steps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Change the biases at a time in mid-drive: a knock, a strained board, another supply."""
     accel, gyro = rng.normal(size=(2, 3))
-    return {}, {'accel_step': plain(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
-                'gyro_step': plain(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
+    return {}, {'accel_step': flat(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
+                'gyro_step': flat(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
                 'bias_step_at': float(rng.uniform(100.0, 300.0))}
 
 

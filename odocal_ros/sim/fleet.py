@@ -101,7 +101,7 @@ def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOpti
         nominal_scale=vehicle.model.nominal)
 
 
-def as_driven(drive: Drive, broken: bool) -> Drive:
+def with_broken_counter(drive: Drive, broken: bool) -> Drive:
     """Return a drive as in its bag: a broken counter stops after a third of the drive."""
     if not broken:
         return drive

@@ -1,8 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sample times, random numbers with a stream for each sensor, and noise processes."""
+"""Sample times, random numbers with a stream for each sensor, noise and drift processes."""
 
+from typing import Any
 import zlib
 
 import numpy as np
@@ -11,7 +12,8 @@ from odocal_ros.data.arrays import Floats, Ints
 
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
-TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
+REMAINDER = 0.2     # judgement: share of the accumulated drift that a loop closure leaves
+TRANSPORT_DELAY = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -51,3 +53,27 @@ def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floa
     n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
     ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
     return ns, ns * 1e-9
+
+
+def reference_drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
+    """Return errors (n, 3) m, ENU, that change with travel (n,), m, and jump at loop closures."""
+    if not options.reference_drift:
+        return 0.0
+    rng, length = stream(options.seed, 'reference drift'), options.drift_length
+    path = np.abs(np.diff(travel, prepend=travel[:1]))
+    left = np.exp(-path / length) if length else np.ones(len(t))
+    closes = stream(options.seed, 'loop closures').uniform(size=len(t)) < np.diff(
+        t, prepend=t[:1]) / (options.closure_time or np.inf)
+    usual = stationary_sigma(options)
+    size = usual * np.sqrt(1 - left**2) if length else options.reference_drift * np.sqrt(path)
+    left = np.where(closes, REMAINDER, left)
+    out, steps = np.zeros((len(t), 3)), size[:, None] * rng.standard_normal((len(t), 2))
+    out[0, :2] = usual * rng.standard_normal(2)
+    for k in range(1, len(t)):
+        out[k, :2] = left[k] * out[k - 1, :2] + steps[k]
+    return out
+
+
+def stationary_sigma(options: Any) -> float:
+    """Return the stationary sigma of a correlated drift, m; 0 for a random walk."""
+    return float(options.reference_drift * np.sqrt(options.drift_length / 2))

@@ -12,7 +12,7 @@ from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
-from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT
+from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT_DELAY
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 
@@ -239,5 +239,5 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     sent = true * (1 + options.velocity_scale_error) + (
         error + far * OUTLIER * rng.standard_normal((len(t), 3)))
     stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
-    return VelocitySamples(stamp, stamp + round(TRANSPORT['fix'] * 1e9), sent,
+    return VelocitySamples(stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), sent,
                            np.full(sent.shape, sigma**2))

@@ -19,10 +19,9 @@ from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stamps, stream
-from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
+from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real_sensors import own_angles, velocity
-from odocal_ros.sim.references import Reference, REFERENCES
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -124,7 +123,7 @@ def motion_of(options: SimOptions) -> Motion:
     real = options.real
     more: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
-    lean = (body.leaning(route.speed, route.yaw_rate, real)
+    lean = (body.road_lean(route.speed, route.yaw_rate, real)
             if real.cross_slope or real.banking or real.crossfall else None)
     if lean:
         more['lean'] = lean
@@ -156,7 +155,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
-        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
+        v = body.lateral_velocity(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
         side = _with(side, v)
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]

@@ -21,10 +21,19 @@ from odocal_ros.nav.geodesy import radii
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
 from odocal_ros.sim import body, real_sensors, wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
-from odocal_ros.sim.noise import gauss_markov, PHASE, random_walk, stamps, stream, TRANSPORT, white
-from odocal_ros.sim.options import SIM_GRADES, SimOptions
+from odocal_ros.sim.noise import (
+    gauss_markov,
+    PHASE,
+    random_walk,
+    reference_drift,
+    stamps,
+    stationary_sigma,
+    stream,
+    TRANSPORT_DELAY,
+    white,
+)
+from odocal_ros.sim.options import REFERENCES, SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
-from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise
@@ -65,7 +74,7 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
     ns, t = stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
     C_vi = imu_rotation(options)
-    w_v, f_v = body.measured(motion, state, options.imu_lever_arm)
+    w_v, f_v = body.imu_output(motion, state, options.imu_lever_arm)
     w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
                                     f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))
@@ -81,7 +90,7 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
                                   real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
     return samples.ImuSamples(
-        stamp, stamp + round(TRANSPORT['imu'] * 1e9), w_i + gyro + gyro_drift,
+        stamp, stamp + round(TRANSPORT_DELAY['imu'] * 1e9), w_i + gyro + gyro_drift,
         f_i + accel + accel_drift, q_ni, variance)
 
 
@@ -90,7 +99,7 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.Headin
     ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return samples.HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
+    return samples.HeadingSamples(stamp, stamp + round(TRANSPORT_DELAY['heading'] * 1e9), q_nb,
                                   np.full(len(t), sigma**2))
 
 
@@ -201,7 +210,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     real = options.real
     latitude, longitude, height = real_sensors.places(motion, t, options)
     error = fix_errors(t, options) + real_sensors.errors(t, options)
-    error = error + drift(t, motion.at(t).travel, options)
+    error = error + reference_drift(t, motion.at(t).travel, options)
     error = real_sensors.fused(t, error, options)
     meridian, normal = radii(latitude)
     by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
@@ -220,8 +229,8 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     n = len(t)
     stamp = options.start_ns + _late(ns, options, 'fix')
     sent = samples.FixSamples(
-        stamp, stamp + round(TRANSPORT['fix'] * 1e9), latitude, longitude, height + error[:, 2],
-        np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
+        stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), latitude, longitude,
+        height + error[:, 2], np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
         np.full(n, 2 if options.fix_noise == 'rtk' else 0))
     seen = np.ones(n, dtype=bool)
     for begin, end in options.outages:

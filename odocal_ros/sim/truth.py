@@ -101,7 +101,7 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
     options = drive.options
     grade = options.real.configured_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
-                      'lever_arm': _configured_arm(options, 'odometer')}
+                                'lever_arm': _configured_arm(options, 'odometer')}
     if options.drive != DIFFERENTIAL:
         odometer['drive'] = options.drive
     if options.wheel_count > len(SIDES):

@@ -79,6 +79,6 @@ def lognormal(rng: np.random.Generator, median: float, spread: float) -> float:
     return float(median * np.exp(spread * rng.standard_normal()))
 
 
-def plain(values: Floats) -> tuple[float, ...]:
+def flat(values: Floats) -> tuple[float, ...]:
     """Return numbers of any shape as a flat tuple."""
     return tuple(float(x) for x in np.ravel(values))

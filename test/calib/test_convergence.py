@@ -24,7 +24,7 @@ from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
-from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -36,8 +36,8 @@ DRIVE = {'duration': 1860.0, 'imu_rate': 20.0, 'odometer_rate': 10.0, 'imu_grade
 
 @pytest.mark.core
 def test_noise_of_rtk_at_one_hz_is_not_taken_for_correlated_errors():
-    made, _ = drawn(109_000_002, 'motorway', 'industrial', ('squat', 'sideslip'), duration=300.0,
-                    fix_noise='rtk', fix_sigma=0.02)
+    made, _ = draw_vehicle(109_000_002, 'motorway', 'industrial', ('squat', 'sideslip'),
+                           duration=300.0, fix_noise='rtk', fix_sigma=0.02)
     assert made.fix_rate == 1.0
     drive = simulate(made)
     config = configured(drive)

@@ -19,7 +19,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.nominal import GRADES, TURN_ON, with_grade_by_noise
-from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
@@ -265,7 +265,7 @@ def test_tyres_that_slip_one_way_only_leave_the_mean_right(driven):
 
 def test_a_slow_drive_settles_on_its_metres():
     """A yard with all that real sensors have: with noise in derivatives its metres shrink."""
-    options, _ = drawn(70_000_024, 'yard', 'consumer', None)
+    options, _ = draw_vehicle(70_000_024, 'yard', 'consumer', None)
     drive = simulate(options)
     config = configured(drive)
     assert off(smooth(leg_of(drive.leg(), config), config), drive) < 3.3

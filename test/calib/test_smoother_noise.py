@@ -20,7 +20,7 @@ from odocal_ros.estimator.imu import white_noise_at_rest
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
-from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 
@@ -171,7 +171,7 @@ def test_without_noise_the_whole_signal_counts(road):
     (99_000_003, 'yard', 'consumer', ('kerbs',), {'fix_noise': 'correlated', 'fix_sigma': 1.5})])
 def test_a_road_that_leans_or_has_kerbs_gives_the_values_within_their_sigmas(
         seed, kind, grade, effects, more):
-    drive = simulate(drawn(seed, kind, grade, effects, **more)[0])
+    drive = simulate(draw_vehicle(seed, kind, grade, effects, **more)[0])
     config = settings(drive, None)
     found = smooth(leg_of(drive.leg(), config), config)
     assert off(found, drive, 'scale_factor', 'yaw_mounting_angle') < 3.3

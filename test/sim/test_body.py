@@ -96,7 +96,7 @@ SQUAT, ROLL = 0.003, 0.009     # rad per m/s^2
 
 def test_springs_answer_a_ramp_as_the_equation_does():
     t = np.arange(0, 5, 0.02)
-    y, dy = body.sprung(0.7 + 0.4 * t, 0.02)
+    y, dy = body.sprung_response(0.7 + 0.4 * t, 0.02)
     w, z = body.FREQUENCY, body.DAMPING
     wd = w * np.sqrt(1 - z**2)
     decay = np.exp(-z * w * t)
@@ -129,20 +129,20 @@ def test_the_imu_on_the_body_feels_how_its_place_moves():
     motion, h, arm = bends(), 1e-4, np.array([0.7, -0.4, 1.1])
     t = np.arange(1.5, 17.0, 0.01)      # as an IMU of 100 Hz
     stiff = Motion(motion.speed, motion.yaw_rate, motion.start)
-    w, f = body.measured(motion, motion.at(t), arm)
+    w, f = body.imu_output(motion, motion.at(t), arm)
     R, before, after = (body.rotation(motion, t + k * h) for k in (0, -1, 1))
     # w = R^T w_v + the axial vector of R^T dR/dt
     spin = np.swapaxes(R, 1, 2) @ (after - before) / (2 * h)
-    w_v, _ = body.measured(stiff, stiff.at(t), (0.0, 0.0, 0.0))
+    w_v, _ = body.imu_output(stiff, stiff.at(t), (0.0, 0.0, 0.0))
     want = np.einsum('nij,ni->nj', R, w_v) + np.stack([spin[:, 2, 1], spin[:, 0, 2],
                                                        spin[:, 1, 0]], -1)
     assert_allclose(w, want, atol=1e-6)
     # f: second difference of the place that the body takes the IMU to, in a stiff vehicle's axes
     a_arm = (after + before - 2 * R) @ arm / h**2
     rate = (after - before) @ arm / (2 * h)
-    _, f_0 = body.measured(stiff, stiff.at(t), (0.0, 0.0, 0.0))
+    _, f_0 = body.imu_output(stiff, stiff.at(t), (0.0, 0.0, 0.0))
     w_0 = w_v
-    dw = np.gradient(body.measured(stiff, stiff.at(np.arange(0, 18, 1e-3)), (0, 0, 0))[0], 1e-3,
+    dw = np.gradient(body.imu_output(stiff, stiff.at(np.arange(0, 18, 1e-3)), (0, 0, 0))[0], 1e-3,
                      axis=0)[np.rint(t / 1e-3).astype(int)]
     place = R @ arm
     want = np.einsum('nij,ni->nj', R, f_0 + a_arm + 2 * np.cross(w_0, rate)

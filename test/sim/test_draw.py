@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS, RARE
+from odocal_ros.sim.draw import draw_vehicle, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS, RARE
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
@@ -19,10 +19,10 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
-    options, there = drawn(7, 'town', 'industrial', ())
+    options, there = draw_vehicle(7, 'town', 'industrial', ())
     assert options.real == Real()
     assert there == ()
-    told = settings(simulate(drawn(7, 'town', 'industrial', (), duration=200.0)[0]))
+    told = settings(simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
     assert told['imu']['grade'] == 'industrial'
     for group, name in (('imu', 'imu'), ('gnss', 'antenna'), ('odometer', 'odometer')):
         assert told[group]['lever_arm'] == list(getattr(options, f'{name}_lever_arm'))
@@ -31,13 +31,13 @@ def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
 @pytest.mark.parametrize('name', EFFECTS)
 def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
     seeds = range(100, 140)
-    alone = [drawn(seed, 'town', 'industrial', (name,)) for seed in seeds]
-    clean = [drawn(seed, 'town', 'industrial', ())[0] for seed in seeds]
+    alone = [draw_vehicle(seed, 'town', 'industrial', (name,)) for seed in seeds]
+    clean = [draw_vehicle(seed, 'town', 'industrial', ())[0] for seed in seeds]
     assert sum(one != bare for (one, _), bare in zip(alone, clean, strict=True)) >= 10
     if name in (*ODOMETER_EFFECTS, 'fix_stamps', 'multipath', 'outages'):
         return                    # alone they are made sure of
     for seed, (one, there) in zip(seeds, alone, strict=True):
-        whole, names = drawn(seed, 'town', 'industrial')
+        whole, names = draw_vehicle(seed, 'town', 'industrial')
         assert not there or name in names
         real, plain = asdict(one.real), asdict(Real())
         changed = {k: v for k, v in real.items() if v != plain[k]}
@@ -46,29 +46,30 @@ def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
 
 @pytest.mark.parametrize('name', RARE)
 def test_a_rare_effect_is_drawn_where_it_is_named_only(name):
-    one, there = drawn(7, 'town', 'industrial', (name,))
+    one, there = draw_vehicle(7, 'town', 'industrial', (name,))
     assert there == (name,)
-    assert one != drawn(7, 'town', 'industrial', ())[0]
-    assert name not in drawn(7, 'town', 'industrial')[1]
+    assert one != draw_vehicle(7, 'town', 'industrial', ())[0]
+    assert name not in draw_vehicle(7, 'town', 'industrial')[1]
 
 
 @pytest.mark.parametrize(('kind', 'grade'), zip(KINDS, cycle(GRADES)))
 def test_a_drawn_vehicle_can_be_driven(kind, grade):
     duration = 320.0 if kind == 'out_and_back' else 260.0
-    options, there = drawn(11, kind, grade, duration=duration, imu_rate=20.0)
+    options, there = draw_vehicle(11, kind, grade, duration=duration, imu_rate=20.0)
     drive = simulate(options)
     assert len(there) >= 15
     assert len(ODOMETER_EFFECTS) > len(set(there) & set(ODOMETER_EFFECTS))
     for samples in (drive.imu, drive.odometer, drive.fix):
         assert (np.diff(samples.stamp_ns) > 0).all()
     assert abs(drive.truth.scale_ratio - 1) < 0.15
-    again = simulate(drawn(11, kind, grade, duration=duration, imu_rate=20.0)[0])
+    again = simulate(draw_vehicle(11, kind, grade, duration=duration, imu_rate=20.0)[0])
     assert (again.imu.w_i == drive.imu.w_i).all()
     assert (again.fix.latitude == drive.fix.latitude).all()
 
 
 def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
-    vehicles = [drawn(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0] for seed in range(60)]
+    vehicles = [draw_vehicle(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0]
+                for seed in range(60)]
     zero = [o for o in vehicles if np.allclose(np.add(o.antenna_lever_arm,
                                                       o.real.antenna_arm_error), 0)]
     assert len(zero) == pytest.approx(0.3 * 60, abs=5 * np.sqrt(60 * 0.21))
@@ -80,9 +81,10 @@ def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
 def test_what_is_given_is_what_effects_go_by():
     arm = (1.0, 0.2, 1.5)
     seed = next(s for s in range(50) if np.allclose(np.add(
-        (o := drawn(s, 'town', 'consumer')[0]).antenna_lever_arm, o.real.antenna_arm_error), 0))
-    options, _ = drawn(seed, 'town', 'consumer', antenna_lever_arm=arm, scale=0.5,
-                       real={'squat': 0.0})
+        (o := draw_vehicle(s, 'town', 'consumer')[0]).antenna_lever_arm,
+        o.real.antenna_arm_error), 0))
+    options, _ = draw_vehicle(seed, 'town', 'consumer', antenna_lever_arm=arm, scale=0.5,
+                              real={'squat': 0.0})
     assert options.antenna_lever_arm == arm
     assert options.real.antenna_arm_error == (-1.0, -0.2, -1.5)
     assert options.scale == 0.5
@@ -95,4 +97,4 @@ def test_what_is_given_is_what_effects_go_by():
     ({'grade': 'navigation'}, 'required: one of consumer')])
 def test_what_cannot_be_drawn_is_said(change, told):
     with pytest.raises(BadUsage, match=told):
-        drawn(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)
+        draw_vehicle(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)

@@ -20,6 +20,8 @@ def test_ramps_and_turns_have_their_speed_path_and_angle():
     # symmetric about its middle: mean speed 6 m/s over 10 s, then 12 m/s for 5 s
     assert speed([0, 3, 8, 13, 18, 99]) == pytest.approx([0, 0, 6, 12, 12, 12], abs=1e-13)
     assert speed.integral()(18.0) == pytest.approx(6 * 10 + 12 * 5, abs=1e-12)
+    # of a duration below both blends, these are shorter: the gain stays
+    assert chain(ramp(1.5, 3, 1.0)).integral()([0.75, 1.5]) == pytest.approx([1.5, 3.0])
     for blend in (0.5, 2.0, 4.0):
         assert chain(turn(8, 1.3, blend)).integral()(8.0) == pytest.approx(1.3, abs=1e-14)
 

@@ -31,8 +31,8 @@ def test_the_imu_reads_by_its_model():
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
     w_m, f_m = real_sensors.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
-                                           accel_matrix=tuple(accel.ravel()),
-                                           g_sensitivity=tuple(G.ravel())))
+                                               accel_matrix=tuple(accel.ravel()),
+                                               g_sensitivity=tuple(G.ravel())))
     for k in range(7):
         assert_allclose(w_m[k], (np.eye(3) + gyro) @ w[k] + G @ f[k], atol=1e-15)
         assert_allclose(f_m[k], (np.eye(3) + accel) @ f[k], atol=1e-15)

@@ -15,8 +15,8 @@ from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.data.samples import LOCAL
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.read_bag import read_bag
-from odocal_ros.sim.options import BY_SCENARIO, resolved
-from odocal_ros.sim.references import drift, REFERENCES
+from odocal_ros.sim.noise import reference_drift
+from odocal_ros.sim.options import BY_SCENARIO, REFERENCES, resolved
 from odocal_ros.sim.scenarios import motion_of, SCENARIOS, SimOptions, simulate
 
 pytestmark = pytest.mark.core
@@ -255,7 +255,7 @@ def test_amcl_keeps_its_error_at_rest_and_forgets_it_with_the_path():
     options = resolved(SimOptions(scenario='indoor', reference='amcl'))
     t = np.arange(0.0, 20_000.0, 1.0)
     travel = np.where(t < 10_000.0, 0.0, t - 10_000.0)
-    error = drift(t, travel, options)
+    error = reference_drift(t, travel, options)
     assert np.ptp(error[t < 10_000.0], axis=0) == pytest.approx(0.0)
     # sqrt(2 m / 2) of path; 5000 independent values
     assert error[t > 10_000.0, :2].std() == pytest.approx(0.05, rel=0.1)
@@ -266,9 +266,9 @@ def test_slam_drifts_with_the_path_and_jumps_back():
     t = np.arange(0.0, 3000.0, 0.1)
     free = resolved(SimOptions(scenario='indoor', closure_time=0.0))
     closing = resolved(SimOptions(scenario='indoor'))
-    steps = np.diff(drift(t, t, free)[:, :2], axis=0)       # at 1 m/s
+    steps = np.diff(reference_drift(t, t, free)[:, :2], axis=0)       # at 1 m/s
     assert steps.std() == pytest.approx(0.01 * np.sqrt(0.1), rel=0.02)
-    error = drift(t, t, closing)[:, :2]
+    error = reference_drift(t, t, closing)[:, :2]
     # between closures 30 s apart, in the mean: sqrt(30 m) of walk
     assert 0.02 < np.abs(error).max() < 0.3
     jumps = np.hypot(*np.diff(error, axis=0).T) > 0.02

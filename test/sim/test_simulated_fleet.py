@@ -9,7 +9,7 @@ from drives import drive
 import numpy as np
 import pytest
 
-from odocal_ros.sim.fleet import as_driven, drive_options, fleet_of, MODELS, WALK
+from odocal_ros.sim.fleet import drive_options, fleet_of, MODELS, WALK, with_broken_counter
 from odocal_ros.sim.scenarios import SimOptions
 
 
@@ -44,8 +44,8 @@ def test_a_drive_is_that_of_its_vehicle_and_a_broken_counter_stands():
     options = drive_options(vehicle, 0, 1, SimOptions(scenario='straight', duration=200.0))
     assert (options.scale, options.yaw) == (vehicle.scale[1], vehicle.yaw[1])
     made = drive(scenario='straight', duration=200.0)
-    assert as_driven(made, broken=False) is made
-    value = as_driven(made, broken=True).odometer.value
+    assert with_broken_counter(made, broken=False) is made
+    value = with_broken_counter(made, broken=True).odometer.value
     k = len(value) // 3
     np.testing.assert_array_equal(value[:k], made.odometer.value[:k])
     assert np.ptp(value[k:]) == 0 < np.ptp(made.odometer.value[k:])
