@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.odometer import travel
+from odocal_ros.nav.odometer import make_travel
 from odocal_ros.offline.survey import fix_path
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.options import SimOptions
@@ -45,7 +45,8 @@ def main():
         t = (t_ns - t_ns[0]) * 1e-9
         cells = []
         for name, x in signals(t, made.odometer.value).items():
-            found = [path.match(t_ns, travel(t, x, OdometerForm(quantity, 0, ''))[0].s).explained
+            found = [path.match(t_ns,
+                                make_travel(t, x, OdometerForm(quantity, 0, ''))[0].s).explained
                      for quantity in ('cumulative', 'rate')]
             cells.append(f'{name} {max(found):.2f}')
         print(f'{scenario}, {noise}, {sigma} m: {len(path.length)} cells; {", ".join(cells)}')

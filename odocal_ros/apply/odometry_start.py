@@ -12,7 +12,7 @@ from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.alignment import C_nL, level_frame
+from odocal_ros.nav.alignment import level_frame, level_to_n_rotation
 from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
@@ -89,7 +89,7 @@ def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting:
     is_level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
     C_Lb = level_frame(mean) if is_level else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
-    C_nb = C_nL(-np.arctan2(forward[1], forward[0])) @ C_Lb
+    C_nb = level_to_n_rotation(-np.arctan2(forward[1], forward[0])) @ C_Lb
     if is_resting:
         bias = w.mean(axis=0)
         noise = np.maximum(grade.gyro_noise / np.sqrt(length), w.std(axis=0) / np.sqrt(len(w)))

@@ -16,14 +16,15 @@ from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-ORDER = ('smoother', 'two_point')
+METHOD_ORDER = ('smoother', 'two_point')
 PLANAR = 'planar'        # the only method of legs that the others cannot compute
-ALWAYS = 'two_point'     # the operator's own marks: computed and shown for every setting
-BY = {'patent': 'smoother', 'wheels': 'smoother'}     # requested: the method that gives the values
+ALWAYS_COMPUTED = 'two_point'     # the operator's own marks: computed and shown for every setting
+# requested: the method that gives the values
+VALUES_FROM = {'patent': 'smoother', 'wheels': 'smoother'}
 # not taken from end points if the smoother refuses it: they have only the accelerometer's level
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # value that a reason is about: left out if another method gives the value
-ABOUT = {
+REASON_ESTIMATES = {
     Code.SCALE_NOT_DETERMINED: 'scale_factor', Code.SCALE_SIGMA_TOO_LARGE: 'scale_factor',
     Code.SCALE_FAR_FROM_NOMINAL: 'scale_factor',
     Code.YAW_NOT_SEPARABLE: 'yaw_mounting_angle', Code.YAW_NOT_DETERMINED: 'yaw_mounting_angle',
@@ -53,9 +54,9 @@ def deciding_methods(method_setting: str | tuple[str, ...], shown: bool = False)
     if not isinstance(method_setting, str):
         return method_setting
     if method_setting in ('auto', 'all'):
-        return ORDER
-    method_setting = BY.get(method_setting, method_setting)
-    return tuple(dict.fromkeys((method_setting, ALWAYS))) if shown else (method_setting,)
+        return METHOD_ORDER
+    method_setting = VALUES_FROM.get(method_setting, method_setting)
+    return tuple(dict.fromkeys((method_setting, ALWAYS_COMPUTED))) if shown else (method_setting,)
 
 
 def choose(methods: Mapping[str, MethodResult],
@@ -96,14 +97,14 @@ def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting:
 
 def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
     """Return the estimates of a LegResult, each from the method that gives it."""
-    return choose(leg.methods, leg.deciding or ORDER)[0]
+    return choose(leg.methods, leg.deciding or METHOD_ORDER)[0]
 
 
 def relevant_reasons(reasons: Iterable[Reason], method: str,
                      estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
     """Return a method's reasons, without those about values that another method gives."""
-    return tuple(r for r in reasons if r.code not in ABOUT or (
-        given := estimates.get(ABOUT[r.code])) is None or given.method == method)
+    return tuple(r for r in reasons if r.code not in REASON_ESTIMATES or (
+        given := estimates.get(REASON_ESTIMATES[r.code])) is None or given.method == method)
 
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
@@ -112,9 +113,9 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
 
     By more than REMARK_SIGMAS of both together, for each parameter.
     """
-    sound = [methods[n] for n in ORDER if n in methods
+    sound = [methods[n] for n in METHOD_ORDER if n in methods
              and methods[n].verdict is not Verdict.REJECTED]
-    if len(sound) < len(ORDER):
+    if len(sound) < len(METHOD_ORDER):
         return []
     (better, other), found = sound, []
     for name, (word, cause) in COMPARED.items():

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from odocal_ros.calib.budget import known_budget
-from odocal_ros.calib.joint import deviate, Z95
+from odocal_ros.calib.joint import NORMAL_95, normal_deviate
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import wrap
@@ -108,7 +108,7 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     freedom = len(y) - 1
     chi2 = float((y - mean) @ np.linalg.solve(allowed, y - mean)) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
-    if freedom and deviate(chi2, freedom) > Z95:
+    if freedom and normal_deviate(chi2, freedom) > NORMAL_95:
         factor = np.sqrt(chi2 / freedom)
         variance *= factor**2
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter}: the scatter of {len(y)} legs is '

@@ -66,9 +66,10 @@ class Evidence:
     by_window: Floats = field(default_factory=lambda: NO_WINDOWS)
 
 
-def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
-             paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
-             covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
+def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,
+                  pin: MarkFix,
+                  paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
+                  covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
     Return the plot data of a leg, at most KEPT_ROWS of each series.
 
@@ -84,23 +85,23 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
     span = (t[0], t[-1]) if len(t) else (0.0, -1.0)
     kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
-    before, after = (_pinned(path, pin) for path in paths)
+    before, after = (_pin_path(path, pin) for path in paths)
     after_n, fixed_n = after(t), after(t_fix)
     yaw = np.unwrap(by_row(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
-    forward = _forward_at(t_fix, t, after_n, sign)
+    forward = _forward_directions(t_fix, t, after_n, sign)
     fix_distance = np.interp(t_fix, t, distance)
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    status, t_out, because = _sent(leg, inputs, kept, span, config)
+    status, t_out, because = _fix_states(leg, inputs, kept, span, config)
 
-    m, k, x = (_few(n) for n in (len(t), len(t_fix), len(because)))
+    m, k, x = (_decimated_rows(n) for n in (len(t), len(t_fix), len(because)))
     return Evidence(
         t=t[m], distance=distance[m], speed=(rate_over_second(t, distance) * sign)[m],
         yaw_rate=rate_over_second(t, yaw)[m], track_n=after_n[m], track_before_n=before(t[m]),
         t_fix=t_fix[k], fix_distance=fix_distance[k], fix_n=fix_n[k], fix_sigma=sigma[k],
-        fix_status=status[k], residual=_split(fixed_n - fix_n, forward)[k],
-        residual_before=_split(before(t_fix) - fix_n, forward)[k],
+        fix_status=status[k], residual=_along_and_across(fixed_n - fix_n, forward)[k],
+        residual_before=_along_and_across(before(t_fix) - fix_n, forward)[k],
         sections=sections(fix_distance, fixed_n, fix_n, sigma),
         t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
         fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
@@ -119,7 +120,7 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
                  if a < span[1] and b > span[0])
 
 
-def _pinned(path: Path, pin: MarkFix) -> Path:
+def _pin_path(path: Path, pin: MarkFix) -> Path:
     here = path(np.array(pin.t))
 
     def at(t: Floats) -> Floats:
@@ -130,8 +131,8 @@ def _pinned(path: Path, pin: MarkFix) -> Path:
     return at
 
 
-def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
-          config: Config) -> tuple[Ints, NDArray[Any], list[str]]:
+def _fix_states(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
+                config: Config) -> tuple[Ints, NDArray[Any], list[str]]:
     """Return the status of kept fixes, the times of the others, and why those are excluded."""
     leg, _ = without_clock_steps(leg)      # as in the screening: inputs have these stamps
     fix, gnss = leg.fix, config.gnss
@@ -154,7 +155,7 @@ def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
     return status, t[out], because
 
 
-def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
+def _forward_directions(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
     """Return the forward direction as complex numbers; at rest the last one: (k,)."""
     z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
     # below 0.2 m/s noise of the track (rounding to counts) dominates the direction
@@ -167,13 +168,13 @@ def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Comp
     return out
 
 
-def _split(off_n: Floats, forward: Complexes) -> Floats:
+def _along_and_across(off_n: Floats, forward: Complexes) -> Floats:
     """Return horizontal offsets, (k, 3) in n, as components forward and left: (k, 2)."""
     z = (off_n[:, 0] + 1j * off_n[:, 1]) * np.conj(forward)
     return np.stack([z.real, z.imag], -1)
 
 
-def _few(n: int) -> Ints:
+def _decimated_rows(n: int) -> Ints:
     """Return at most KEPT_ROWS row numbers, first and last included."""
     return np.unique(np.linspace(0, n - 1, min(n, KEPT_ROWS)).round().astype(int)) if n else \
         np.empty(0, int)

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.calib.linked_legs import LinkedLegs
+from odocal_ros.calib.marginal_information import MarginalInformation, SCATTER_POINTS
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # statistical, limits of the chi-square's normal deviate for disagreement: by chance once in 20
 # sets of sound legs; in one constant once in 300, with some 15 tested again one set in 20
-Z95, DISPUTED_DEVIATES = 1.6449, 2.7
+NORMAL_95, DISPUTED_DEVIATES = 1.6449, 2.7
 # judgement: grid of ln (sigma between legs / usual sigma), for means over it
 SCATTER_GRID = np.linspace(-2.5, 5.0, SCATTER_POINTS)
 # 1 sigma of a permanent change of ln K, by any tyre, gear or counter: physical
@@ -29,7 +29,7 @@ FREE_STEP = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class JointEstimate:
     """Joint estimate of m constants from all J legs."""
 
     names: tuple[str, ...]
@@ -40,17 +40,17 @@ class Joint:
     chi2: float                     # of the legs before any widening
     freedom: float                  # its degrees of freedom
     deviation: Floats  # (J, m) of each leg from the others, in sigmas, without scatter
-    carried: Border                 # information of all legs, for later legs
+    carried: MarginalInformation                 # information of all legs, for later legs
     between: dict[str, float] = field(default_factory=dict)  # scatter between legs
     disputed: tuple[str, ...] = ()  # constants in which legs differ
     factor: float = 1.0             # on all sigmas, included in ``covariance``
     bent: Floats = field(default_factory=lambda: np.zeros(0))  # rad, linearisation errors
 
 
-def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
-          drifting: str = 'scale_factor', angles: Sequence[str] = (),
-          curved: Sequence[str] = (), usual: Mapping[str, float] | None = None,
-          same: Sequence[bool] = ()) -> Joint:
+def fit_jointly(borders: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
+                drifting: str = 'scale_factor', angles: Sequence[str] = (),
+                curved: Sequence[str] = (), usual: Mapping[str, float] | None = None,
+                same: Sequence[bool] = ()) -> JointEstimate:
     """
     Combine legs of one vehicle; all sigmas are widened if legs differ beyond them and the scatter.
 
@@ -63,7 +63,7 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     """
     usual = usual or {}
     legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
-    bent = _bend(legs, [n for n in curved if n in legs.names])
+    bent = _add_linearisation_errors(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
     drives = legs.joined(same)
     scatter = _scatter(drives, usual)
@@ -72,16 +72,18 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     between = {} if alone else scatter.sigmas
     left, rest = (in_scatter + of_legs - of_drives for in_scatter, of_legs, of_drives in zip(
         drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
-    factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
+    factor = float(np.sqrt(left / rest)) if rest and normal_deviate(left,
+                                                                    rest) > NORMAL_95 else 1.0
     where = drives.place(len(drives.borders) - 1)
-    x, C = drives.solve() if alone else _averaged(drives, scatter, usual)
+    x, C = drives.solve() if alone else _average_over_scatter(drives, scatter, usual)
     carried = drives.carried(x[where], scatter.sigmas, scatter.evidence).widened(factor)
-    return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,
-                 chi2, freedom, legs.deviations(), carried, between,
-                 _disputed(legs, between, usual), factor, bent)
+    return JointEstimate(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma,
+                         legs.used,
+                         chi2, freedom, legs.deviations(), carried, between,
+                         _find_disputed(legs, between, usual), factor, bent)
 
 
-def deviate(chi2: float, freedom: float) -> float:
+def normal_deviate(chi2: float, freedom: float) -> float:
     """Return the normal deviate of a chi-square (Wilson and Hilferty 1931)."""
     a = 2 / (9 * freedom)
     out: float = ((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - a)) / np.sqrt(a)
@@ -118,8 +120,8 @@ def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     return Scatter(between, evidence, weights)
 
 
-def _averaged(legs: LinkedLegs, scatter: Scatter,
-              usual: Mapping[str, float]) -> tuple[Floats, Floats]:
+def _average_over_scatter(legs: LinkedLegs, scatter: Scatter,
+                          usual: Mapping[str, float]) -> tuple[Floats, Floats]:
     """Return the unknowns at this scatter, and their covariance averaged over all of it, (S39)."""
     x, C = legs.solve(scatter.sigmas)
     out = C.copy()
@@ -130,8 +132,8 @@ def _averaged(legs: LinkedLegs, scatter: Scatter,
     return x, out
 
 
-def _disputed(legs: LinkedLegs, between: dict[str, float],
-              usual: Mapping[str, float]) -> tuple[str, ...]:
+def _find_disputed(legs: LinkedLegs, between: dict[str, float],
+                   usual: Mapping[str, float]) -> tuple[str, ...]:
     """Return the constants in which legs differ by more than the usual scatter."""
     # of those without scatter, only the one that explains most of the remaining chi-square
     def deviates(name: str) -> float:
@@ -139,7 +141,7 @@ def _disputed(legs: LinkedLegs, between: dict[str, float],
                         else as_they_are)
         left, rest = legs.disagreement({**between, name: np.inf})
         # below, the legs do not determine the constant
-        return deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
+        return normal_deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
     if len(legs.borders) < 2:
         return ()
     as_they_are = legs.disagreement(between)
@@ -149,7 +151,7 @@ def _disputed(legs: LinkedLegs, between: dict[str, float],
     return tuple(name for name in sure if odds[name] > DISPUTED_DEVIATES)
 
 
-def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
+def _add_linearisation_errors(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
     """Add a linearisation error to each leg, by the distance from its point; return it, (J,)."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
@@ -171,12 +173,12 @@ class ScaleStep:
     sigmas: float
 
 
-def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
-                angles: Sequence[str] = ()) -> list[ScaleStep]:
+def scale_steps(borders: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
+                drifting: str, angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
     Return changes of the scale from its prediction by the earlier legs, beyond REMARK_SIGMAS.
 
-    Arguments as for ``joint``. After a change, only later legs predict the scale.
+    Arguments as for ``fit_jointly``. After a change, only later legs predict the scale.
     """
     steps, found = np.array(steps, float), []
     for j in range(1, len(borders)):

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, own_errors
+from odocal_ros.calib.marginal_information import eliminate_own_errors, MarginalInformation
 from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
@@ -79,7 +79,7 @@ class LinkedEquations:
 class LinkedLegs:
     """Borders with common names, the priors of the constants, and the random walk of one."""
 
-    def __init__(self, borders: Sequence[Border], drifting: str,
+    def __init__(self, borders: Sequence[MarginalInformation], drifting: str,
                  steps: Sequence[float] | Floats, angles: Sequence[str] = ()) -> None:
         """Take legs by time; ``steps`` (J - 1,): sigmas of the change of ``drifting``."""
         self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
@@ -107,7 +107,7 @@ class LinkedLegs:
             borders = [*borders, border] if own else [*borders[:-1], borders[-1].plus(border)]
         return LinkedLegs(borders, self.names[self.drifting], self.steps[is_new_leg])
 
-    def take(self, borders: list[Border]) -> None:
+    def take(self, borders: list[MarginalInformation]) -> None:
         """Replace the borders; each must have the names of all."""
         self.borders = borders
         self._clean: dict[float, LegInformation] = {}
@@ -182,13 +182,14 @@ class LinkedLegs:
             np.eye(len(at)) + own * np.multiply.outer(size, size))[1].sum() / 2)
 
     def carried(self, value: Floats, spread: dict[str, float],
-                evidence: dict[str, Floats]) -> Border:
+                evidence: dict[str, Floats]) -> MarginalInformation:
         """Return the information of all legs at ``value``; evidence : of the scatter, by name."""
         equations = self.equations(self.information(), spread, prior=False)
         D, pull = equations.of(self.place(len(self.borders) - 1))
         D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
-        return Border(self.names, value, D, pull - D @ (value - self.borders[-1].value),
-                      self.centre, self.sigma, self.used, evidence)
+        return MarginalInformation(self.names, value, D, pull
+                                   - D @ (value - self.borders[-1].value),
+                                   self.centre, self.sigma, self.used, evidence)
 
     def evidence(self, name: str, points: int) -> Floats:
         """Return the log likelihood of a constant's scatter by combined legs: (points,)."""
@@ -228,11 +229,11 @@ class LinkedLegs:
 
     def _scattering(self, legs: 'LegInformation', spread: dict[str, float] | None
                     ) -> tuple[Floats, Floats, Floats, int]:
-        """Return T and DA of ``own_errors`` by a scatter, the pull of the legs, sum of ranks."""
+        """Return T and DA of ``eliminate_own_errors`` by a scatter, pull, and sum of ranks."""
         # the information of combined legs already includes their scatter
         at = [self.names.index(n) for n in spread or ()]
         sigmas = np.array(list((spread or {}).values())) / self.unit[at]
-        taken, DA, A = own_errors(legs.D, at, sigmas)
+        taken, DA, A = eliminate_own_errors(legs.D, at, sigmas)
         taken[[bool(b.evidence) for b in self.borders]] = 0.0
         free = (np.isinf(sigmas) & taken.any(axis=1)).sum()
         pull = legs.pull - (taken @ (np.swapaxes(A, 1, 2) @ legs.pull[:, :, None]))[:, :, 0]
@@ -243,13 +244,14 @@ class LinkedLegs:
 class LegInformation:
     """Information of J legs, in units of their m constants, without what is rounding."""
 
-    D: Floats        # (J, m, m), as in ``Border``
+    D: Floats        # (J, m, m), as in ``MarginalInformation``
     pull: Floats     # (J, m)
     nearest: Floats  # (J, m) own estimate, less its value: D nearest = pull, also for a scatter
     rank: Ints       # (J,) of D
 
 
-def information(borders: Sequence[Border], unit: Floats, least: float) -> LegInformation:
+def information(borders: Sequence[MarginalInformation], unit: Floats,
+                least: float) -> LegInformation:
     """Return the information of borders in directions of more than ``least``: (m,) unit."""
     J, m = len(borders), len(unit)
     out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
@@ -264,7 +266,7 @@ def information(borders: Sequence[Border], unit: Floats, least: float) -> LegInf
     return out
 
 
-def _on(border: Border, names: tuple[str, ...]) -> Border:
+def _on(border: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
     """Return a border with more names, without information or prior on the new ones."""
     if border.names == names:
         return border
@@ -278,5 +280,6 @@ def _on(border: Border, names: tuple[str, ...]) -> Border:
         out[at] = values
         return out
     # sigma 0: has no effect in the maximum over legs
-    return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
-                  on(border.sigma, 0.0), on(border.used, 0.0), border.evidence)
+    return MarginalInformation(names, on(border.value, 0.0), D, on(border.pull, 0.0),
+                               on(border.centre, 0.0),
+                               on(border.sigma, 0.0), on(border.used, 0.0), border.evidence)

@@ -53,17 +53,17 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     t : (n,) times, s.   position_n : (n, 3) fixes, m, motion removed.   covariance_n : (n, 3, 3)
     stated, m^2.   correlation_time : of the errors, s; 0: white; NaN: estimated from the data.
     """
-    keep = _near_middle(position_n, covariance_n)
+    keep = _inliers(position_n, covariance_n)
     t, position_n, covariance_n = t[keep], position_n[keep], covariance_n[keep]
     weight = 1 / np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2)
     weight = weight / weight.sum()
     mean = weight @ position_n
     whole = np.einsum('n,nij->ij', weight, covariance_n)
-    share = _share(t, position_n - mean, whole, weight, correlation_time)
+    share = _variance_share(t, position_n - mean, whole, weight, correlation_time)
     return mean, whole * share, int(keep.sum()), int((~keep).sum())
 
 
-def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
+def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
     """Return the fixes within five robust sigmas of the median, horizontally and in height."""
     off = np.abs(position_n - np.median(position_n, axis=0))
     level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
@@ -74,15 +74,15 @@ def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
     return out
 
 
-def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
-           correlation_time: float) -> float:
+def _variance_share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
+                    correlation_time: float) -> float:
     """Return the variance of the mean over that of a single fix: docs/method.md (T7)."""
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
         return white
     if not np.isnan(correlation_time):
-        return _left(t, weight, correlation_time)
+        return _mean_variance_share(t, weight, correlation_time)
     if n < FEWEST_SCATTERED:
         return 1.0
     sigma = np.sqrt(np.diag(whole))
@@ -95,11 +95,12 @@ def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
         return white * (scatter if scatter > 1 + slack else 1.0)
     fast = min(step, 1.0)
     slow = max(1.0, scatter) - fast
-    out: float = fast * white + slow * _left(t, weight, _correlation_time(t, z, fast, slow))
+    out: float = fast * white + slow * _mean_variance_share(t, weight,
+                                                            _correlation_time(t, z, fast, slow))
     return out
 
 
-def _left(t: Floats, weight: Floats, tau: float) -> float:
+def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
     """Return the variance share of a mean of Gauss-Markov errors with correlation time tau, s."""
     if tau == np.inf:
         return 1.0
@@ -236,20 +237,20 @@ def with_slow_errors(mark: MarkFix, slow: float, tau: float, span: tuple[float, 
     return replace(mark, covariance_n=mark.covariance_n + more)
 
 
-def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, way_n: Floats,
-                           chord_n: Floats, residual: Floats, covariance_n: Floats,
+def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats,
+                           path_n: Floats, chord_n: Floats, residual: Floats, covariance_n: Floats,
                            drift_n: Floats) -> tuple[MarkFix, MarkFix]:
     """
     Return both marks of a leg with at least the variance of its slow fix errors.
 
     marks : (MarkFix, MarkFix) with the variance of their own fixes.   spans : (k, 2) standstills,
-    s.   t, way_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s,
+    s.   t, path_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s,
     corrected track there, m, track minus fix, m, and stated covariance, m^2.   chord_n : (3,) from
     mark to mark, m.   drift_n : (3, k) possible track error by gyro drift, m.
     """
     along = chord_n[:2] / np.hypot(*chord_n[:2])
     stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)
-    slow, tau = slow_variance(t, residual[:, :2] @ along, way_n[:, :2] @ along, stated,
+    slow, tau = slow_variance(t, residual[:, :2] @ along, path_n[:, :2] @ along, stated,
                               float(np.linalg.norm(along @ drift_n[:2])))
     up_ratio = np.median(covariance_n[:, 2, 2] / stated)
     start, end = (with_slow_errors(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),

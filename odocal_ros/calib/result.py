@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, Carried
 from odocal_ros.calib.evidence import Evidence
+from odocal_ros.calib.marginal_information import CarriedInformation, MarginalInformation
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
@@ -71,7 +71,8 @@ class MethodResult:
     parameters: tuple[str, ...] = ()  # names, in the order of the rows of the sources
     sources: tuple[Source, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
-    border: Border | None = None      # of the leg, or of all; None: the method has none
+    # of the leg, or of all; None: the method has none
+    border: MarginalInformation | None = None
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -160,7 +161,7 @@ class Calibration:
     legs: tuple[LegResult, ...]
     imu_rotation_xyzw: tuple[float, ...] | None = None  # base_link <- imu frame
     imu_rotation_rpy: tuple[float, ...] | None = None
-    carried: Carried | None = None  # information for later legs
+    carried: CarriedInformation | None = None  # information for later legs
 
     @property
     def verdict(self) -> Verdict:

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.linked_legs import LinkedLegs
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.result import MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
@@ -174,7 +174,7 @@ def _parameter_sigmas(method: MethodResult) -> Floats:
     return sigmas
 
 
-def _border(method: MethodResult) -> Border:
+def _border(method: MethodResult) -> MarginalInformation:
     assert method.border is not None, 'a fit has one'
     return method.border
 

@@ -26,8 +26,8 @@ from odocal_ros.nav.rotations import (
     quat_conjugate,
     quat_from_rotvec,
     quat_multiply,
+    rotate,
     skew,
-    turn,
 )
 from odocal_ros.nav.strapdown import prefix_product
 
@@ -92,7 +92,6 @@ STEPS_AT_A_TIME = 2048
 # definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f
 # with its bias): the g-sensitivity of the gyro has the latter, so that b_a does not turn
 OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
-
 
 Some = TypeVar('Some', Intervals, Points)
 
@@ -174,17 +173,18 @@ class _Chunk:
         # integral of the attitude over a step of unit length, and the integral of that
         self.G = np.eye(3) + skew(self.turn_mean) + square / 6
         self.GG = np.eye(3) / 2 + skew(self.turn_mean / 2 - self.turn / 12) + square / 24
-        q = quat_multiply(quat_from_rotvec(-turn(self.G, gyro)), quat_from_rotvec(imu.turn[rows]))
+        q = quat_multiply(quat_from_rotvec(-rotate(self.G, gyro)),
+                          quat_from_rotvec(imu.turn[rows]))
         q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
         back = quat_conjugate(q[self.key[:-1]])[self.own]
         self.R = matrix_from_quat(quat_multiply(back, q[:-1]))
         self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
         # a rotation that grows over the step multiplies the force times the time since its start
         self.grows = np.eye(3) + skew(self.turn) / 3
-        dv, dp, turned = imu.dv[rows], imu.dp[rows], turn(self.grows, gyro)
-        dv, dp = (dv - np.cross(turned, dv - dp / dt) - turn(self.G, accel),
-                  dp - np.cross(turned, dv * dt / 6) - turn(self.GG, accel) * dt)
-        self.step_v, self.step_p = turn(self.R, dv), turn(self.R, dp)
+        dv, dp, turned = imu.dv[rows], imu.dp[rows], rotate(self.grows, gyro)
+        dv, dp = (dv - np.cross(turned, dv - dp / dt) - rotate(self.G, accel),
+                  dp - np.cross(turned, dv * dt / 6) - rotate(self.GG, accel) * dt)
+        self.step_v, self.step_p = rotate(self.R, dv), rotate(self.R, dp)
         self.v, self.dv = self._running(self.step_v)
         self.p, self.dp = self._running(self.v * dt + self.step_p)
         # integrals of R over a step, single and double

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
 from odocal_ros.calib.combine import newest
-from odocal_ros.calib.joint import FREE_STEP, Joint, joint, scale_steps, ScaleStep
+from odocal_ros.calib.joint import fit_jointly, FREE_STEP, JointEstimate, scale_steps, ScaleStep
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.value_limits import cause_of_change, format_change
 from odocal_ros.data.arrays import Floats, Ints
@@ -62,10 +62,10 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
-                  CONSTANTS[:PARAMETER_COUNT],
-                  dict(zip(CONSTANTS[:PARAMETER_COUNT], SCATTER, strict=True)),
-                  (days == 0).tolist())
+    found = fit_jointly(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
+                        CONSTANTS[:PARAMETER_COUNT],
+                        dict(zip(CONSTANTS[:PARAMETER_COUNT], SCATTER, strict=True)),
+                        (days == 0).tolist())
     at = [found.names.index(name) for name in CONSTANTS]
     C = with_model_floor(found.covariance[np.ix_(at, at)])
     common = _common_sources(legs)
@@ -101,7 +101,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
                         found.carried)
 
 
-def _share_sizes(borders: Sequence[Border]) -> list[Border]:
+def _share_sizes(borders: Sequence[MarginalInformation]) -> list[MarginalInformation]:
     """Return borders with the same sizes of imperfections: geometric means by information."""
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
@@ -133,7 +133,7 @@ def _leg_name(number: int) -> str:
     return f'leg {number}' if number else 'the saved result'
 
 
-def _disagreement_reasons(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
+def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
     J, reasons = len(found.deviation), list[Reason]()
     unexplained = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
@@ -157,7 +157,7 @@ def _disagreement_reasons(found: Joint, numbers: list[int]) -> tuple[Reason, ...
     return tuple(reasons)
 
 
-def _largest_deviation(found: Joint, numbers: list[int]) -> str:
+def _largest_deviation(found: JointEstimate, numbers: list[int]) -> str:
     """Return the largest deviation of a constant without scatter between legs, as text."""
     own = [i for i, name in enumerate(found.names) if name not in found.between]
     z = found.deviation[:, own]
@@ -189,7 +189,7 @@ def _error_sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[S
             Source('model', np.diag(MODEL_FLOOR)))
 
 
-def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...],
+def _details(found: JointEstimate, value: Floats, C: Floats, sources: tuple[Source, ...],
              legs: int) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(C))
     return {

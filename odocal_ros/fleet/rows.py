@@ -22,7 +22,7 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.calib import result
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.errors import BadData
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file, write_text
@@ -161,8 +161,8 @@ def read_rows(paths: Iterable[Path | str]) -> Iterator[Row]:
 
 
 STORED_TYPES = {kind.__name__: kind for kind in (
-    Border, result.Estimate, result.LegResult, result.MethodResult, result.PerDistance, Reason,
-    result.Source, result.TrackCheck)}
+    MarginalInformation, result.Estimate, result.LegResult, result.MethodResult,
+    result.PerDistance, Reason, result.Source, result.TrackCheck)}
 TYPE_KEY = '~'      # the key of an object's type
 
 

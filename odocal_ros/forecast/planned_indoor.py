@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from odocal_ros.calib.planar.fit import fit_at, LEAST, LEVELS, priors
-from odocal_ros.calib.planar.result import result_of
-from odocal_ros.calib.planar.run import of_sides, rows_of, Run, Wheels
+from odocal_ros.calib.planar.result import make_planar_result
+from odocal_ros.calib.planar.run import make_side_wheels, Run, wheel_rows, Wheels
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.errors import BadUsage
@@ -170,20 +170,19 @@ def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Fl
 
 
 def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
-    """Return the wheels of body increments, (n, 3), and the constants after the curvature."""
+    """Return the wheels of body increments, (n, 3), and the constants after the inverse width."""
     if robot.drive in settings.HOLONOMIC:
-        rows = rows_of(robot.drive, robot.wheels)
+        rows = wheel_rows(robot.drive, robot.wheels)
         count = (d * [1.0, 1.0, robot.width / 2]) @ rows.T
         return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == settings.MECANUM)
-    wheel_difference = d[:, 2] * robot.width
+    half = d[:, 2] * robot.width / 2      # of the difference of the wheel paths
     arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
 
-    def of(wheel_difference: Floats) -> Wheels:
-        return of_sides(d[:, 0] - wheel_difference / 2, d[:, 0] + wheel_difference / 2,
-                        robot.drive)
+    def wheels_of(half: Floats) -> Wheels:
+        return make_side_wheels(d[:, 0] - half, d[:, 0] + half, robot.drive)
     for _ in range(50 * (robot.drive == settings.SKID)):      # the width depends on the paths
-        wheel_difference = d[:, 2] / (1 / robot.width + arc * of(wheel_difference).straightness)
-    return of(wheel_difference), [arc] * (robot.drive == settings.SKID)
+        half = d[:, 2] / (1 / robot.width + arc * wheels_of(half).straightness) / 2
+    return wheels_of(half), [arc] * (robot.drive == settings.SKID)
 
 
 def _position_nodes(motion: RobotMotion, robot: Robot) -> Ints:
@@ -203,7 +202,7 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
     found = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)
-    return result_of(found, '1', 0.0, config)
+    return make_planar_result(found, '1', 0.0, config)
 
 
 def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:

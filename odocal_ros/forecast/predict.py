@@ -24,12 +24,12 @@ from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.nav.alignment import (
     Alignment,
     COMPASS_LIMIT,
-    complete,
     COURSE_DISTANCE,
     gyrocompass,
     Level,
     level_at_rest,
     level_in_motion,
+    make_alignment,
     MOTION_LEVEL,
 )
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
@@ -223,9 +223,9 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
         found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '
                         'bias are estimated from the drive'),)
     yaw, sigma, source, why = _heading(drive, config.alignment, fix_sigma, level, grade)
-    alignment = complete(level, yaw, sigma, source, source != 'gyrocompass',
-                         Origin(drive.latitude, drive.longitude, drive.height), grade,
-                         grade.gyro_noise)
+    alignment = make_alignment(level, yaw, sigma, source, source != 'gyrocompass',
+                               Origin(drive.latitude, drive.longitude, drive.height), grade,
+                               grade.gyro_noise)
     return alignment, found + why
 
 

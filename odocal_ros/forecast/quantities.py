@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.choice import ABOUT, deciding_methods, PLANAR
+from odocal_ros.calib.choice import deciding_methods, PLANAR, REASON_ESTIMATES
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.forecast.planned_drive import drive_from_rates
@@ -205,8 +205,8 @@ def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 def check_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str,
                                                                                           str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
-    names_with_reason = {ABOUT[r.code] for r in calibration.reasons
-                         if r.code in ABOUT and r.code.severity is not Verdict.ACCEPTED}
+    names_with_reason = {REASON_ESTIMATES[r.code] for r in calibration.reasons
+                         if r.code in REASON_ESTIMATES and r.code.severity is not Verdict.ACCEPTED}
     return check_estimates(calibration.estimates, config, two_wheels,
                            calibration.verdict is not Verdict.REJECTED, names_with_reason)
 

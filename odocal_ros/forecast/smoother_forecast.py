@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.choice import ABOUT, choose, deciding_methods, PLANAR
+from odocal_ros.calib.choice import choose, deciding_methods, PLANAR, REASON_ESTIMATES
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData, OdocalError
@@ -75,7 +75,7 @@ def add_running_estimate(forecast: Forecast, running: RunningEstimate, config: C
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
     faults = [r for r in method.reasons
-              if r.code.severity is Verdict.REJECTED and r.code not in ABOUT]
+              if r.code.severity is Verdict.REJECTED and r.code not in REASON_ESTIMATES]
     if faults:      # its values are of no use then
         return replace(forecast, faults=tuple(faults))
     if method.verdict is not Verdict.REJECTED:
@@ -170,7 +170,7 @@ def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> 
         raise BadData(method.reasons[0].text)
     faults = tuple(r for r in (*result.reasons, *method.reasons)
                    if r.code.severity is Verdict.REJECTED
-                   and r.code not in {*ABOUT, *TEMPORARY_CODES})
+                   and r.code not in {*REASON_ESTIMATES, *TEMPORARY_CODES})
     estimates, _ = choose(result.methods, config.method)
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),

@@ -5,7 +5,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from odocal_ros.calib.choice import ABOUT, deciding_methods
+from odocal_ros.calib.choice import deciding_methods, REASON_ESTIMATES
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import quantities
@@ -244,5 +244,5 @@ def _remedies(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
     labels = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
     return list(dict.fromkeys(
-        f'for the {labels[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
-        for r in reasons if ABOUT.get(r.code) in labels))
+        f'for the {labels[REASON_ESTIMATES[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
+        for r in reasons if REASON_ESTIMATES.get(r.code) in labels))

@@ -8,7 +8,7 @@ from enum import Enum
 from math import nan
 from typing import Any
 
-from odocal_ros.calib.border import Carried
+from odocal_ros.calib.marginal_information import CarriedInformation
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.forecast import Forecast
@@ -91,7 +91,7 @@ class Session:
         self.lost = ''      # why the last leg was dropped automatically
         self.is_automatic = False      # leg.automatic started the last leg
         self.unused: Reason | None = None      # why the last automatic leg is not used
-        self.carried: Carried | None = None    # information of released and earlier legs
+        self.carried: CarriedInformation | None = None    # of released and earlier legs
         self.marks: list[FloorMark] = []       # since the pre-roll of the last leg
         self._last_id = 0
 
@@ -160,7 +160,7 @@ class Session:
         self.event, self.unused = 'cancelled', reason
         self.settle(self.calibration)
 
-    def set_carried(self, carried: Carried | None, legs: int) -> None:
+    def set_carried(self, carried: CarriedInformation | None, legs: int) -> None:
         """Release the first kept legs: their information is carried over."""
         self.carried, self.legs = carried, self.legs[legs:]
 

@@ -17,7 +17,7 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.task import Future
 from std_msgs.msg import Header
 
-from odocal_ros.calib.border import Carried
+from odocal_ros.calib.marginal_information import CarriedInformation
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
@@ -60,7 +60,7 @@ class Computed:
     results: tuple[LegResult, ...]
     paths: Paths
     calibration: Calibration
-    carried: Carried | None
+    carried: CarriedInformation | None
     folded: int
 
 
@@ -73,7 +73,8 @@ class UnusedLeg:
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
-            kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
+            kept: list[tuple[LegResult, ...]], config: Config, carried: CarriedInformation
+            | None = None,
             is_automatic: bool = False, progress: Callable[[Stage], None] | None = None,
             ) -> Computed | UnusedLeg:
     """Return a leg's result, its combination with the kept legs, and the paths to publish."""
@@ -94,7 +95,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     return Computed(results, paths, calibration, carried, folded)
 
 
-def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
+def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,
               ) -> tuple[Calibration, Paths]:
     return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 

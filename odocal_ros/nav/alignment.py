@@ -81,7 +81,7 @@ def level_frame(up_b: Floats) -> Floats:
     return np.stack([np.cross(y, u), y, u])
 
 
-def C_nL(yaw: float) -> Floats:
+def level_to_n_rotation(yaw: float) -> Floats:
     """Return the rotation from L to n for the ENU yaw of L's x axis, rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -151,7 +151,7 @@ def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, flo
     return float(yaw), float(np.hypot(gyro, level.level_sigma * np.tan(latitude)))
 
 
-def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
+def earth_rate_deviation(level: Level, latitude: float, grade: Grade) -> float:
     """Return the deviation of the rate at rest from the Earth's, level or up, in sigmas."""
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
@@ -161,14 +161,14 @@ def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
     return float(np.abs(off / sigma).max())
 
 
-def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
-             origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
+def make_alignment(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
+                   origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
     Return the Alignment by a level and a heading, with the gyro bias by a standstill.
 
     yaw : of L's x axis in ENU at the level's position, rad.   yaw_sigma : of ``yaw``, rad.
     """
-    C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
+    C_nb = level.C_np @ level_to_n_rotation(yaw) @ level.C_Lb
     bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, origin, grade)
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),

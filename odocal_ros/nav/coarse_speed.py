@@ -82,7 +82,7 @@ class CoarseSpeed:
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
-    def way_variance(self, t: Floats) -> Floats:
+    def travel_variance(self, t: Floats) -> Floats:
         """
         Return the variance of travel between n times, s, by rounding: (n - 1,) scale units^2.
 
@@ -119,7 +119,7 @@ class CoarseSpeed:
         outer = np.maximum(np.abs(cell[at]), np.abs(cell[at + 1]))
         inner = np.minimum(np.abs(cell[at]), np.abs(cell[at + 1]))
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
-        gained = _rates(middle, edge, q) * h
+        gained = _rate_limits(middle, edge, q) * h
         jump = np.where(gained > q, 2, jump)    # there a step may pass two edges, or none
         least_cell = 2    # cells from zero: the first may have a dead band
         single = (jump == 1) & (outer >= least_cell) & (inner > 0)
@@ -137,7 +137,7 @@ class CoarseSpeed:
         return SpeedInstants(when[order], value[order], np.sign(value[order]), sigma[order])
 
 
-def _rates(t: Floats, edge: Floats, q: float) -> Floats:
+def _rate_limits(t: Floats, edge: Floats, q: float) -> Floats:
     """
     Return an upper limit of the rate of change at each crossing, (m,): the larger of both sides.
 
@@ -153,9 +153,9 @@ def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     return floored
 
 
-def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
+def find_coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     """Return the grid of a speed from its rows, (n,) s and scale units per s; None without one."""
-    step = grid(value)
+    step = find_grid_step(value)
     top = np.abs(value).max(initial=0.0)
     knots = np.ones(len(value), bool)
     if len(value) > 2:
@@ -164,14 +164,14 @@ def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     changes = np.diff(value, prepend=value[:1]) != 0
     knot_share = 0.5    # of the rows that change: an interpolation has fewer knots
     if (knots & changes).sum() < knot_share * changes.sum():
-        own = grid(value[knots])
+        own = find_grid_step(value[knots])
         knot_step = 1.5    # least ratio of the knots' grid to that of all rows
         if own and own > knot_step * (step or 0.0):
             return CoarseSpeed(own, t[knots], value[knots], True)
     return CoarseSpeed(step, t, value) if step else None
 
 
-def grid(value: Floats) -> float | None:
+def find_grid_step(value: Floats) -> float | None:
     """
     Return the step of the grid of all values other than zero, None if they are not on a grid.
 
@@ -186,7 +186,7 @@ def grid(value: Floats) -> float | None:
                          return_counts=True)
     fewest_values = 20    # distinct values needed to detect a grid
     if len(u) < fewest_values:
-        return _of_few(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
+        return _step_of_few_values(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
     if not _may_be_grid(u):
         return None
     phase = _coherence(u, GRID_PADDED)
@@ -196,7 +196,7 @@ def grid(value: Floats) -> float | None:
         return None
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
-    step = _refined(value, 1 / float(f[peak]))
+    step = _refine_step(value, 1 / float(f[peak]))
     fewest_cells = 6    # cells with values
     # values accumulate at the begin of a cruise: two or three such speeds are on some grid
     return step if len(np.unique(np.rint(value / step))) >= fewest_cells else None
@@ -221,18 +221,18 @@ def _may_be_grid(u: Ints) -> bool:
     return bool(_coherence(u, GRID_ROUGH)[fewest:].max() >= left)
 
 
-def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
+def _step_of_few_values(value: Floats, u: Floats, count: Ints) -> float | None:
     """Return the step that divides few distinct values u, each repeated many times."""
     few_values, often_sent = 4, 5    # least number of distinct values, and of repetitions
     if len(u) < few_values or np.median(count) < often_sent:
         return None
-    step = _refined(value, float(np.diff(u).min()))
+    step = _refine_step(value, float(np.diff(u).min()))
     off = u / step - np.rint(u / step)
     divides_cell = 0.02    # of a cell, largest deviation of values from the grid
     return step if np.abs(off).max() < divides_cell else None
 
 
-def _refined(value: Floats, step: float) -> float:
+def _refine_step(value: Floats, step: float) -> float:
     """Return the step, near a given one, whose multiples fit the values best."""
     cell = np.rint(value / step)
     for _ in range(3):
@@ -265,7 +265,7 @@ class HeldSpeed(CoarseSpeed):
         return SpeedInstants(self.t[row], v[row], np.sign(v[row]), sigma)
 
 
-def held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
+def find_held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
     """Return the held speed from rows (n,); None if the speed is not held."""
     change = np.diff(value)
     size = np.abs(change[(value[1:] != 0) & (value[:-1] != 0)])

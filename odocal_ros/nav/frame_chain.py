@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 LONGEST_STEP_NS = 500_000_000
 RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
 MOST_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
-Known = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
+NewPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
 Values = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
 
 
@@ -59,7 +59,7 @@ class FrameChain:
         self._static: dict[str, tuple[str, Values]] = {}
         self._path: list[str] | None = None      # children, from the parent downwards
         self._last: Values | None = None         # of the moving frame next to the parent
-        self._done: list[Known] = []             # before the stamps started again
+        self._done: list[NewPositions] = []             # before the stamps started again
 
     def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
             ) -> None:
@@ -105,13 +105,13 @@ class FrameChain:
             here = self._moving[here].parent if here in self._moving else self._static[here][0]
         return here, path
 
-    def take(self) -> Known:
+    def take(self) -> NewPositions:
         """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
         done, self._done = [*self._done, self._known()], []
         stamps, received, position = (np.concatenate(some) for some in zip(*done, strict=True))
         return stamps, received, position
 
-    def _known(self) -> Known:
+    def _known(self) -> NewPositions:
         """Return the new positions since the last restart of the stamps."""
         nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
@@ -136,16 +136,16 @@ class FrameChain:
                 np.array(first.values[:n]))
             edge = self._moving.get(name, first)
             if edge is not first:
-                values, near = _interpolated(edge, stamps)
+                values, near = _interpolate(edge, stamps)
                 good &= near
-            position = _placed(values, position)
+            position = _to_parent_frame(values, position)
         first.drop(n)
         for edge in others:     # the previous one is needed for later positions
             edge.drop(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
         return stamps[good], received[good], position[good]
 
 
-def _interpolated(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
+def _interpolate(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
     """Return the transforms of a frame at stamps, (n, 7), and a mask of usable ones, (n,)."""
     t, values = np.array(edge.stamps), np.array(edge.values)
     before = np.searchsorted(t, stamps, side='right') - 1
@@ -162,7 +162,7 @@ def _interpolated(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
     return a + share * (b - a), good
 
 
-def _placed(values: Floats, position: Floats) -> Floats:
+def _to_parent_frame(values: Floats, position: Floats) -> Floats:
     """
     Convert positions (n, 3) from the child frame to the parent frame.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, runs, Values
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, held_speed, HeldSpeed
+from odocal_ros.nav.coarse_speed import CoarseSpeed, find_coarse_speed, find_held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is not motion
@@ -64,8 +64,8 @@ class Travel:
         return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 
-def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
-           name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
+def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
+                name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
     Return the travel from an odometer's rows, and reasons.
 
@@ -78,7 +78,7 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     coarse = None
     if form.quantity == 'rate':
         speed = value.astype(float, copy=False)
-        coarse = _coarse(t, -speed if reversed_counts else speed)
+        coarse = _find_coarse_speed(t, -speed if reversed_counts else speed)
         if isinstance(coarse, HeldSpeed):
             speed = -coarse.value if reversed_counts else coarse.value
         step = (speed[:-1] + speed[1:]) / 2 * np.diff(t)
@@ -100,9 +100,9 @@ def _quantum(step: Floats) -> float:
     return float(np.gcd.reduce(size.astype(np.int64)))
 
 
-def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:
+def _find_coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     """Return the grid of a speed; a held speed takes precedence over a finer grid."""
-    coarse, held = coarse_speed(t, value), held_speed(t, value)
+    coarse, held = find_coarse_speed(t, value), find_held_speed(t, value)
     return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
 
@@ -137,11 +137,11 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
     raw = np.diff(value)
     counted = without_rollover(raw, modulus)
     rolled, step = counted != raw, counted.astype(float)
-    resets = _resets(t, step, whole)
+    resets = _find_resets(t, step, whole)
     reasons: tuple[Reason, ...] = ()
     if resets.any():
         first = int(np.argmax(resets))
-        step, count = _bridged(t, step, resets), int(resets.sum())
+        step, count = _bridge_resets(t, step, resets), int(resets.sum())
         jump = value[first + 1].item() - value[first].item()
         by = f'{jump:+}' if whole else f'{jump:+.6g}'
         reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {by} at t = '
@@ -156,7 +156,7 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
     return step, reasons
 
 
-def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
+def _find_resets(t: Floats, step: Floats, whole: bool) -> Bools:
     """Return a mask of impossible steps: far above the speed of the drive, single or in pairs."""
     dt = np.diff(t)
     if len(step) < FEWEST_STEPS or not step.any():
@@ -174,7 +174,7 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
     return far
 
 
-def _bridged(t: Floats, step: Floats, resets: Bools) -> Floats:
+def _bridge_resets(t: Floats, step: Floats, resets: Bools) -> Floats:
     dt = np.diff(t)
     step = step.copy()
     good = np.flatnonzero(~resets & (dt > 0))

@@ -21,7 +21,7 @@ from odocal_ros.data.arrays import Floats, Ints
 LEAST_LAG2 = 1e-4
 
 
-def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
+def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
               ) -> tuple[Floats, Floats]:
     """
     Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
@@ -33,7 +33,7 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
         if square > 0:
             track, tau = _Track(t, place, velocity), np.sqrt(square)
             return track.smoothed(at + tau, tau) - track.at(at)
-        return _tracked(t, place, velocity, at, np.sqrt(-square / 2))
+        return _tracking_error(t, place, velocity, at, np.sqrt(-square / 2))
 
     if abs(square) <= LEAST_LAG2:
         least = -LEAST_LAG2 if square < 0 else LEAST_LAG2
@@ -44,7 +44,8 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     return here, (off(square * (1 + lag2_step)) - here) / (square * lag2_step)
 
 
-def _bends(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats, Floats]:
+def _cubic_coefficients(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats,
+                                                                             Floats]:
     """Return (n - 1, 1) lengths of the intervals, (n - 1, 3) p'' / 2 at their start, p''' / 6."""
     T = np.diff(t)[:, None]
     mean = np.diff(place, axis=0) / T
@@ -52,16 +53,16 @@ def _bends(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats, 
             (velocity[:-1] + velocity[1:] - 2 * mean) / T**2)
 
 
-def odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share: float,
-                   log_time: float) -> tuple[Floats, Floats, Floats]:
+def own_odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share: float,
+                       log_time: float) -> tuple[Floats, Floats, Floats]:
     """
     Return fix errors from the receiver's own odometer, and derivatives by share and log_time.
 
     The error is ``share`` times the motion until ``at``, weighted by exp(-age / time): satellites
     correct the position of its odometer within that time.
 
-    t, place, velocity, at : as for ``smoothing``.   share : relative scale error of its odometer.
-    log_time : logarithm of s.
+    t, place, velocity, at : as for ``smoothing_error``.   share : relative scale error of its
+    odometer.   log_time : logarithm of s.
     """
     track, time, step = _Track(t, place, velocity), np.exp(log_time), 1e-3    # of the logarithm
     motion = track.at(at) - track.smoothed(at, time)
@@ -77,7 +78,7 @@ class _Track:
         self.t = np.append(t, t[-1] + beyond)
         self.place = np.concatenate([place, place[-1:] + beyond * velocity[-1:]])
         self.velocity = np.concatenate([velocity, velocity[-1:]])
-        self.T, self.bend, self.twist = _bends(self.t, self.place, self.velocity)
+        self.T, self.bend, self.twist = _cubic_coefficients(self.t, self.place, self.velocity)
 
     def _cubic(self, at: Floats) -> tuple[Ints, Floats, Floats]:
         """Return intervals (k,), times in them (k, 1) and positions (k, 3)."""
@@ -110,15 +111,15 @@ class _Track:
         return out
 
 
-def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
+def _tracking_error(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
     """Return the error at ``at`` of a filter of position and velocity, (k, 3)."""
-    T, bend, twist = _bends(t, place, velocity)
+    T, bend, twist = _cubic_coefficients(t, place, velocity)
 
     def forced(k: Ints | slice, s: Floats) -> Floats:
         jerk = 6 * twist[k]
         return tau**2 * np.stack([np.sqrt(2) * tau * jerk - 2 * bend[k] - jerk * s, -jerk], 1)
 
-    swing = _swing(np.append(0.0, T[:-1, 0]), tau)
+    swing = _transition_matrices(np.append(0.0, T[:-1, 0]), tau)
     first, last = forced(slice(None), np.zeros_like(T)), forced(slice(None), T)
     left = -first
     left[1:] += last[:-1]       # error and its derivative are continuous where two cubics meet
@@ -127,11 +128,11 @@ def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float)
     k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
     s = (at - t[k])[:, None]
     off: Floats = forced(k, s)[:, 0] + np.einsum(
-        'ki,kij->kj', _swing(np.maximum(s[:, 0], 0.0), tau)[:, 0], left[k])
+        'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], left[k])
     return off
 
 
-def _swing(s: Floats, tau: float) -> Floats:
+def _transition_matrices(s: Floats, tau: float) -> Floats:
     """Return transition matrices of an error and its derivative over s: (k, 2, 2)."""
     w = np.sqrt(0.5) / tau      # decay rate and frequency at a damping of sqrt(1/2)
     decay, sine, cosine = np.exp(-w * s), np.sin(w * s), np.cos(w * s)

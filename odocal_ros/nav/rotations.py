@@ -76,7 +76,7 @@ def transpose(C: Floats) -> Floats:
     return np.swapaxes(C, -1, -2)
 
 
-def turn(C: Floats, vectors: Floats) -> Floats:
+def rotate(C: Floats, vectors: Floats) -> Floats:
     """Return C @ v row by row: (K, 3, 3), (K, 3)."""
     out: Floats = np.einsum('kij,kj->ki', C, vectors)
     return out

@@ -21,7 +21,7 @@ from odocal_ros.library.topics import COMMANDS, GNSS, NEVER, without_estimates
 from odocal_ros.messages.decode import Deserialize
 from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.nav.odometer import travel
+from odocal_ros.nav.odometer import make_travel
 from odocal_ros.offline.survey import FixPath, Match
 from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 
@@ -168,8 +168,8 @@ def _best_meaning(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: F
     for quantity in _quantities(path):
         counts = is_whole and quantity == 'cumulative'
         wrap = _rollover(value) if counts else 0
-        s = travel(seconds, value.astype(np.int64) if counts else value,
-                   OdometerForm(quantity, wrap, ''))[0].s
+        s = make_travel(seconds, value.astype(np.int64) if counts else value,
+                        OdometerForm(quantity, wrap, ''))[0].s
         s = s * stride if quantity == 'increment' else s
         match = fixes.match(t_ns, s)
         if match.follows:
@@ -220,7 +220,7 @@ def match_of(rows: OdometerSamples, form: OdometerForm, path: FixPath) -> Match:
     keep = (rows.value == rows.value) & (t_ns > 0)
     keep[1:] &= t_ns[1:] > t_ns[:-1]
     t_ns = t_ns[keep]
-    s = travel((t_ns - t_ns[:1]) * 1e-9, rows.value[keep], form)[0].s
+    s = make_travel((t_ns - t_ns[:1]) * 1e-9, rows.value[keep], form)[0].s
     return path.match(t_ns, s)
 
 

@@ -9,7 +9,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from odocal_ros.calib.choice import ABOUT, leg_estimates
+from odocal_ros.calib.choice import leg_estimates, REASON_ESTIMATES
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.plot_style import apply_style, Drawing
@@ -98,7 +98,7 @@ def _main_reason(reasons: tuple[Reason, ...]) -> Reason | None:
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
         return None
-    return min(groups[0][2], key=lambda r: r.code not in ABOUT)
+    return min(groups[0][2], key=lambda r: r.code not in REASON_ESTIMATES)
 
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:

@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-from odocal_ros.calib.border import Carried, carried_from
+from odocal_ros.calib.marginal_information import CarriedInformation, read_carried
 from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, plain, SCHEMA
@@ -38,8 +38,8 @@ class Stored:
     # parameter -> source -> one-sigma share in its unit, shared by all legs; of its method
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
-    carried: Carried | None = None      # information for later legs, with leg.automatic
-    imu: Carried | None = None          # its information on the IMU
+    carried: CarriedInformation | None = None      # information for later legs, with leg.automatic
+    imu: CarriedInformation | None = None          # its information on the IMU
 
     @property
     def usable(self) -> bool:
@@ -101,11 +101,11 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
         {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
          if key not in BESIDE},
         str(content.get('vehicle') or ''),
-        *(carried_from(content[part]) if isinstance(content.get(part), dict) else None
+        *(read_carried(content[part]) if isinstance(content.get(part), dict) else None
           for part in ('carried', 'imu')))
 
 
-def known_imu(config: Config) -> Carried | None:
+def known_imu(config: Config) -> CarriedInformation | None:
     """
     Return the IMU information of the result at ``imu.constants``, None without one.
 

@@ -15,7 +15,7 @@ from enum import Enum
 import math
 from typing import Any
 
-from odocal_ros.calib.choice import ABOUT
+from odocal_ros.calib.choice import REASON_ESTIMATES
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -119,7 +119,7 @@ def _explain_undecided(held: ValueDecision, reasons: tuple[Reason, ...]) -> tupl
     name, found = held.name.replace('_', ' '), held.estimate
     if found.value is None or found.sigma is None:
         about = 'scale_factor' if held.name == 'scale_ratio' else held.name
-        reason = next((r for r in reasons if ABOUT.get(r.code) == about), None)
+        reason = next((r for r in reasons if REASON_ESTIMATES.get(r.code) == about), None)
         if held.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[held.name]).remedy

@@ -13,15 +13,15 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import (
     Alignment,
     COMPASS_LIMIT,
-    complete,
     COURSE_DISTANCE,
+    earth_rate_deviation,
     gyrocompass,
     HEADING_LIMIT,
     Level,
     level_at_rest,
     level_in_motion,
+    make_alignment,
     MOTION_LEVEL,
-    off_the_earth,
     REST_EDGE,
 )
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
@@ -74,7 +74,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
         yaw, sigma, refusals = _heading_by_course(inputs, level, metres_per_unit, fixes_n, origin,
                                                   grade)
         reasons += refusals
-    return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
+    return make_alignment(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
 def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
@@ -247,7 +247,7 @@ def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
                       f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg; '
                       f'the limit is {np.rad2deg(COMPASS_LIMIT):.1f} deg')
-    deviation = off_the_earth(level, latitude, grade)
+    deviation = earth_rate_deviation(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
     if deviation > no_earth_sigmas:
         return None, (f'the turn rate at rest differs from the Earth rate by {deviation:.0f} '
@@ -259,7 +259,7 @@ def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade
 def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats,
                        origin: Origin, grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
-    trial = complete(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
+    trial = make_alignment(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,

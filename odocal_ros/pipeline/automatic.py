@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.border import Carried
+from odocal_ros.calib.marginal_information import CarriedInformation
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
@@ -162,7 +162,7 @@ def rejecting_reason(result: LegResult) -> Reason | None:
 
 
 def add_to_carried(legs: Iterable[LegResult], config: Config,
-                   carried: Carried | None = None) -> Carried | None:
+                   carried: CarriedInformation | None = None) -> CarriedInformation | None:
     """Return the carried information with legs added, in order of time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried

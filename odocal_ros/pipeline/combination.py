@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.border import Carried
 from odocal_ros.calib.choice import choose, leg_estimates, relevant_reasons
 from odocal_ros.calib.combine import combine_method
+from odocal_ros.calib.marginal_information import CarriedInformation
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
@@ -32,8 +32,8 @@ SMOOTHER = 'smoother'      # the method whose legs are combined on their shared 
 ACROSS_LEGS_CODES = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 
 
-def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None = None,
-            imu: Carried | None = None) -> Calibration:
+def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformation | None = None,
+            imu: CarriedInformation | None = None) -> Calibration:
     """
     Return the calibration of one vehicle from its legs.
 
@@ -85,16 +85,16 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
 
 
 def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],
-                                before: Carried | None) -> Carried | None:
+                                before: CarriedInformation | None) -> CarriedInformation | None:
     """Return the marginal information of legs for later ones, None without any."""
     combined = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
     if combined is None or combined.border is None or not times:
         return None
-    return Carried(combined.border, combined.estimates['scale_factor'].unit,
-                   before.first_ns if before else min(times), max(times),
-                   len(times) + (before.legs if before else 0))
+    return CarriedInformation(combined.border, combined.estimates['scale_factor'].unit,
+                              before.first_ns if before else min(times), max(times),
+                              len(times) + (before.legs if before else 0))
 
 
 def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
@@ -110,7 +110,7 @@ def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
 
 def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequence[int],
                     config: Config, numbers: Sequence[int] | None = None,
-                    carried: Carried | None = None) -> MethodResult:
+                    carried: CarriedInformation | None = None) -> MethodResult:
     """Return the result of a method for several legs, including carried ones if possible."""
     if carried and all(r.border for r in results):
         unknown = {parameter: Estimate(None, None, e.unit)
@@ -127,7 +127,7 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
 
 
 def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
-                    carried: Carried | None) -> MethodResult:
+                    carried: CarriedInformation | None) -> MethodResult:
     """Return a method's combination of the legs without rejection; of all if all have one."""
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)

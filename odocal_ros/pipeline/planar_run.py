@@ -10,8 +10,16 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
-from odocal_ros.calib.planar.result import refused, result_of
-from odocal_ros.calib.planar.run import Fit, Known, MECANUM_ROWS, of_sides, rows_of, Run, Wheels
+from odocal_ros.calib.planar.result import make_planar_result, refused_planar_result
+from odocal_ros.calib.planar.run import (
+    Fit,
+    make_side_wheels,
+    MECANUM_ROWS,
+    PriorKnowledge,
+    Run,
+    wheel_rows,
+    Wheels,
+)
 from odocal_ros.calib.result import failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
@@ -51,7 +59,7 @@ def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
     progress(Stage(PLANAR))
     run, lacking = _make_run(inputs, config)
     if run is None:
-        methods = {PLANAR: refused(lacking, inputs.scale_unit)}
+        methods = {PLANAR: refused_planar_result(lacking, inputs.scale_unit)}
         return leg_result(leg, inputs, (*reasons, *lacking), methods, deciding=(PLANAR,))
     method, more = _fit_guarded(run, inputs, config, progress)
     return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
@@ -60,17 +68,17 @@ def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
 def _fit_guarded(run: Run, inputs: Inputs, config: settings.Config,
                  progress: Callable[[Stage], None], ) -> tuple[MethodResult, dict[str, Any]]:
     """Return the method's result and plot data; an error only rejects the method."""
-    from odocal_ros.calib.planar.fit import fit
+    from odocal_ros.calib.planar.fit import fit_run
     unit = inputs.scale_unit
 
     def unknown(reason: Reason) -> MethodResult:
-        return refused([reason], unit)
+        return refused_planar_result([reason], unit)
     try:
         with raise_on_overflow():
-            found = fit(run, known_values(run, config), lambda passes, change: progress(
+            found = fit_run(run, known_values(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
-            method = result_of(found, unit, nominal_scale(config, unit), config,
-                               shortened_by_slopes(inputs))
+            method = make_planar_result(found, unit, nominal_scale(config, unit), config,
+                                        shortened_by_slopes(inputs))
             return method, _tracks(run, found)
     except (FloatingPointError, np.linalg.LinAlgError):
         return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} did not converge: an estimate became '
@@ -100,9 +108,9 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list
     covariance = inputs.covariance_n[used]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(one.at(t)) for one in travels])
-    wheels = (Wheels(steps.T, rows_of(kind, len(steps), config.odometer.wheel_offset), kind)
+    wheels = (Wheels(steps.T, wheel_rows(kind, len(steps), config.odometer.wheel_offset), kind)
               if kind in settings.HOLONOMIC else
-              of_sides(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
+              make_side_wheels(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
     if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
     return Run(t, wheels, node, position, sigma, _gyro_turns(inputs, t)), []
@@ -158,10 +166,10 @@ def _gyro_turns(inputs: Inputs, t: Floats) -> Floats:
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
-def known_values(run: Run, config: settings.Config) -> Known:
+def known_values(run: Run, config: settings.Config) -> PriorKnowledge:
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     grade = grade_of(config.imu)
-    known = Known(
+    known = PriorKnowledge(
         width=config.odometer.track_width * (run.wheels.kind not in settings.HOLONOMIC),
         offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
         offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.evidence import evidence, KEPT_ROWS
+from odocal_ros.calib.evidence import KEPT_ROWS, make_evidence
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.scale_variation import counter_change_reasons
@@ -238,8 +238,9 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     kept, outlier_reasons = without_outliers(prepared, after, start, between)
     found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)),
               *outlier_reasons)
-    leg_evidence = evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
-                            start, paths, prepared.config, prepared.t_fit, prepared.covered)
+    leg_evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n,
+                                 kept,
+                                 start, paths, prepared.config, prepared.t_fit, prepared.covered)
     found += counter_change_reasons(leg_evidence.sections, leg_evidence.t_fix,
                                     leg_evidence.fix_distance)
     return fields | {'evidence': leg_evidence}, found

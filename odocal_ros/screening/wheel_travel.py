@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
-from odocal_ros.nav.odometer import FEWEST_STEPS, mean_travel, Travel, travel
+from odocal_ros.nav.odometer import FEWEST_STEPS, make_travel, mean_travel, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.late_rows import sampling_times
 from odocal_ros.screening.odometer_rows import (
@@ -218,7 +218,7 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
         found.extend(why)
     samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
     t = sampling_times(samples, t, form, found, f'{side} odometer'.strip())
-    counts, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
+    counts, reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
     counts, more_t, more = with_gap_uncertainty(counts, samples.value, form)
     return replace(counts, name=side), np.append(doubt_t, more_t), np.append(doubt, more)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.result import LegResult
 from odocal_ros.reasons import Reason
 
@@ -49,8 +49,8 @@ class Toy:
         A, B, b = self.A[j], self.B[j], self.b[j]
         about = TRUTH + 0.1 * j if about is None else about
         free = B - A @ np.linalg.lstsq(A, B, rcond=None)[0]
-        return Border(NAMES, np.array(about, float), free.T @ free,
-                      free.T @ (b - B @ about), np.zeros(len(NAMES)), PRIOR, PRIOR)
+        return MarginalInformation(NAMES, np.array(about, float), free.T @ free,
+                                   free.T @ (b - B @ about), np.zeros(len(NAMES)), PRIOR, PRIOR)
 
     def borders(self):
         return [self.border(j) for j in range(len(self.A))]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.evidence import evidence, KEPT_ROWS
+from odocal_ros.calib.evidence import KEPT_ROWS, make_evidence
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.scale_variation import sections
 from odocal_ros.data.leg import Leg
@@ -54,8 +54,8 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, set_ns=0, **streams):
     kept = np.ones(len(inputs.t_fix), bool)
     kept[[row for row, what in bad if what == 'far']] = False
     pin = MarkFix(0.0, np.zeros(3), np.eye(3), True, 1, 1)
-    return evidence(leg, inputs, track, fixes_n, kept, pin,
-                    (lambda t: 1.1 * path_n(t) + 7.0, lambda t: path_n(t) - 3.0), config)
+    return make_evidence(leg, inputs, track, fixes_n, kept, pin,
+                         (lambda t: 1.1 * path_n(t) + 7.0, lambda t: path_n(t) - 3.0), config)
 
 
 def test_residuals_are_split_by_the_direction_driven():

@@ -15,7 +15,7 @@ from odocal_ros.estimator import smooth
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result import remarks
 from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
-from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
+from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.nominal import GRADES, TURN_ON, with_grade_by_noise
@@ -65,9 +65,9 @@ def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
     grows = np.convolve(drive.motion.speed(t) > 1.0, np.ones(200) / 200, 'same')
     angle = np.radians(3.0) * np.sin(2 * np.pi * hertz * t) * grows
     C_bi = matrix_from_rpy(np.stack([0 * t, angle, 0 * t], -1))     # about the IMU's y
-    w_i = turn(transpose(C_bi), imu.w_i)
+    w_i = rotate(transpose(C_bi), imu.w_i)
     w_i[:, 1] += np.gradient(angle, t)
-    swaying = replace(sent, imu=replace(imu, w_i=w_i, f_i=turn(transpose(C_bi), imu.f_i)))
+    swaying = replace(sent, imu=replace(imu, w_i=w_i, f_i=rotate(transpose(C_bi), imu.f_i)))
     config = settings(drive, None)
     scale = smooth(leg_of(swaying, config), config).estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma

@@ -9,15 +9,15 @@ from legs_to_combine import apart, LEGS, NAMES, PRIOR, STEPS, Toy, TRUTH
 import numpy as np
 import pytest
 
-from odocal_ros.calib.border import Border
-from odocal_ros.calib.joint import joint
+from odocal_ros.calib.joint import fit_jointly
+from odocal_ros.calib.marginal_information import MarginalInformation
 
 pytestmark = pytest.mark.slow
 USUAL = {'z3': 0.05}
 
 
 def of(borders, steps=STEPS, usual=None):
-    return joint(borders, steps, 'k', usual=usual)
+    return fit_jointly(borders, steps, 'k', usual=usual)
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_sections_of_one_leg_are_one_leg(toy):
     """With a scatter between legs, which they do not have: as without any."""
     still = np.zeros(LEGS - 1)
     whole = of(toy.borders(), still)
-    found = joint(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
+    found = fit_jointly(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
     assert apart(found.value, whole.value, whole.covariance) < 1e-6
     assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
     assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
@@ -138,21 +138,22 @@ def test_what_no_constant_explains_widens_all():
 
 def scale_and_yaw(yaw, *information):
     unit = np.full(2, np.inf)
-    return Border(('k', 'yaw'), np.array([0.0, yaw]), np.diag(information), np.zeros(2),
-                  np.zeros(2), unit, unit)
+    return MarginalInformation(('k', 'yaw'), np.array([0.0, yaw]), np.diag(information),
+                               np.zeros(2),
+                               np.zeros(2), unit, unit)
 
 
 def test_a_leg_far_from_where_it_was_linearised_counts_less():
     # the first knows nothing of the yaw and was linearised 0.1 rad off: its scale is 0.5 % off
     legs = [scale_and_yaw(0.1, 1e12, 1e-2), scale_and_yaw(0.0, 1e8, 1e8)]
-    found = joint(legs, [0.0], 'k', ('yaw',), ('k', 'yaw'))
+    found = fit_jointly(legs, [0.0], 'k', ('yaw',), ('k', 'yaw'))
     assert found.bent == pytest.approx([0.005, 0.0], abs=1e-9)
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(1e-4, rel=1e-3)
-    assert np.sqrt(joint(legs, [0.0], 'k').covariance[0, 0]) < 2e-6
+    assert np.sqrt(fit_jointly(legs, [0.0], 'k').covariance[0, 0]) < 2e-6
 
 
 def test_angles_about_half_a_turn_are_one():
     legs = [scale_and_yaw(yaw, 1e6, 1e6) for yaw in (np.pi - 1e-3, 1e-3 - np.pi)]
-    found = joint(legs, [0.0], 'k', ('yaw',), ('yaw',))
+    found = fit_jointly(legs, [0.0], 'k', ('yaw',), ('yaw',))
     assert abs(found.value[1]) == pytest.approx(np.pi, abs=1e-9)
     assert not found.disputed

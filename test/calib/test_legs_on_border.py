@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from smoother_legs import made, smoothed
 
-from odocal_ros.calib.joint import joint
+from odocal_ros.calib.joint import fit_jointly
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.slip import NO_SLIPS
 from odocal_ros.estimator import several
@@ -38,7 +38,7 @@ def legs():
 
 def by_border(one, i):
     """Return value and sigma of ln K, yaw or pitch that the border of a result gives."""
-    found = joint([one.border], [])
+    found = fit_jointly([one.border], [])
     # sizes are of the vehicle's priors, of which a border has none
     of_sizes, = (s.effects[i] for s in one.sources if s.name == 'imperfection_sizes')
     return found.value[i], np.sqrt(

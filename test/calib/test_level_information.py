@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from smoother_legs import made
 
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.estimator.chain import solve
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors import point_rows, signals
@@ -99,8 +99,9 @@ def test_a_border_with_errors_of_levels_has_the_sum_of_both_covariances():
     rng = np.random.default_rng(1)
     A, effects = rng.standard_normal((9, 4)), 0.1 * rng.standard_normal((4, 2))
     D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)
-    border = Border(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9), centre, sigma,
-                    sigma)
+    border = MarginalInformation(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9),
+                                 centre, sigma,
+                                 sigma)
     wider, weight = border.with_errors(effects), 1 / sigma**2
 
     def posterior(one):

@@ -9,8 +9,15 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
-from odocal_ros.calib.planar.run import Known, of_sides, rows_of, Run, UNEQUAL, Wheels
+from odocal_ros.calib.planar.fit import fit_run, LEVELS, noise_path
+from odocal_ros.calib.planar.run import (
+    make_side_wheels,
+    PriorKnowledge,
+    Run,
+    UNEQUAL,
+    wheel_rows,
+    Wheels,
+)
 
 LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
 SCALES = np.array([0.0352, 0.0349, 0.0351, 0.0356])     # m/rad, of each wheel
@@ -38,10 +45,10 @@ def run_of(d, kind='differential', arc=0.0, lateral=0.95, slip=0.0, noise=1e-4, 
     z = np.append(0.0, np.cumsum(chord * np.exp(1j * (turn[1:] + turn[:-1]) / 2)))
     apart = d[:, 2] * WIDTH
     for _ in range(50 * bool(arc)):     # the width depends on the wheels
-        straight = of_sides((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT,
-                            'skid').straightness
+        straight = make_side_wheels((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT,
+                                    'skid').straightness
         apart = d[:, 2] / (1 / WIDTH + arc * straight)
-    rows = rows_of(kind, count, offset)
+    rows = wheel_rows(kind, count, offset)
     side = d[:, 1] / (lateral if kind == 'mecanum' else 1.0)
     metres = rows @ np.stack([d[:, 0], side, apart / 2])
     if slip:
@@ -79,7 +86,7 @@ OMNI = [(count, offset) for count in (3, 4) for offset in (0.0, 0.5, -2.0)]
     ([*SQUARES, (2, 0, 1.2), (1.5, 0, -0.8), (2, 0, -2.0), (1, 0, 2.0)],
      {'kind': 'skid', 'arc': 1.0}, (LEFT, RIGHT, 1 / WIDTH, 1.0), 1e-5)])
 def test_without_noise_the_fit_is_exact(moves, options, expected, loose):
-    found = fit(run_of(body(moves), **options), Known())
+    found = fit_run(run_of(body(moves), **options), PriorKnowledge())
     assert found.converged
     assert_allclose(found.value[:len(expected)], expected, rtol=loose)
     offset = found.names.index('ahead')
@@ -92,7 +99,7 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
     psi = np.append(0.0, np.cumsum(body(SQUARES)[:, 2])) + 0.3
     arm = (0.1 - 0.05j) * np.exp(1j * psi)
     run = replace(run, position=run.position + np.stack([arm.real, arm.imag], -1))
-    found = fit(run, Known())
+    found = fit_run(run, PriorKnowledge())
     assert_allclose(found.value[3:5], (0.1, -0.05), atol=1e-5)
     assert_allclose(found.value[2], 1 / WIDTH, rtol=1e-5)
 
@@ -100,23 +107,23 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
 def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch):
     """A turn and no sideways motion: one difference of four wheels has its prior alone."""
     run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
-    sigma = np.sqrt(np.diag(fit(run, Known()).covariance)[:4])
+    sigma = np.sqrt(np.diag(fit_run(run, PriorKnowledge()).covariance)[:4])
     assert (sigma < 1.2 * UNEQUAL * SCALES).all()
     monkeypatch.setattr('odocal_ros.calib.planar.run.UNEQUAL', 0.3)
-    assert (np.sqrt(np.diag(fit(run, Known()).covariance)[:4]) > 2 * sigma).all()
+    assert (np.sqrt(np.diag(fit_run(run, PriorKnowledge()).covariance)[:4]) > 2 * sigma).all()
 
 
 @pytest.mark.parametrize('kind', ['differential', 'mecanum', 'omni'])
 def test_wheels_by_their_rows_give_the_motion_that_rolled_them(kind):
     """The table is the pseudo-inverse of the rows: numpy.linalg.pinv."""
-    rows = rows_of(kind, 5, 0.3)
+    rows = wheel_rows(kind, 5, 0.3)
     table = Wheels(np.zeros((1, len(rows))), rows, kind).table
     assert_allclose(table, np.linalg.pinv(rows) * [[1], [1], [2]], atol=1e-12)
 
 
 def test_omni_rows_are_those_of_omni_wheel_drive_controller():
     """ros2_controllers, test_odometry.cpp: 1 m/s turns wheels of 0.1 m by 0, 10, 0, -10 rad/s."""
-    forward, left, turn = (rows_of('omni', 4) @ np.eye(3) / 0.1).T
+    forward, left, turn = (wheel_rows('omni', 4) @ np.eye(3) / 0.1).T
     assert_allclose(forward, (0, 10, 0, -10), atol=1e-12)
     assert_allclose(left, (-10, 0, 10, 0), atol=1e-12)
     assert_allclose(turn, -10)
@@ -125,7 +132,7 @@ def test_omni_rows_are_those_of_omni_wheel_drive_controller():
 def test_gyro_scale_and_bias_are_exact():
     run = run_of(body(SQUARES))
     turn = body(SQUARES)[:, 2]
-    found = fit(replace(run, gyro=1.02 * turn + 0.01 * STEP), Known())
+    found = fit_run(replace(run, gyro=1.02 * turn + 0.01 * STEP), PriorKnowledge())
     assert_allclose(1 + value(found, 'gyro_scale')[0], 1 / 1.02, rtol=1e-5)
     assert_allclose(value(found, 'gyro_bias')[0], 0.01 / 1.02, rtol=1e-3)
 
@@ -139,8 +146,9 @@ def test_sigma_is_the_bound_of_a_straight_run():
     run = run_of(body([(8, 0, 0)]))
     run = replace(run, node=run.node[[0, -1]], position=run.position[[0, -1]],
                   sigma=np.array([0.01, 0.02]), gyro=np.zeros(len(run.t) - 1))
-    known = Known(offset_sigma=1e-6, delay_sigma=1e-6, gyro_noise=1e-6, gyro_bias_sigma=1e-6)
-    found = fit(run, known)
+    known = PriorKnowledge(offset_sigma=1e-6, delay_sigma=1e-6, gyro_noise=1e-6,
+                           gyro_bias_sigma=1e-6)
+    found = fit_run(run, known)
     path = noise_path(run, LEFT)
     level = {name: sigma**2 for name, sigma in found.levels.items()}
     student = 6 / 8         # information of Student's distribution
@@ -165,9 +173,10 @@ def test_truth_is_within_sigma(kind):
     for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         d = body(SQUARES + arcs + sideways)
-        found = fit(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005, every=2,
-                           rng=rng, count=3), Known())
-        truth = {'left': LEFT, 'right': RIGHT, 'curvature': 1 / WIDTH, 'arc': 0.5,
+        found = fit_run(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005,
+                               every=2,
+                               rng=rng, count=3), PriorKnowledge())
+        truth = {'left': LEFT, 'right': RIGHT, 'inverse_track_width': 1 / WIDTH, 'arc': 0.5,
                  'lateral': 0.95} | {f'wheel_{k}': one for k, one in enumerate(SCALES, 1)}
         off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
                     for n in found.names[:found.names.index('ahead')]])

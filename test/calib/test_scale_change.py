@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from smoother_legs import made, smoothed
 
-from odocal_ros.calib.border import carried_from
-from odocal_ros.calib.joint import joint, scale_steps
+from odocal_ros.calib.joint import fit_jointly, scale_steps
+from odocal_ros.calib.marginal_information import read_carried
 from odocal_ros.errors import BadUsage
 from odocal_ros.estimator import several, smooth
 from odocal_ros.output.files import as_json
@@ -32,9 +32,9 @@ ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of 
 @pytest.mark.parametrize('first', [1, 2, 4])
 def test_legs_carried_on_are_one_fit_with_those_to_come(first):
     borders = Toy(np.random.default_rng(5)).borders()
-    whole = joint(borders, STEPS, 'k')
-    before = joint(borders[:first], STEPS[:first - 1], 'k').carried
-    found = joint([before, *borders[first:]], STEPS[first - 1:], 'k')
+    whole = fit_jointly(borders, STEPS, 'k')
+    before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').carried
+    found = fit_jointly([before, *borders[first:]], STEPS[first - 1:], 'k')
     assert apart(found.value, whole.value, whole.covariance) < 1e-6
     sigma = np.sqrt(np.diag(whole.covariance))
     assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
@@ -119,7 +119,7 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
     whole = combine(legs, config)
     two = combine(legs[:2], config)
     written = json.loads(json.dumps(as_json(two, config, [], 'now'), allow_nan=False))
-    carried = carried_from(written['carried'])
+    carried = read_carried(written['carried'])
     assert (carried.legs, carried.first_ns, carried.last_ns) == (
         2, legs[0].start_ns, legs[1].start_ns)
     for before in (carried, add_to_carried(legs[:2], config)):
@@ -185,7 +185,7 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
     config, results = session
     legs = legs_of(results)
     whole = combine(legs, config)
-    found = combine(legs[2:], config, carried_from(json.loads(json.dumps(
+    found = combine(legs[2:], config, read_carried(json.loads(json.dumps(
         add_to_carried(legs[:2], config).as_dict()))))
     compare(found, whole, 0.1)
     evidence = found.carried.border.evidence

@@ -19,7 +19,7 @@ from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import M, PHI, WITH_SLOW
 from odocal_ros.nav.dead_reckoning import forward_b
-from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
+from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
 from odocal_ros.sim.options import SimOptions
@@ -71,11 +71,11 @@ def test_the_truth_fulfils_the_equations(perfect):
 def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
     problem, state = perfect
     preintegrate_at = preintegrated(problem, state)[0]
-    rate_n = turn(state.C_nb[:-1], preintegrate_at.mean_rate)
+    rate_n = rotate(state.C_nb[:-1], preintegrate_at.mean_rate)
     assert np.abs(rate_n[:, 2]).max() > 0.1
     rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level, and the mounting is 1 deg
     leaning = replace(state, C_nb=rolled)
-    measured = turn(transpose(rolled[:-1]), rate_n)
+    measured = rotate(transpose(rolled[:-1]), rate_n)
     upright, other = (Motion(problem, one, own).pitch_increments[:, 0] for one, own in (
         (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
     # of a turn by 0.2 rad a tenth was pitch; the heading that the mounting changes with the roll,

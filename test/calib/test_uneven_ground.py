@@ -12,7 +12,7 @@ from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LIFT, PITCH
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
+from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.slow
@@ -56,7 +56,7 @@ def figures_of_eight():
     path = STEP * (np.cumsum(speed) - speed / 2)
     imu, fixes = slice(0, None, 4), slice(40, None, 80)
     leg = SmootherLeg(
-        origin, 0.0, t[-1] - 1.0, t[imu], w_b[imu], turn(transpose(C_nb), f_n)[imu],
+        origin, 0.0, t[-1] - 1.0, t[imu], w_b[imu], rotate(transpose(C_nb), f_n)[imu],
         Travel(t[imu], path[imu], 0.0), t[fixes], p_n[fixes],
         np.tile(0.01**2 * np.eye(3), (len(t[fixes]), 1, 1)),
         np.array([[0.0, 19.0], [251.5, t[-1]]]), 1.0)

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
+from odocal_ros.nav.alignment import (
+    gyrocompass,
+    level_at_rest,
+    level_frame,
+    make_alignment,
+    REST_EDGE,
+)
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import earth_rate_n, gravity
 from odocal_ros.nav.rotations import matrix_from_rpy, wrap
@@ -43,8 +49,8 @@ def levelled(sensors, grade=EXACT):
 
 
 def finished(level, yaw, sigma=1e-9, source='fixed', grade=EXACT, latitude=LATITUDE):
-    return complete(level, yaw, sigma, source, False, Origin(latitude, 0.0, 0.0), grade,
-                    grade.gyro_noise)
+    return make_alignment(level, yaw, sigma, source, False, Origin(latitude, 0.0, 0.0), grade,
+                          grade.gyro_noise)
 
 
 def variance_is_one(z):

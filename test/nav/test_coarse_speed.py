@@ -8,8 +8,13 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid, held_speed
-from odocal_ros.nav.odometer import travel
+from odocal_ros.nav.coarse_speed import (
+    CoarseSpeed,
+    find_coarse_speed,
+    find_grid_step,
+    find_held_speed,
+)
+from odocal_ros.nav.odometer import make_travel
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.wheels import coarse, held
@@ -31,7 +36,7 @@ def sent(step, how, t=T, speed=SPEED):
 @pytest.mark.parametrize('how', ['floor', 'round'])
 @pytest.mark.parametrize('step', [KMH, 0.1 * KMH, 0.0075 * KMH])
 def test_the_step_is_found(step, how):
-    found = coarse_speed(*sent(step, how))
+    found = find_coarse_speed(*sent(step, how))
     assert found.step == pytest.approx(step, rel=1e-6)
     assert not found.interpolated
 
@@ -50,15 +55,15 @@ def test_the_step_is_found_under_noise_and_of_a_slow_drive():
     t, v = sent(KMH, 'floor')
     noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)
     # the mean of some hundred places of 0.01 m/s, over a lever of tens of cells: below 1e-3
-    assert grid(noisy) == pytest.approx(KMH, rel=1e-3)
+    assert find_grid_step(noisy) == pytest.approx(KMH, rel=1e-3)
     slow = SPEED / 8
-    assert coarse_speed(*sent(KMH, 'round', speed=slow)).step == pytest.approx(KMH, rel=1e-6)
-    assert coarse_speed(T, slow) is None
+    assert find_coarse_speed(*sent(KMH, 'round', speed=slow)).step == pytest.approx(KMH, rel=1e-6)
+    assert find_coarse_speed(T, slow) is None
 
 
 def test_of_an_interpolation_only_the_knots_are_data():
     t, v = sent(KMH, 'floor', T[::10], SPEED[::10])
-    found = coarse_speed(T[:-9], np.interp(T[:-9], t, v))
+    found = find_coarse_speed(T[:-9], np.interp(T[:-9], t, v))
     assert found.interpolated
     assert found.step == pytest.approx(KMH, rel=1e-6)
     assert np.isin(found.t[1:-1], t).all()
@@ -66,9 +71,9 @@ def test_of_an_interpolation_only_the_knots_are_data():
 
 def test_only_speeds_have_a_grid_and_reversed_ones_too():
     t, v = sent(KMH, 'floor')
-    found = travel(t, v, RATE, reversed_counts=True)[0].coarse
+    found = make_travel(t, v, RATE, reversed_counts=True)[0].coarse
     np.testing.assert_array_equal(found.value, -v)
-    assert travel(t, np.cumsum(v), OdometerForm('cumulative', 0, '1'))[0].coarse is None
+    assert make_travel(t, np.cumsum(v), OdometerForm('cumulative', 0, '1'))[0].coarse is None
 
 
 @pytest.mark.parametrize('rate', [1, 10])
@@ -99,8 +104,9 @@ def test_a_smooth_start_to_one_cruise_has_no_grid():
     t = np.arange(0.0, 60.0, 0.04)
     x = np.clip((t - 10.0) / 12.0, 0.0, 1.0)
     speed = 11.7647 * (x**3 * (10 - 15 * x + 6 * x**2))      # no jerk at either end
-    assert coarse_speed(t, speed) is None
-    assert coarse_speed(t, np.floor(speed * 3.6) / 3.6).step == pytest.approx(1 / 3.6, rel=1e-6)
+    assert find_coarse_speed(t, speed) is None
+    assert find_coarse_speed(t, np.floor(speed * 3.6) / 3.6).step == pytest.approx(1 / 3.6,
+                                                                                   rel=1e-6)
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 10.0])
@@ -149,7 +155,7 @@ def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
                                                       *[rng.uniform(6, 7)] * 2, 0.0])
         sent = np.rint(speed / step) * step
         found = CoarseSpeed(step, t, sent)
-        told = found.way_variance(np.arange(0.0, 200.0))
+        told = found.travel_variance(np.arange(0.0, 200.0))
         errors.append(((sent - speed) * 0.05).sum())
     # nothing while it stands, and of the way up less than of 60 s at a speed
     assert told[162:].max() == 0.0
@@ -166,7 +172,7 @@ def town(t):
 
 @pytest.mark.parametrize('scale', [1.0, 37.0])
 def test_a_held_speed_is_known_by_its_step(scale):
-    found = held_speed(AT, scale * held(town(AT), STEP))
+    found = find_held_speed(AT, scale * held(town(AT), STEP))
     # the least change of many is a step and what the speed gains in a row at its slowest
     assert STEP <= found.step / scale < 1.05 * STEP
     assert not found.truncation
@@ -177,13 +183,13 @@ def test_a_held_speed_is_known_by_its_step(scale):
     np.repeat(town(AT[::5]), 5), coarse(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
     np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
 def test_other_speeds_are_not_taken_for_held(value):
-    way = travel(AT, value, RATE)[0]
+    way = make_travel(AT, value, RATE)[0]
     assert way.coarse is None or way.coarse.truncation
 
 
 def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
     true = town(AT)
-    found = held_speed(AT, held(true, STEP))
+    found = find_held_speed(AT, held(true, STEP))
     assert_allclose(found.instants.value, np.interp(found.instants.t, AT, true), atol=1e-9)
     off = np.abs(found.value - true)[true > 0]
     # a row beyond it where the vehicle turns about within a step
@@ -193,7 +199,7 @@ def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
 
 def test_the_path_has_no_more_than_the_error_of_its_cruises():
     true = town(AT)
-    middle = travel(AT, held(true, STEP), RATE)[0].s[-1]
+    middle = make_travel(AT, held(true, STEP), RATE)[0].s[-1]
     whole, sent = (((x[1:] + x[:-1]) / 2 * np.diff(AT)).sum() for x in (true, held(true, STEP)))
     # four cruises of 20 s, each uniform within a step: 3 sigmas
     assert abs(middle - whole) < 3 * np.sqrt(4) * 20 * STEP / np.sqrt(12)
@@ -202,7 +208,8 @@ def test_the_path_has_no_more_than_the_error_of_its_cruises():
 
 def test_reversed_counts_are_held_on_the_other_side():
     value = held(town(AT), STEP)
-    way, back = travel(AT, value, RATE)[0], travel(AT, -value, RATE, reversed_counts=True)[0]
+    way, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
+                                                             reversed_counts=True)[0]
     assert_allclose(back.s, way.s)
     assert_allclose(back.coarse.value, way.coarse.value)
     assert_allclose(back.coarse.instants.value, way.coarse.instants.value)
@@ -218,9 +225,9 @@ BAND = 0.25
 @pytest.mark.parametrize('reversed_counts', [False, True])
 def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
     zeroed = np.where(np.abs(TO_AND_FRO) < BAND, 0.0, TO_AND_FRO)
-    raw, _ = travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
+    raw, _ = make_travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
     way, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
-    true, _ = travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
+    true, _ = make_travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
     lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
     left = np.abs(np.diff(way.s)).sum() - np.abs(np.diff(true.s)).sum()
     assert lost < -0.8          # 40 times v^2 / 2a
@@ -233,7 +240,7 @@ def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
 
 
 def test_a_speed_that_falls_to_zero_stays_as_it_is():
-    exact, _ = travel(AT, TO_AND_FRO, RATE)
+    exact, _ = make_travel(AT, TO_AND_FRO, RATE)
     way, t, _ = with_gap_uncertainty(exact, TO_AND_FRO, RATE)
     np.testing.assert_array_equal(way.s, exact.s)
     assert not len(t)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.odometer import mean_travel, Travel, travel
+from odocal_ros.nav.odometer import make_travel, mean_travel, Travel
 from odocal_ros.reasons import Code
 
 pytestmark = pytest.mark.core
@@ -40,7 +40,7 @@ def test_rollover_is_undone_both_ways(modulus, low, way):
     total = low + modulus - 200 + np.arange(100) * 37 if way > 0 else \
         low + 200 - np.arange(100) * 37
     t = np.arange(100) * 0.02
-    found, reasons = travel(t, sent(total, modulus, low), counter(modulus))
+    found, reasons = make_travel(t, sent(total, modulus, low), counter(modulus))
     # exact in whole numbers; 2^62 leaves no digit behind the point
     assert np.array_equal(found.s, way * np.arange(100) * 37.0)
     assert codes(reasons) == [Code.COUNTER_ROLLOVER]
@@ -50,7 +50,7 @@ def test_rollover_is_undone_both_ways(modulus, low, way):
 
 def test_rollover_says_how_often_and_where():
     total = np.arange(1000) * 37
-    _, reasons = travel(np.arange(1000) * 0.02, sent(total, 9000, 0), counter(9000))
+    _, reasons = make_travel(np.arange(1000) * 0.02, sent(total, 9000, 0), counter(9000))
     # 36963 counts pass 9000 four times, first in step 9000 // 37 = 243
     assert '4 times' in reasons[0].text
     assert f't = {244 * 0.02:.2f} s' in reasons[0].text
@@ -61,7 +61,7 @@ def test_64_bits_roll_over_by_themselves(way):
     edge = np.array([2**63 - 10 * way], dtype=np.uint64)
     steps = np.arange(30, dtype=np.uint64) * 3
     value = (edge + steps if way > 0 else edge - steps).view(np.int64)
-    found, reasons = travel(np.arange(30.0), value, counter(2**64))
+    found, reasons = make_travel(np.arange(30.0), value, counter(2**64))
     assert np.array_equal(found.s, way * np.arange(30) * 3.0)
     assert reasons == ()
 
@@ -73,7 +73,7 @@ def test_any_walk_below_half_a_modulus_a_step_comes_back(seed, modulus):
     steps = rng.integers(-4000, 4001, 60)
     total = int(rng.integers(0, 8000)) + np.concatenate([[0], np.cumsum(steps)])
     value = sent(total, modulus, -2**63 if modulus == 2**64 else 0)
-    found, _ = travel(np.arange(61) * 0.1, value, counter(modulus))
+    found, _ = make_travel(np.arange(61) * 0.1, value, counter(modulus))
     assert np.array_equal(found.s, (total - total[0]).astype(float))
 
 
@@ -90,7 +90,7 @@ def test_a_reset_is_bridged_at_the_speed_beside_it(modulus, at):
     t, total, rate = drive()
     before = total + (30_000 if modulus == 2**16 else 1_500_000_000)     # whole numbers
     value = np.where(np.arange(len(t)) < at, before, total - total[at])
-    found, reasons = travel(t, value, counter(modulus))
+    found, reasons = make_travel(t, value, counter(modulus))
     # one step is interpolated between its neighbours: whole counts, one off at most
     assert np.abs(found.s - total).max() <= 1.0
     assert codes(reasons) == [Code.COUNTER_RESET]
@@ -102,7 +102,7 @@ def test_a_false_row_costs_two_steps_not_the_leg():
     t, total, _ = drive()
     value = total.copy() + 30_000
     value[200] = 0
-    found, reasons = travel(t, value, counter(2**32))
+    found, reasons = make_travel(t, value, counter(2**32))
     assert np.abs(found.s - total).max() <= 2.0
     assert '2 such steps' in reasons[0].text
 
@@ -125,7 +125,7 @@ SLOW = np.concatenate([np.full(300, 0.01), np.ones(200), [0.01], np.full(300, 0.
     (EVEN[:50], np.full(50, 77))],
     ids=['hour at rest', 'creeping', 'two counts', 'bursts', 'early row', 'seldom', 'standing'])
 def test_uneven_counts_and_stamps_are_no_resets(t, value):
-    found, reasons = travel(t, value, counter(2**32))
+    found, reasons = make_travel(t, value, counter(2**32))
     assert reasons == ()
     assert np.array_equal(found.s, (value - value[0]).astype(float))
 
@@ -134,12 +134,12 @@ def test_an_angle_in_floats_and_its_reset():
     t = np.arange(100) * 0.02
     angle = 5.0 + 12.0 * t
     form = OdometerForm('cumulative', 0, 'm/rad')
-    found, reasons = travel(t, angle, form)
+    found, reasons = make_travel(t, angle, form)
     assert_allclose(found.s, 12.0 * t, atol=1e-13)
     assert found.quantum == 0.0
     assert reasons == ()
     restarted = np.where(t < 0.99, angle, angle - 900.0)
-    found, reasons = travel(t, restarted, form)
+    found, reasons = make_travel(t, restarted, form)
     assert_allclose(found.s, 12.0 * t, atol=1e-12)
     assert codes(reasons) == [Code.COUNTER_RESET]
 
@@ -148,36 +148,37 @@ def test_a_counter_in_steps_of_five_has_a_quantum_of_five():
     t = np.arange(400) * 0.1
     s = 30.0 * t + 20.0 * np.sin(t)
     form = OdometerForm('cumulative', 0, 'm/pulse')
-    assert travel(t, (5 * np.floor(s / 5)).astype(np.int64), form)[0].quantum == 5.0
-    assert travel(t, np.floor(s).astype(np.int64), form)[0].quantum == 1.0
-    assert travel(t, 6 * np.arange(400), form)[0].quantum == 1.0        # of one speed only
+    assert make_travel(t, (5 * np.floor(s / 5)).astype(np.int64), form)[0].quantum == 5.0
+    assert make_travel(t, np.floor(s).astype(np.int64), form)[0].quantum == 1.0
+    assert make_travel(t, 6 * np.arange(400), form)[0].quantum == 1.0        # of one speed only
 
 
 def test_increments_add_up_and_rates_are_summed_by_trapezoids():
-    found, _ = travel(np.arange(4.0), np.array([100, 1, 2, -1]),
-                      OdometerForm('increment', 0, 'm/pulse'))
+    found, _ = make_travel(np.arange(4.0), np.array([100, 1, 2, -1]),
+                           OdometerForm('increment', 0, 'm/pulse'))
     assert_allclose(found.s, [0, 1, 3, 2], atol=0)
     assert found.quantum == 1.0
     t = np.array([0.0, 1.0, 1.5, 4.0])
-    found, _ = travel(t, 2 + 3 * t, OdometerForm('rate', 0, '1'))
+    found, _ = make_travel(t, 2 + 3 * t, OdometerForm('rate', 0, '1'))
     assert_allclose(found.s, 2 * t + 1.5 * t**2, atol=1e-14)     # exact for a straight line
     assert found.quantum == 0.0
-    assert travel(t, np.arange(4), OdometerForm('rate', 0, '1'))[0].quantum == 0.0
+    assert make_travel(t, np.arange(4), OdometerForm('rate', 0, '1'))[0].quantum == 0.0
 
 
 @pytest.mark.parametrize('form', [counter(2**32), OdometerForm('increment', 0, 'm/pulse'),
                                   OdometerForm('rate', 0, '1')])
 def test_reversed_counts(form):
     t, value = np.arange(30.0), np.arange(30) ** 2
-    assert np.array_equal(travel(t, value, form, True)[0].s, -travel(t, value, form)[0].s)
+    assert np.array_equal(make_travel(t, value, form, True)[0].s,
+                          -make_travel(t, value, form)[0].s)
 
 
 @pytest.mark.parametrize('quantity', ['cumulative', 'increment', 'rate'])
 @pytest.mark.parametrize('dtype', [np.int64, np.float64])
 def test_no_row_and_one_row(quantity, dtype):
     form = OdometerForm(quantity, 2**16, 'm/pulse')
-    assert travel(np.empty(0), np.empty(0, dtype), form)[0].s.shape == (0,)
-    found, reasons = travel(np.array([3.0]), np.array([7], dtype), form)
+    assert make_travel(np.empty(0), np.empty(0, dtype), form)[0].s.shape == (0,)
+    found, reasons = make_travel(np.array([3.0]), np.array([7], dtype), form)
     assert_allclose(found.s, [0.0], atol=0)
     assert reasons == ()
 
@@ -211,8 +212,8 @@ def test_the_mean_of_two_rounded_wheels_errs_as_its_quantum_says():
 
 
 def test_steps_too_small_for_a_speed_are_no_resets():
-    found, reasons = travel(np.arange(100) * 1e9, np.arange(100) * 5e-324,
-                            OdometerForm('cumulative', 0, 'm/rad'))
+    found, reasons = make_travel(np.arange(100) * 1e9, np.arange(100) * 5e-324,
+                                 OdometerForm('cumulative', 0, 'm/rad'))
     assert reasons == ()
     assert np.array_equal(found.s, np.arange(100) * 5e-324)
 

@@ -20,15 +20,16 @@ from odocal_ros.settings.config import Config, SIDES
 # largest relative sigmas of a value. Judgement, by measurement on 24 simulated runs:
 # the two without a straight after their only turn have widths that are 3 to 570 sigma off, with a
 # sigma of 6 to 70 % of the width, or of 2.5 % of the scale
-MOST_SCALE, MOST = 0.02, 0.03
+SCALE_SIGMA_LIMIT, SIGMA_LIMIT = 0.02, 0.03
 ARC = 0.75      # definition: straightness on a radius of twice the track width
 # 1 sigma, share of the change of the width from the spot to that radius: its law is assumed.
 # Judgement, by measurement on 12 simulated runs with another law: the rms of error over sigma is
 # 3.6 without it, now 0.69
-LAW, MOST_ARC = 0.15, 0.05
+WIDTH_LAW_SHARE, ARC_SIGMA_LIMIT = 0.15, 0.05
 LAW_SOURCE, FIT_SOURCE, SLOPES = 'width_by_radius', 'positions_and_wheel_noise', 'slopes'
-WHEEL_NOISE, MOST_NOISE = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip
-TURNS = 'turns on the spot in both directions, each followed by a straight of a metre or more'
+WHEEL_NOISE, NOISE_LIMIT = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip
+REQUIRED_TURNS = ('turns on the spot in both directions, each followed by a straight of a metre '
+                  'or more')
 Constants = dict[str, float]
 
 
@@ -37,27 +38,27 @@ class Quantity(NamedTuple):
 
     needs: str
     value: Callable[[Constants], float]
-    most: float
+    limit: float
     code: Code
-    lacks: str
+    required_motion: str
 
 
 QUANTITIES = {
-    'scale_factor': Quantity('curvature', lambda c: _mean_scale(c), MOST_SCALE,
+    'scale_factor': Quantity('inverse_track_width', lambda c: _mean_scale(c), SCALE_SIGMA_LIMIT,
                              Code.SCALE_NOT_DETERMINED, 'straights'),
-    'scale_factor_left': Quantity('left', lambda c: c['left'], MOST_SCALE,
+    'scale_factor_left': Quantity('left', lambda c: c['left'], SCALE_SIGMA_LIMIT,
                                   Code.WHEELS_NOT_SEPARABLE, 'straights'),
-    'scale_factor_right': Quantity('right', lambda c: c['right'], MOST_SCALE,
+    'scale_factor_right': Quantity('right', lambda c: c['right'], SCALE_SIGMA_LIMIT,
                                    Code.WHEELS_NOT_SEPARABLE, 'straights'),
-    'track_width': Quantity('curvature', lambda c: 1 / c['curvature'], MOST,
-                            Code.TRACK_WIDTH_NOT_DETERMINED, TURNS),
-    'track_width_arc': Quantity('arc', lambda c: 1 / (c['curvature'] + ARC * c['arc']),
-                                MOST_ARC, Code.PARAMETER_NOT_DETERMINED,
+    'track_width': Quantity('inverse_track_width', lambda c: 1 / c['inverse_track_width'],
+                            SIGMA_LIMIT, Code.TRACK_WIDTH_NOT_DETERMINED, REQUIRED_TURNS),
+    'track_width_arc': Quantity('arc', lambda c: 1 / (c['inverse_track_width'] + ARC * c['arc']),
+                                ARC_SIGMA_LIMIT, Code.PARAMETER_NOT_DETERMINED,
                                 'arcs with radii of two to four track widths, to both sides'),
-    'rotation_lever': Quantity('wheel_1', lambda c: 1 / (2 * c['curvature']), MOST,
-                               Code.TRACK_WIDTH_NOT_DETERMINED, TURNS),
-    'lateral_scale_factor': Quantity('lateral', lambda c: c['lateral'] * _mean_scale(c), MOST,
-                                     Code.PARAMETER_NOT_DETERMINED,
+    'rotation_lever': Quantity('wheel_1', lambda c: 1 / (2 * c['inverse_track_width']),
+                               SIGMA_LIMIT, Code.TRACK_WIDTH_NOT_DETERMINED, REQUIRED_TURNS),
+    'lateral_scale_factor': Quantity('lateral', lambda c: c['lateral'] * _mean_scale(c),
+                                     SIGMA_LIMIT, Code.PARAMETER_NOT_DETERMINED,
                                      'sideways motion of a metre or more'),
 }
 
@@ -75,41 +76,41 @@ def _quantities(names: tuple[str, ...], config: Config) -> dict[str, Quantity]:
     found = {name: one for name, one in QUANTITIES.items() if one.needs in names
              and name != without}
     wheels = [name for name in names if name.startswith('wheel_')]
-    for name, own in zip(wheels, config.odometer.names(len(wheels)), strict=False):
-        found[f'scale_factor_{own}'] = Quantity(
-            name, lambda c, name=name: c[name], MOST_SCALE,  # type: ignore[misc]
+    for name, value_unit in zip(wheels, config.odometer.names(len(wheels)), strict=False):
+        found[f'scale_factor_{value_unit}'] = Quantity(
+            name, lambda c, name=name: c[name], SCALE_SIGMA_LIMIT,  # type: ignore[misc]
             Code.PARAMETER_NOT_DETERMINED, 'straights, turns and sideways motion')
     return found
 
 
-def result_of(fit: Fit, unit: str, nominal: float, config: Config,
-              slopes: float = 0.0) -> MethodResult:
+def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
+                       slopes: float = 0.0) -> MethodResult:
     """
     Return the result of a fit.
 
     unit, nominal : of the scale factor.   slopes : relative shortening of the path by slopes.
     """
     c = dict(zip(fit.names, fit.value.tolist(), strict=True))
-    estimates, effects, laws, reasons = unknown_values(unit), {}, {}, _doubts(fit)
+    estimates, effects, law_sigmas, reasons = unknown_values(unit), {}, {}, _fit_reasons(fit)
     # a fit that has not converged has twice the sigma
     root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
     quantities = _quantities(fit.names, config)
     for name, quantity in quantities.items():
         value, effect = quantity.value(c), _gradient(quantity, fit) @ root
-        own = unit if 'scale' in name else 'm'
-        law = slopes * value if 'scale' in name else LAW * abs(
-            value - 1 / c['curvature']) * (quantity.needs == 'arc')
-        sigma = float(np.hypot(np.linalg.norm(effect), law))
-        if value > 0 and sigma < quantity.most * value:
-            estimates[name] = Estimate(value, sigma, own)
-            unit_of = value if name.startswith('scale_factor') else 1.0
-            effects[name], laws[name] = effect / unit_of, law / unit_of
+        value_unit = unit if 'scale' in name else 'm'
+        law_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
+            value - 1 / c['inverse_track_width']) * (quantity.needs == 'arc')
+        sigma = float(np.hypot(np.linalg.norm(effect), law_sigma))
+        if value > 0 and sigma < quantity.limit * value:
+            estimates[name] = Estimate(value, sigma, value_unit)
+            effect_scale = value if name.startswith('scale_factor') else 1.0
+            effects[name], law_sigmas[name] = effect / effect_scale, law_sigma / effect_scale
         else:
-            estimates[name] = Estimate(None, None, own)
+            estimates[name] = Estimate(None, None, value_unit)
             reasons.append(Reason(
                 quantity.code, f'{name.replace("_", " ")}: the uncertainty is '
-                f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.most:.0f} %',
-                f'Repeat the run with {quantity.lacks}.'))
+                f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.limit:.0f} %',
+                f'Repeat the run with {quantity.required_motion}.'))
     scale = estimates['scale_factor']
     if scale.value and slopes > np.linalg.norm(effects['scale_factor']):
         reasons.append(Reason(
@@ -121,20 +122,21 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
     names = tuple(quantities)
     sources = [Source(FIT_SOURCE, np.array([effects.get(name, 0 * root[0]) for name in names]))]
     for source, scales in ((LAW_SOURCE, False), (SLOPES, True)):
-        own_laws = [laws.get(name, 0.0) * (('scale' in name) == scales) for name in names]
-        if any(own_laws):
-            sources.append(Source(source, np.array(own_laws)[:, None], True))
+        source_sigmas = [law_sigmas.get(name, 0.0) * (('scale' in name) == scales)
+                         for name in names]
+        if any(source_sigmas):
+            sources.append(Source(source, np.array(source_sigmas)[:, None], True))
     reasons += check_limits(estimates, nominal, config)
     return MethodResult(PLANAR, tuple(reasons), estimates, names, tuple(sources),
                         _details(fit, estimates, names, sources))
 
 
-def refused(reasons: Iterable[Reason], unit: str) -> MethodResult:
+def refused_planar_result(reasons: Iterable[Reason], unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses."""
     return MethodResult(PLANAR, tuple(reasons), unknown_values(unit))
 
 
-def _doubts(fit: Fit) -> list[Reason]:
+def _fit_reasons(fit: Fit) -> list[Reason]:
     """Return the reasons against a fit as a whole."""
     found = [] if fit.converged else [Reason(
         Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations')]
@@ -142,10 +144,10 @@ def _doubts(fit: Fit) -> list[Reason]:
         found.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
                             'left and right wheels are swapped'))
     noisy = max(WHEEL_NOISE, key=lambda name: fit.levels[name])
-    if fit.levels[noisy] > MOST_NOISE:
+    if fit.levels[noisy] > NOISE_LIMIT:
         found.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
-            f'per metre ({noisy}); the limit is {1e3 * MOST_NOISE:.0f} mm',
+            f'per metre ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive and the time offsets.'))
     return found
 

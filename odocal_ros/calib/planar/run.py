@@ -25,7 +25,7 @@ MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [
 UNEQUAL = 0.03
 
 
-def rows_of(kind: str, count: int, offset: float = 0.0) -> Floats:
+def wheel_rows(kind: str, count: int, offset: float = 0.0) -> Floats:
     """
     Return the rows of the wheels of a drive: (w, 3).
 
@@ -46,7 +46,7 @@ class Wheels:
     """Increments of w wheels in n intervals."""
 
     count: Floats  # (n, w) scale units; of differential and skid drives the means of both sides
-    rows: Floats   # (w, 3) of ``rows_of``, whose columns are orthogonal
+    rows: Floats   # (w, 3) of ``wheel_rows``, whose columns are orthogonal
     kind: str      # as odometer.drive
 
     @property
@@ -55,7 +55,8 @@ class Wheels:
         wheels = self.count.shape[1]
         scales = ('left', 'right') if wheels == len(SIDE_ROWS) else tuple(
             f'wheel_{k}' for k in range(1, wheels + 1))
-        return (*scales, 'curvature', *{SKID: ('arc',), MECANUM: ('lateral',)}.get(self.kind, ()))
+        return (*scales, 'inverse_track_width',
+                *{SKID: ('arc',), MECANUM: ('lateral',)}.get(self.kind, ()))
 
     @property
     def table(self) -> Floats:
@@ -78,11 +79,11 @@ class Wheels:
         return path
 
     @property
-    def spins(self) -> Bools:
+    def turns_on_spot(self) -> Bools:
         """Return True for intervals with more turn than travel: (n,)."""
         forward, side, wheel_difference = np.abs(self.body(self.count)).T
-        spins: Bools = wheel_difference > 2 * (forward + side)
-        return spins
+        turns_on_spot: Bools = wheel_difference > 2 * (forward + side)
+        return turns_on_spot
 
     @property
     def straightness(self) -> Floats:
@@ -100,24 +101,25 @@ class Wheels:
         the ratio of motion to rolling sideways.
         """
         w, table = self.count.shape[1], self.table
-        scale, by, side = self._split(c)
+        scale, inverse_width, side = self._split_constants(c)
         forward, rolled, wheel_difference = self.body(self.count * scale).T
         J = np.zeros((len(self.count), 3, len(self.names)))
         J[:, 0, :w] = self.count * table[0]
         J[:, 1, :w] = self.count * table[1] * side
-        J[:, 2, :w] = self.count * table[2] * by[:, None]
+        J[:, 2, :w] = self.count * table[2] * inverse_width[:, None]
         J[:, 2, w] = wheel_difference
         if self.kind == SKID:
             J[:, 2, w + 1] = wheel_difference * self.straightness
         if self.kind == MECANUM:
             J[:, 1, w + 1] = rolled
-        return np.stack([forward, rolled * side, wheel_difference * by], -1), J
+        return np.stack([forward, rolled * side, wheel_difference * inverse_width], -1), J
 
-    def _split(self, c: Floats) -> tuple[Floats, Floats, float]:
-        """Return scales (w,), curvatures (n,), and the ratio of motion to rolling sideways."""
+    def _split_constants(self, c: Floats) -> tuple[Floats, Floats, float]:
+        """Return scales (w,), inverse widths (n,), and the ratio of motion to rolling sideways."""
         w, n = self.count.shape[1], len(self.count)
-        by = np.full(n, c[w]) + (c[w + 1] * self.straightness if self.kind == SKID else 0.0)
-        return c[:w], by, float(c[w + 1]) if self.kind == MECANUM else 1.0
+        inverse_width = np.full(n, c[w]) + (c[w + 1] * self.straightness if self.kind == SKID
+                                            else 0.0)
+        return c[:w], inverse_width, float(c[w + 1]) if self.kind == MECANUM else 1.0
 
     def gains(self, c: Floats) -> tuple[Floats, Floats]:
         """
@@ -127,16 +129,17 @@ class Wheels:
         that the noise of a wheel does not bias its factor (errors in variables).
         """
         w = self.count.shape[1]
-        scales, by, side = self._split(c)
+        scales, inverse_width, side = self._split_constants(c)
         scale = scales.sum() / w
         J = np.zeros((len(self.count), 3, len(self.names)))
-        J[:, 0, :w], J[:, 1, :w], J[:, 2, :w] = 1 / w, side / w, by[:, None] / w
+        J[:, 0, :w], J[:, 1, :w], J[:, 2, :w] = 1 / w, side / w, inverse_width[:, None] / w
         J[:, 2, w] = scale
         if self.kind == SKID:
             J[:, 2, w + 1] = scale * self.straightness
         if self.kind == MECANUM:
             J[:, 1, w + 1] = scale
-        return np.stack([np.full_like(by, scale), np.full_like(by, scale * side), by * scale],
+        return np.stack([np.full_like(inverse_width, scale),
+                         np.full_like(inverse_width, scale * side), inverse_width * scale],
                         -1), J
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
@@ -144,15 +147,15 @@ class Wheels:
         wide = 0.35     # relative, judgement: too wide to affect any run with a result
         w, scale = self.count.shape[1], (left + right) / 2
         scales = [left, right] if w == len(SIDE_ROWS) else [scale] * w
-        more = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
+        further = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
         covariance = np.diag([(wide * scale)**2] * w + [
-            width**-2.0, *(sigma**2 for _, sigma in more)])
+            width**-2.0, *(sigma**2 for _, sigma in further)])
         if w > len(SIDE_ROWS):
             covariance[:w, :w] = scale**2 * (wide**2 + UNEQUAL**2 * np.eye(w))
-        return np.array([*scales, 1 / width, *(value for value, _ in more)]), covariance
+        return np.array([*scales, 1 / width, *(value for value, _ in further)]), covariance
 
 
-def of_sides(left: Floats, right: Floats, kind: str) -> Wheels:
+def make_side_wheels(left: Floats, right: Floats, kind: str) -> Wheels:
     """Return the wheels of a differential robot or skid steering: (n,) of each side."""
     return Wheels(np.stack([left, right], -1), SIDE_ROWS, kind)
 
@@ -170,7 +173,7 @@ class Run:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Known:
+class PriorKnowledge:
     """Prior knowledge of a run; sigmas are 1 sigma, in SI units."""
 
     width: float = 0.0          # m, track width, 0 unknown; of several minima the nearest is used

@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Floats, iterate_releasing
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
-from odocal_ros.nav.rotations import turn
+from odocal_ros.nav.rotations import rotate
 from odocal_ros.settings.nominal import G
 
 WALK_SPEED = 1.0     # m/s, below it slopes are reduced: judgement
@@ -46,7 +46,7 @@ class Axle:
         arm = state.constants[ODO_ARM] - leg.imu_arm
 
         def at(arm_v: Floats) -> Floats:
-            return state.v_n + turn(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
+            return state.v_n + rotate(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
 
         self.v_n = at(arm)
         self.wheel = self._forward_speed(at(arm + leg.odometer_arm))
@@ -73,7 +73,7 @@ class Axle:
         # axes at mid interval: with those at its start, centripetal acceleration looks like
         # braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
-        force = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
+        force = rotate((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
         force[:, 0] += G * self._slope()
         jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)

@@ -21,8 +21,8 @@ from odocal_ros.estimator.leg import ExternalSamples, from_place, thinned
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
-from odocal_ros.nav.receiver_filter import odometer_error, smoothing
-from odocal_ros.nav.rotations import skew, transpose, turn
+from odocal_ros.nav.receiver_filter import own_odometer_error, smoothing_error
+from odocal_ros.nav.rotations import rotate, skew, transpose
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
@@ -41,7 +41,7 @@ class Fixes(PointRows):
         k, tau = self.k, points.tau[:, None]
         self.t_fix = leg.t_fix[problem.use]
         self.C = state.C_nb[k]
-        dp = turn(self.C, points.dp)
+        dp = rotate(self.C, points.dp)
         v = state.v_n[k]
         w = leg.origin.earth_rate_n
         g = gravity_n(state.p_n[k], leg.origin)
@@ -54,15 +54,15 @@ class Fixes(PointRows):
         slow = state.slow_n[k] * (1 - self.share)[:, None] \
             + state.slow_n[k + 1] * self.share[:, None]
         self.dp = dp
-        self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
+        self.v_n = v + rotate(self.C, points.dv) + g * tau + rotate(
             self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
         # of a receiver that smooths the mean age is a delay
         track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
-        smoothed, self.by_lag = smoothing(*track, state.constants[layout.FIX_LAG2])
-        added, self.by_motion, self.by_time = odometer_error(
+        smoothed, self.by_lag = smoothing_error(*track, state.constants[layout.FIX_LAG2])
+        added, self.by_motion, self.by_time = own_odometer_error(
             *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_TIME])
         stated = leg.stated_sigma[problem.use]
         # a constant error does not affect the results
@@ -129,7 +129,7 @@ def antenna(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floa
     """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,
-            state.v_n + turn(state.C_nb, np.cross(rate, arm_b)))
+            state.v_n + rotate(state.C_nb, np.cross(rate, arm_b)))
 
 
 def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
@@ -190,13 +190,13 @@ class VelocityRows(ExternalRows):
         C_t = C @ points.R
         arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ arm_v
-        dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
-        swing = turn(C_t, np.cross(points.rate, arm_b))
+        dv, g = rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+        swing = rotate(C_t, np.cross(points.rate, arm_b))
         _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
         faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
-        smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
-                                     state.t[k] + points.tau,
-                                     state.constants[layout.VELOCITY_LAG2])
+        smoothed, by_lag = smoothing_error(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
+                                           state.t[k] + points.tau,
+                                           state.constants[layout.VELOCITY_LAG2])
         v = state.v_n[k] + dv + g * tau + swing + smoothed
         # the factor is on the prediction: on the measurement it would also scale its noise, and
         # small factors would fit best
@@ -216,7 +216,7 @@ class VelocityRows(ExternalRows):
         c[:, :, layout.YAW], c[:, :, layout.PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
         c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
         c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = faster, -by_lag
-        force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(layout.ACCEL_AXIS)))
+        force, signals = rotate(transpose(C), faster - g), np.zeros((m, 3, len(layout.ACCEL_AXIS)))
         # fitted force, (m, 3) m/s^2, by its axes
         columns = range(len(layout.ACCEL_AXIS))
         signals[:, layout.ACCEL_AXIS, columns] = force[:, layout.ACCEL_SIGNAL]

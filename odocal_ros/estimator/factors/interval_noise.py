@@ -202,7 +202,7 @@ def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -
     if coarse is None:
         return np.zeros((len(rest), ROWS, 0))
     if not leg.by_steps:
-        sigma = motion.state.scale * np.sqrt(coarse.way_variance(motion.state.t))
+        sigma = motion.state.scale * np.sqrt(coarse.travel_variance(motion.state.t))
         given = np.zeros((len(rest), ROWS, 1))
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]

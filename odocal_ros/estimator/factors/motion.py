@@ -44,7 +44,7 @@ from odocal_ros.estimator.state import (
     YAW,
 )
 from odocal_ros.nav.dead_reckoning import gravity_n
-from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn
+from odocal_ros.nav.rotations import exp_so3, level_left, rotate, rotvec, skew, transpose
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
@@ -84,7 +84,7 @@ class Motion:
         _, self.left, self.up = state.C_bv.T
         w = leg.origin.earth_rate_n
         W = skew(w)
-        dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
+        dv, dp = rotate(self.C, intervals.dv), rotate(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         p, v = state.p_n, state.v_n
         moved = p[1:] - p[:-1]
@@ -92,7 +92,7 @@ class Motion:
         along = self.f + self._vary_axis()
         # the odometer measures the path, in any direction of the body
         along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
-        straight = turn(half @ self.C, turn(intervals.S, along))
+        straight = rotate(half @ self.C, rotate(intervals.S, along))
         self.wheel_displacement = straight * self.scale_ratio * self._inclination_ratio(straight)[
             :, None]
         self.by_delay = self._derivative_by_filter()
@@ -169,7 +169,7 @@ class Motion:
             :, None] * c[BY_PITCHING]
         pitch, yaw = (self.lean_accelerations * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up; not by turns of a body that rolls
-        self.rate_n = turn(self.C, self.sums.mean_rate)
+        self.rate_n = rotate(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
         pitch_increments = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         # on banked ground a turn of the vehicle pitches it about its own axis
@@ -233,7 +233,7 @@ class Motion:
         # biases change little over HILL_INTERVALS: they do not affect the faster part
         lift = T * (C @ self.up)[:, :, None]
         hills, _, turns, tilted = state.constants[PITCH_CENTRE]
-        a[:, D, BG] += lift * ((hills - turns) * turn(transpose(C), self.level_left)
+        a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
                                + turns * self.left + tilted * self.up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)

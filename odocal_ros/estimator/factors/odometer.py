@@ -31,7 +31,7 @@ from odocal_ros.estimator.state import (
 from odocal_ros.nav.coarse_speed import SpeedInstants
 from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import turn
+from odocal_ros.nav.rotations import rotate
 
 # s each side, for the mean of a speed: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
@@ -152,7 +152,7 @@ class SpeedSteps(PointRows):
         self.state, self.instants = state, _within(problem)
         k, tau = points.interval, points.tau[:, None]
         C = state.C_nb[k]
-        C_t, dv, g = C @ points.R, turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+        C_t, dv, g = C @ points.R, rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
         v_n, ahead = state.v_n[k] + dv + g * tau, C_t @ state.forward
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
         arm_b = state.C_bv @ self.arm_v
@@ -166,9 +166,9 @@ class SpeedSteps(PointRows):
         points = self.points
         super().__init__(problem, points)
         self.sigma = self.instants.sigma * leg.rough_scale
-        self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
+        self.v_b = rotate(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the forward axis rotates, and an IMU beside the axle moves relative to the axle
-        self.acceleration = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
+        self.acceleration = np.einsum('ki,ki->k', self.ahead, rotate(self.C, points.force) + g)\
             + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
             + np.cross(points.spin, arm_b) @ state.forward
         c = state.constants

@@ -20,7 +20,7 @@ from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BARE, BG, GYRO, M, P, PHI, PRESSURE, V
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
-from odocal_ros.nav.rotations import skew, turn
+from odocal_ros.nav.rotations import rotate, skew
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
@@ -77,8 +77,8 @@ class PressureRows(ExternalRows):
         sent, k, tau = problem.external['pressure'], points.interval, points.tau
         assert isinstance(sent, Pressure)
         C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
-        dp = turn(C, points.dp)
-        dv = turn(C, points.dv)
+        dp = rotate(C, points.dp)
+        dv = rotate(C, points.dv)
         velocity_n = state.v_n[k] + dv + g * tau[:, None]
         by_velocity = (2 * state.constants[PRESSURE][2] * velocity_n)[:, None]
         by_constants = np.stack([np.ones(len(k)), sent.t, (velocity_n**2).sum(axis=1),

@@ -21,7 +21,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
-from odocal_ros.nav.rotations import transpose, turn
+from odocal_ros.nav.rotations import rotate, transpose
 
 FORCES = 3      # definition: number of the first gyro signal that is a force
 # judgement, measured in decision 9: sigmas of the noise of an interval
@@ -54,7 +54,7 @@ class Signals:
         gyro.
         """
         part, columns = self.motion.take(rows), constants[:, :, layout.GYRO]
-        noise = turn(transpose(part.C), part.residual[:, layout.PHI]) / part.T * part.fitted
+        noise = rotate(transpose(part.C), part.residual[:, layout.PHI]) / part.T * part.fitted
         rate = part.sums.mean_rate + noise
         bound = (LIKELY_NOISE**2 * (gyro[:, layout.PHI]**2).sum(axis=(1, 2))[:, None] / 3
                  / part.T**2)
@@ -73,7 +73,7 @@ class Signals:
         of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
         for axes, sway in self.sway:
             self._by_forces(part, constants[:, axes, layout.ACCEL],
-                            turn(transpose(part.C), sway[rows]), part.residual[:, axes],
+                            rotate(transpose(part.C), sway[rows]), part.residual[:, axes],
                             of_gyro[:, axes])
 
     def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
@@ -81,14 +81,14 @@ class Signals:
         """Correct the derivatives of velocity, or position, that are forces: columns (k, 3, a)."""
         back = transpose(part.C)
         turned = back @ of_gyro      # towards an axis of b, about an axis of b
-        own = turn(back, residual) - turned.sum(axis=2)
+        own = rotate(back, residual) - turned.sum(axis=2)
         for i, (into, by) in enumerate(zip(layout.ACCEL_AXIS, layout.ACCEL_SIGNAL, strict=True)):
             noise = np.zeros_like(own)
             noise[:, into] = own[:, by] - sway[:, by]
             if into == by:      # a force along one axis, turned about another, toward the third
                 for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
                     noise[:, toward] += turned[:, toward, about]
-            columns[:, :, i] += turn(part.C, noise)
+            columns[:, :, i] += rotate(part.C, noise)
 
 
 def across(x_n: Floats, forward_n: Floats) -> Floats:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
 from odocal_ros.calib.evidence import KEPT_ROWS
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import travel_reasons, unforced_sign
 from odocal_ros.calib.value_limits import check_limits
@@ -163,7 +163,7 @@ def _without_estimate(fit: Fit, sigma: Floats, ratio: Mapping[str, float],
 
 
 def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
-            posterior: _Posterior) -> tuple[list[Source], Border]:
+            posterior: _Posterior) -> tuple[list[Source], MarginalInformation]:
     """Return the error sources, and the information for other legs, with all model errors."""
     sources = [*(replace(source, effects=source.effects * posterior.factor)
                  for source in error_sources(fit, marginals)),
@@ -274,7 +274,7 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     return (*own, *shared, Source('standstill', root_of(rest)))
 
 
-def marginal_information(fit: Fit, setting_values: Floats) -> Border:
+def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformation:
     """
     Return the marginal information of a fit at its last linearisation point.
 
@@ -292,7 +292,7 @@ def marginal_information(fit: Fit, setting_values: Floats) -> Border:
     weight = 1 / priors.constants**2
     free = priors.constants > layout.NO_ERROR
     free[layout.OF_LEG] = False
-    return Border(
+    return MarginalInformation(
         layout.CONSTANTS, at + setting_values,
         (reduced - np.diag(weight)) * np.outer(free, free),
         (g_reduced + weight * (at - priors.centre)) * free, priors.centre + setting_values,

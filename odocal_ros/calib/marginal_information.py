@@ -21,7 +21,7 @@ NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
 
 
 @dataclass(frozen=True, eq=False)
-class Border:
+class MarginalInformation:
     """
     Log likelihood of a leg as a quadratic in the constants x, its other unknowns eliminated.
 
@@ -38,18 +38,18 @@ class Border:
     used: Floats         # (m,) the same, widened if the leg contradicts them, or by sizes
     evidence: dict[str, Floats] = field(default_factory=dict)  # (S38)
 
-    def widened(self, factor: float) -> 'Border':
+    def widened(self, factor: float) -> 'MarginalInformation':
         """Return the information with all sigmas multiplied by a factor."""
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
 
-    def plus(self, other: 'Border') -> 'Border':
+    def plus(self, other: 'MarginalInformation') -> 'MarginalInformation':
         """Return the sum with a border of the same constants, at this one's ``value``."""
         pull = other.pull - other.information @ (self.value - other.value)
         return replace(self, information=self.information + other.information,
                        pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
                        used=np.maximum(self.used, other.used))
 
-    def loosened(self, sigmas: dict[str, float]) -> 'Border':
+    def loosened(self, sigmas: dict[str, float]) -> 'MarginalInformation':
         """
         Return the border of a leg whose constants differ from the vehicle's by errors of its own.
 
@@ -57,12 +57,12 @@ class Border:
         The data depend on x + d; d is eliminated, docs/method.md (S34).
         """
         at = [self.names.index(name) for name in sigmas]
-        taken, DA, A = own_errors(self.information, at, np.array(list(sigmas.values())))
+        taken, DA, A = eliminate_own_errors(self.information, at, np.array(list(sigmas.values())))
         left = self.information - taken @ DA.T
         return replace(self, information=(left + left.T) / 2,
                        pull=self.pull - taken @ (A.T @ self.pull))
 
-    def with_errors(self, effects: Floats) -> 'Border':
+    def with_errors(self, effects: Floats) -> 'MarginalInformation':
         """Return the border of the same x, a covariance larger by E E', effects (m, L), (S33a)."""
         weight = 1 / self.used**2
         G = (self.information + np.diag(weight)) @ effects
@@ -72,25 +72,27 @@ class Border:
         return replace(self, information=(left + left.T) / 2,
                        pull=self.pull - taken @ (effects.T @ (self.pull + weight * off)))
 
-    def only(self, names: Sequence[str]) -> 'Border':
+    def only(self, names: Sequence[str]) -> 'MarginalInformation':
         """Return the information on some constants, the others eliminated with their priors."""
         at = np.isin(self.names, names)
         free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
                               if n not in names})
         D, off = free.information, np.where(np.isfinite(self.used), self.centre - self.value, 0.0)
-        return Border(tuple(n for n in self.names if n in names), self.value[at],
-                      D[np.ix_(at, at)], free.pull[at] - D[np.ix_(at, ~at)] @ off[~at],
-                      self.centre[at], self.sigma[at], self.used[at],
-                      {n: evidence for n, evidence in self.evidence.items() if n in names})
+        evidence = {n: own for n, own in self.evidence.items() if n in names}
+        return MarginalInformation(
+            tuple(n for n in self.names if n in names), self.value[at], D[np.ix_(at, at)],
+            free.pull[at] - D[np.ix_(at, ~at)] @ off[~at], self.centre[at], self.sigma[at],
+            self.used[at], evidence)
 
-    def turned(self, name: str, about: float) -> 'Border':
+    def turned(self, name: str, about: float) -> 'MarginalInformation':
         """Return the border with an angle, rad, wrapped to within half a turn of ``about``."""
         value, i = self.value.copy(), self.names.index(name)
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
 
-def own_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats, Floats]:
+def eliminate_own_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats,
+                                                                            Floats]:
     """
     Return T, DA and A: eliminating own errors of constants takes T DA' of D, T A' pull, (S34).
 
@@ -105,24 +107,24 @@ def own_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats
     return DA @ np.linalg.pinv(np.diag(known * 1.0) + np.swapaxes(A, -1, -2) @ DA), DA, A
 
 
-NUMBERS = [f for f in fields(Border) if f.name not in ('names', 'evidence')]
+NUMBERS = [f for f in fields(MarginalInformation) if f.name not in ('names', 'evidence')]
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
-    """Border of all legs so far, with the scale at the last leg."""
+class CarriedInformation:
+    """Information of all legs so far, with the scale at the last leg."""
 
-    border: Border
+    border: MarginalInformation
     unit: str      # of the scale
     first_ns: int  # start of the first leg
     last_ns: int   # start of the last leg
     legs: int      # their number
 
-    def includes(self, other: 'Carried') -> bool:
+    def includes(self, other: 'CarriedInformation') -> bool:
         """Return True if it contains all the information of another."""
         return self.first_ns == other.first_ns and self.legs > other.legs
 
-    def only(self, names: Sequence[str], keeps: float | Floats) -> 'Carried':
+    def only(self, names: Sequence[str], keeps: float | Floats) -> 'CarriedInformation':
         """
         Return the information on some constants.
 
@@ -141,8 +143,8 @@ class Carried:
                 'legs': self.legs, 'border': border}
 
 
-def carried_from(content: dict[str, Any]) -> Carried:
-    """Return the Carried from ``as_dict``, null: not finite; raises ValueError if not valid."""
+def read_carried(content: dict[str, Any]) -> CarriedInformation:
+    """Return the content of ``as_dict``, null: not finite; raises ValueError if not valid."""
     try:
         entry = content['border']
         names = tuple(map(str, entry['names']))
@@ -151,9 +153,10 @@ def carried_from(content: dict[str, Any]) -> Carried:
                                   NOTHING.get(f.name, np.nan))
                    for f in NUMBERS}
         evidence = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
-                for n, x in dict(entry.get('evidence', {})).items()}
-        return Carried(Border(names, **numbers, evidence=evidence), str(content['unit']),
-                       int(content['first_ns']), int(content['last_ns']), int(content['legs']))
+                    for n, x in dict(entry.get('evidence', {})).items()}
+        information = MarginalInformation(names, **numbers, evidence=evidence)
+        return CarriedInformation(information, str(content['unit']), int(content['first_ns']),
+                                  int(content['last_ns']), int(content['legs']))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'carried: {error}') from None
 
