@@ -52,7 +52,7 @@ class StampScreen:
     def __init__(self) -> None:
         self.clock_jumped = False
         self.jump_row = 0
-        self.excess_s = 0.0           # excess of the last odd stamp; negative: behind
+        self.excess_s = 0.0           # of the last refused stamp; negative: behind
         self.dropped = 0              # rows of the last block
         self._refused_rows = 0
         self._newest_ns = 0

@@ -168,7 +168,7 @@ class Reader:
             self._layout = layout
             paths = [column.pick(layout) for column in columns]
             self._record, self._unpackers = layout.record(paths), (
-                layout.unpackers(paths) if self._plan.plain else [])
+                layout.unpackers(paths) if self._plan.has_readings else [])
         if self._record is None:
             return []
         table = np.frombuffer(b''.join([raw[:layout.size] for raw in raws]), self._record)
@@ -190,7 +190,8 @@ class Reader:
     def _complete_plan(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
         """Pass messages to the plan until it is complete; return the number of skipped ones."""
         for k, raw in enumerate(raws):
-            view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
+            view: View | None = cdr.layout_of(self.msgtype,
+                                              raw) if self._plan.is_known_type else None
             if view is None:
                 view = self._message_view(raw, deserialize)
             if view is not None and self._plan.ready(view):

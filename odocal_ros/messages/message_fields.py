@@ -157,10 +157,10 @@ class SensorPlan:
     """Fields to read from a stamped sensor message, and the function that makes samples."""
 
     form: samples.OdometerForm | None = None
-    known = True         # the layout is sufficient, no message is needed
+    is_known_type = True     # the layout is sufficient, no message is needed
 
     def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
-        self.slot, self.plain = slot, slot == 'imu'
+        self.slot, self.has_readings = slot, slot == 'imu'
         self.columns = (*STAMP, *columns)
         self._build = build
 

@@ -44,11 +44,11 @@ class OdometerPlan:
     messages in order until it returns True.
     """
 
-    plain = True         # readings can be made
+    has_readings = True      # messages can be read as plain numbers
 
     def __init__(self, slot: str, msgtype: str, config: Config) -> None:
         self.slot, self.msgtype, self.odometer = slot, msgtype, config.odometer
-        self.known = msgtype in DEFAULT_FIELD
+        self.is_known_type = msgtype in DEFAULT_FIELD
         self.field = config.odometer.field or DEFAULT_FIELD.get(msgtype, '')
         self.keys = _wheel_keys(slot, config)
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
@@ -64,14 +64,14 @@ class OdometerPlan:
                 self.odometer.quantity, ('position',))
         else:
             self.fields = (self.field,)
-        if self.known:
+        if self.is_known_type:
             self.form = self._odometer_form(self.fields[0])
             if len(self.fields) == 1 and not self.selects_wheels:
                 self._set_columns(self.field or self.fields[0])
 
     def _check(self) -> None:
         """Raise an error for settings that must fail, before the first message."""
-        if not self.known and not self.field and len(self.keys) < 2:
+        if not self.is_known_type and not self.field and len(self.keys) < 2:
             raise BadData(
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
                 f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
@@ -79,7 +79,7 @@ class OdometerPlan:
         if self.field and not parts(self.field):
             raise BadConfig(f'odometer.field: {self.field!r} is not a path such as '
                             'twist.linear.x, data[0] or position[joint]')
-        if not self.known:
+        if not self.is_known_type:
             return
         kinds = _value_types(self.msgtype)
         base, key = _split_key(self.field)
@@ -97,13 +97,13 @@ class OdometerPlan:
 
     def _is_list(self) -> bool:
         base, _ = _split_key(self.field)
-        return self.known and (not base or '[' in _value_types(self.msgtype)[base])
+        return self.is_known_type and (not base or '[' in _value_types(self.msgtype)[base])
 
     def ready(self, view: View) -> bool:
         """Complete the plan from a message; return False to repeat with the next one."""
         if self.columns:
             return True
-        if not self.known:
+        if not self.is_known_type:
             assert isinstance(view, MessageView)
             self._complete_unknown_type(view)
             return True
@@ -163,7 +163,7 @@ class OdometerPlan:
 
     def _odometer_form(self, field: str, kind: str = '') -> OdometerForm:
         bits = 0
-        if self.known:
+        if self.is_known_type:
             kind = self._kind(field)
             bits = int(kind.lstrip('uintfloa'))
         is_whole = 'int' in kind
@@ -185,7 +185,7 @@ class OdometerPlan:
         """Return a function that returns the paths of a wheel's values in a message."""
         path = self._path(field, key)
         base, side = _split_key(field)
-        if not self.known or '[' not in _value_types(self.msgtype)[base]:
+        if not self.is_known_type or '[' not in _value_types(self.msgtype)[base]:
             return lambda view: (path,)
         key = key or side        # not by parsing the path: a joint may have any name
 
