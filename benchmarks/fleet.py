@@ -15,7 +15,7 @@ FLEET: a folder of odocal simulate --fleet.
 
 import argparse
 from collections import Counter
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 import csv
 from dataclasses import replace
 import json
@@ -28,10 +28,8 @@ import sys
 import tempfile
 import time
 
+from fleet_processes import children, cluster, fleet_command, process
 import numpy as np
-
-ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli']
-QUICK = ['--method', 'two_point', '--reports', 'none', '--quiet']
 
 
 def rows_in(output):
@@ -93,49 +91,6 @@ def found(args):
             print(f'  {name} of {len(z)} vehicles: (value - truth) / sigma has mean '
                   f'{z.mean():+.2f}, rms {np.sqrt((z**2).mean()):.2f}, largest '
                   f'{np.abs(z).max():.1f}')
-
-
-@contextmanager
-def process(*command, **options):
-    """Run a command beside, and end it with all of its own."""
-    running = subprocess.Popen(command, start_new_session=True, **options)
-    try:
-        yield running
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(running.pid, signal.SIGKILL)
-        running.wait()
-
-
-@contextmanager
-def cluster(folder, port, workers=2):
-    """Run a dask scheduler and workers over TCP; give its address and the processes."""
-    env = os.environ | {'OPENBLAS_NUM_THREADS': '1'}
-    quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL, 'env': env}
-    address = f'tcp://127.0.0.1:{port}'
-    dask = [sys.executable, '-m', 'dask']
-    with process(*dask, 'scheduler', '--host', '127.0.0.1', '--port', str(port),
-                 '--no-dashboard', **quiet) as scheduler:
-        worker = [*dask, 'worker', address, '--nthreads', '1', '--no-dashboard',
-                  '--memory-limit', '0', '--local-directory', str(folder)]
-        with process(*worker, '--nworkers', str(workers), **quiet):
-            yield address, scheduler
-
-
-def children(pid):
-    """Return the processes that run tasks below one."""
-    import psutil
-    try:
-        every = psutil.Process(pid).children(recursive=True)
-        return [p.pid for p in every if 'spawn_main' in ' '.join(p.cmdline())]
-    except psutil.Error:
-        return []
-
-
-def fleet_command(fleet, output, *options):
-    """Return the command that computes a fleet."""
-    return [*ODOCAL, 'fleet', str(fleet / 'manifest.csv'), '--output', str(output), *QUICK,
-            *options]
 
 
 def kills(args):

@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import SETTINGS, settings_of
 from odocal_ros.settings.node_configs import ApplyConfig
 from tools import settings_page
-from tools.reasons_page import MEANINGS
+from tools.reason_meanings import MEANINGS
 
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
 PAGE = (ROOT / 'docs' / 'recipes.md').read_text(encoding='utf-8')
@@ -67,7 +67,7 @@ def test_the_readme_is_short_and_in_its_order():
 
 def test_each_reason_is_explained_once_in_the_order_of_the_enum():
     explained = [code for codes in MEANINGS.values() for code in codes]
-    assert explained == list(Code), 'say what the code means in tools/reasons_page.py'
+    assert explained == list(Code), 'say what the code means in tools/reason_meanings.py'
     assert all(text.endswith('.') for codes in MEANINGS.values() for text in codes.values())
 
 

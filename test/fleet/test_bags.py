@@ -14,6 +14,7 @@ from odocal_ros.fleet import bags as bags_module
 from odocal_ros.fleet.bags import bag_fingerprint, find_bags, FleetBag, local_copy
 from odocal_ros.fleet.rows import key_of, legs_from_text, read_rows, Row, RowStore, text_of_legs
 from odocal_ros.fleet.tables import folder_name
+from odocal_ros.offline.cli import main
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
 
@@ -143,3 +144,17 @@ def test_legs_from_text_combine_to_the_same_digits():
     assert found['result']['scale_factor']['method'] == 'smoother'
     assert again[0].methods['smoother'].border.information.tobytes() == \
         legs[0].methods['smoother'].border.information.tobytes()
+
+
+@pytest.mark.parametrize(('argv', 'what'), [
+    (['*.none'], 'no bag found'),
+    (['{fleet}', '--set', 'leg.min_distance=x'], 'leg.min_distance'),
+    (['{fleet}', '--accept', 'x=1:2'], '--accept'), (['{fleet}', '--leg', '3'], '--leg'),
+    (['{fleet}', '--task-timeout', '0'], '--task-timeout'),
+    (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'no answer')])
+def test_wrong_usage_is_told_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [word.format(fleet=fleet.manifest) for word in argv]
+    assert main(['fleet', *words, '--output', str(tmp_path / 'out')]) == 2
+    assert what in capsys.readouterr().err
+    assert not (tmp_path / 'out' / 'fleet.html').exists()

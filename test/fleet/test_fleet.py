@@ -291,17 +291,3 @@ def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
     truth = next(v for v in fleet.truth if v['vehicle'] == manifest.vehicle[0])
     off = frame.scale_factor[:2] - truth['scale_factor'][:2]
     assert (abs(off) < 4 * frame.scale_factor_sigma[:2]).all()
-
-
-@pytest.mark.parametrize(('argv', 'what'), [
-    (['*.none'], 'no bag found'),
-    (['{fleet}', '--set', 'leg.min_distance=x'], 'leg.min_distance'),
-    (['{fleet}', '--accept', 'x=1:2'], '--accept'), (['{fleet}', '--leg', '3'], '--leg'),
-    (['{fleet}', '--task-timeout', '0'], '--task-timeout'),
-    (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'no answer')])
-def test_wrong_usage_is_told_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = [word.format(fleet=fleet.manifest) for word in argv]
-    assert main(['fleet', *words, '--output', str(tmp_path / 'out')]) == 2
-    assert what in capsys.readouterr().err
-    assert not (tmp_path / 'out' / 'fleet.html').exists()
