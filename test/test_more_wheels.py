@@ -180,7 +180,7 @@ def test_the_share_of_a_slip_in_the_mean_is_one_over_the_wheels():
                                 np.array([1])) for t, size in ((50.0, 0.4), (10.0, 0.8)))
     both = join_axles((first, second), 4)
     assert both.begin.tolist() == [10.0, 50.0]
-    t, sigma = both.doubts()
+    t, sigma = both.uncertain_travel()
     for begin, size in ((10.0, 0.8), (50.0, 0.4)):
         inside = (t > begin) & (t < begin + 2.0)
         assert np.linalg.norm(sigma[inside]) == pytest.approx(size / 4)

@@ -49,7 +49,7 @@ def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signe
     assert f"right wheel's counter rolls over at {span}," in text
     # bridging would lose counts; here none is
     assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
-    assert not len(inputs.doubt_t)
+    assert not len(inputs.uncertain_t)
 
 
 def test_the_wheel_and_the_first_time_are_named(made):
@@ -72,7 +72,7 @@ def test_a_span_of_no_round_number_is_taken_with_its_doubt(made, clean):
     inputs, said = screened(with_right(made, lambda a: a % 4321), made)
     assert 'about' in said[Code.WHEEL_COUNTERS_DIFFER]
     off = inputs.travels[1].s[-1] - clean.travels[1].s[-1]
-    doubt = np.linalg.norm(inputs.doubt_sigma)          # of the mean: half the right wheel's
+    doubt = np.linalg.norm(inputs.uncertain_sigma)          # of the mean: half the right wheel's
     assert 0 < doubt < 1e-3 * clean.travel.s[-1]
     assert abs(off / 2) < 3 * doubt
 
@@ -84,10 +84,10 @@ def test_damaged_counts_are_no_span(made):
         value[row:row + 2] = 2**63 - 1, -2**63
     count = changed(count, value=lambda _: value)
     step = np.diff(value.astype(float))
-    same, found, doubt_t, _ = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
+    same, found, uncertain_t, _ = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
     assert same is count
     assert not found
-    assert not len(doubt_t)
+    assert not len(uncertain_t)
 
 
 @pytest.mark.parametrize(('span', 'found'), [(256, True), (260, False), (2**16, True)])

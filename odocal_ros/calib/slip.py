@@ -244,7 +244,7 @@ class WheelSlips:
         """Return the middle of each slip, s."""
         return (self.begin + self.end) / 2
 
-    def doubts(self) -> tuple[Floats, Floats]:
+    def uncertain_travel(self) -> tuple[Floats, Floats]:
         """
         Return the times at which the mean of the wheels is uncertain, and its sigma: (d,) s, m.
 

@@ -54,7 +54,8 @@ TYRE_BLUR, TURN_DOUBT = 0.005, 0.01
 
 def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                  between: tuple[float, float], track: Track, latitude: float,
-                 metres_per_unit: float, track_width: float = 0.0, doubt_t: Floats | None = None,
+                 metres_per_unit: float, track_width: float = 0.0,
+                 uncertain_t: Floats | None = None,
                  max_deviation: float = 0.35,
                  count: int = 2) -> tuple[tuple[Reason, ...], WheelSlips]:
     """
@@ -63,12 +64,12 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     axle : (2,) sequence of Travel the left and the right wheel, scale units.   imu : (t, w_b, f_b)
     (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with their bias.   between : (2,) the marks, s.   track :
     dead reckoned with the mean of both, for attitudes.   latitude : rad.   metres_per_unit :
-    approximate scale of the mean.   track_width : m, 0 unknown.   doubt_t : (d,) s, times of
+    approximate scale of the mean.   track_width : m, 0 unknown.   uncertain_t : (d,) s, times of
     travel that is uncertain for other reasons (gaps, resets).   max_deviation : limit of the ratio
     of the counts minus one.   count : number of wheels in the mean.
     """
     two = wheels_on_grid(axle, imu, between, SLIP_GRID,
-                         np.empty(0) if doubt_t is None else doubt_t)
+                         np.empty(0) if uncertain_t is None else uncertain_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
     two = without_gyro_drift(two)

@@ -83,8 +83,8 @@ class SmootherLeg:
     imu_arm: Floats = field(default_factory=lambda: np.zeros(3))
     odometer_arm: Floats = field(default_factory=lambda: np.zeros(3))
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
-    doubt_t: Floats = _none()
-    doubt_sigma: Floats = _none()        # scale units
+    uncertain_t: Floats = _none()
+    uncertain_sigma: Floats = _none()        # scale units
     # by the name of the factor
     external: Mapping[str, ExternalSamples] = field(default_factory=dict)
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels

@@ -71,7 +71,7 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
         scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
-        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
+        uncertain_t=inputs.uncertain_t, uncertain_sigma=inputs.uncertain_sigma,
         external={part.name: sent for part in EXTERNAL_FACTORS
                   if (sent := part.prepared(inputs, config, origin)) is not None},
         has_accelerometer=inputs.has_accelerometer,

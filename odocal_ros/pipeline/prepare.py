@@ -132,7 +132,7 @@ def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track
     odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
     found, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
-        placed.origin.latitude, placed.rough, odometer.track_width, inputs.doubt_t,
+        placed.origin.latitude, placed.rough, odometer.track_width, inputs.uncertain_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
     return tuple(chain(*found)), join_axles(wheel_slips, count)
 

@@ -37,9 +37,9 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
     leg = make_smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
                             prepared.spans, prepared.rough, prepared.t_fit)
-    t_slip, metres = prepared.wheel_slips.doubts()
-    leg = replace(leg, doubt_t=np.append(leg.doubt_t, t_slip),
-                  doubt_sigma=np.append(leg.doubt_sigma, metres / prepared.rough))
+    t_slip, metres = prepared.wheel_slips.uncertain_travel()
+    leg = replace(leg, uncertain_t=np.append(leg.uncertain_t, t_slip),
+                  uncertain_sigma=np.append(leg.uncertain_sigma, metres / prepared.rough))
     passes = count(1)
     method = smooth(leg, prepared.config,
                     lambda *state: report_pass(next(passes), state[-1]))

@@ -108,7 +108,7 @@ class TwoPointRun:
             return None
         chord = Chord(track, prepared.origin, start, end, prepared.lever_b,
                       self._velocity_change((start, end)), prepared.alignment,
-                      (self.inputs.doubt_t, self.inputs.doubt_sigma))
+                      (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
         exact = all(m.standing or m.surveyed for m in (start, end))
         if exact or refusal_reasons(chord, prepared.rough):
             return chord

@@ -49,7 +49,7 @@ def usable_axles(wheels: Wheels, imu: Imu,
     A broken axle is left out if another one is usable and does not steer: with one wheel its mean
     is not that of the axle's middle.
     """
-    axles = pair_wheels(wheels.each)
+    axles = pair_wheels(wheels.wheels)
     faults = [_faults(axle, axles, imu, between) for axle in axles]
     reasons = [reason for why in faults for reason in why]
     if len(axles) < 2:
@@ -57,7 +57,8 @@ def usable_axles(wheels: Wheels, imu: Imu,
     # the working wheel of a broken axle is used to detect steering of the others
     usable = [axle if not why else _working_wheel(axle, why) for axle, why in zip(
         axles, faults, strict=True)]
-    ahead = iter(_distances_ahead([axle for axle in usable if axle], imu, between, wheels.doubt_t))
+    ahead = iter(_distances_ahead([axle for axle in usable if axle], imu, between,
+                                  wheels.uncertain_t))
     distances = [next(ahead) if axle else np.inf for axle in usable]
     working = [replace(wheel, ahead=x)
                for axle, why, x in zip(axles, faults, distances, strict=True)
@@ -101,10 +102,10 @@ def _faults(axle: Axle, axles: list[Axle], imu: Imu,
 
 
 def _distances_ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
-                     doubt_t: Floats) -> list[float]:
+                     uncertain_t: Floats) -> list[float]:
     """Return the distance of each axle ahead of the one that steers least, scale units."""
     first = mean_travel(axles[0])
-    found = [(0.0, 0.0), *(_squared_distance(mean_travel(axle), first, imu, between, doubt_t)
+    found = [(0.0, 0.0), *(_squared_distance(mean_travel(axle), first, imu, between, uncertain_t)
                            for axle in axles[1:])]
     squares, sigmas = np.transpose(found)
     least = int(np.argmin(squares))
@@ -114,9 +115,9 @@ def _distances_ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
 
 
 def _squared_distance(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
-                      doubt_t: Floats) -> tuple[float, float]:
+                      uncertain_t: Floats) -> tuple[float, float]:
     """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
-    two = wheels_on_grid((own, other), imu, between, STEER_GRID, doubt_t)
+    two = wheels_on_grid((own, other), imu, between, STEER_GRID, uncertain_t)
     if two is None:
         return 0.0, 0.0
     at = np.arange(0, len(two.t), CELL)

@@ -41,8 +41,8 @@ class Inputs:
     C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
     travel: Travel                     # mean of the wheels
     travels: tuple[Travel, ...]        # of several wheels; () if one, or if sides are unknown
-    doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
-    doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
+    uncertain_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
+    uncertain_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
     t_fix: NDArray[np.float64]         # (k,)
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2

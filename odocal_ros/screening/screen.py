@@ -66,14 +66,14 @@ def screen(leg: Leg, config: Config,
     inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
     wheels = rows.wheels      # the mean has the rows of the first one
-    for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.each[1:]), strict=False):
+    for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
         found += topic_gap(slot, one.t)
     if check_faults:
         found += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
         found += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
         found += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
-        if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
+        if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
             wheels, why = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
                                        (0.0, inputs.t_stop))
             found += why
@@ -181,9 +181,9 @@ def _inputs_of(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) ->
 
 def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
     # of two wheels with unknown sides only the mean is defined
-    several = wheels.each if leg.form.sides and len(wheels.each) > 1 else ()
+    several = wheels.wheels if leg.form.sides and len(wheels.wheels) > 1 else ()
     return {'travel': wheels.mean, 'travels': several,
-            'doubt_t': wheels.doubt_t, 'doubt_sigma': wheels.doubt_sigma}
+            'uncertain_t': wheels.uncertain_t, 'uncertain_sigma': wheels.uncertain_sigma}
 
 
 def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:

@@ -49,11 +49,11 @@ class WheelPair:
 
 
 def wheels_on_grid(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
-                   doubt_t: Sequence[float] | Floats = ()) -> WheelPair | None:
+                   uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
     """
     Return the wheels on a grid of ``step`` s, None with fewer than 20 common cells.
 
-    imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
+    imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   uncertain_t : (d,) s.
     """
     t_imu, w_b, f_b = imu
     left, right = axle
@@ -71,7 +71,7 @@ def wheels_on_grid(axle: Sequence[Travel], imu: Imu, between: tuple[float, float
         gap = np.diff(times)
         for k in np.flatnonzero(gap > max(GAP_INTERVALS * np.median(gap), 0.2)):
             known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
-    for at in doubt_t:
+    for at in uncertain_t:
         known &= (t[1:] < at - step) | (t[:-1] > at + step)
     return WheelPair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
                      max(left.quantum, right.quantum),

@@ -136,44 +136,45 @@ def correct_rollovers(
                    'corrected' + '; if the counter cannot roll over so often, check for two '
                    'publishers on one topic' * twice, do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
-    doubt = np.full(times, span.sigma * np.sqrt(times))
+    uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),
-            *((t[span.rows], doubt) if span.sigma else (none, none)))
+            *((t[span.rows], uncertain_sigma) if span.sigma else (none, none)))
 
 
 @dataclass(frozen=True, eq=False)
 class Wheels:
     """Travel of the wheels, and its uncertain parts."""
 
-    each: tuple[Travel, ...]
+    wheels: tuple[Travel, ...]
     # of each: times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
-    doubts: tuple[tuple[Floats, Floats], ...]
+    uncertain_travel: tuple[tuple[Floats, Floats], ...]
 
     @cached_property
     def mean(self) -> Travel:
         """Return the mean of the wheels that do not steer; the first one if another is empty."""
-        fixed = [self.each[k] for k in self._fixed]
+        fixed = [self.wheels[k] for k in self._fixed]
         return mean_travel(fixed) if all(len(one.t) for one in fixed) else fixed[0]
 
     @property
-    def doubt_t(self) -> Floats:
+    def uncertain_t(self) -> Floats:
         """Return the times at which the mean is uncertain, s."""
-        return np.concatenate([self.doubts[k][0] for k in self._fixed])
+        return np.concatenate([self.uncertain_travel[k][0] for k in self._fixed])
 
     @property
-    def doubt_sigma(self) -> Floats:
+    def uncertain_sigma(self) -> Floats:
         """Return the sigmas of the mean at these times, scale units."""
-        sigma: Floats = np.concatenate([self.doubts[k][1] for k in self._fixed])
+        sigma: Floats = np.concatenate([self.uncertain_travel[k][1] for k in self._fixed])
         return sigma / len(self._fixed)
 
     @property
     def _fixed(self) -> list[int]:
-        return [k for k, one in enumerate(self.each) if not one.ahead]
+        return [k for k, one in enumerate(self.wheels) if not one.ahead]
 
-    def only(self, travel_of_wheels: Sequence[Travel]) -> 'Wheels':
-        """Return the travel of the given wheels, a part of ``each``, and their uncertain parts."""
-        doubts = {one.name: doubt for one, doubt in zip(self.each, self.doubts, strict=True)}
-        return Wheels(tuple(travel_of_wheels), tuple(doubts[one.name] for one in travel_of_wheels))
+    def only(self, kept: Sequence[Travel]) -> 'Wheels':
+        """Return the travel of the kept ones of the wheels, and their uncertain parts."""
+        by_name = {wheel.name: uncertain for wheel, uncertain in zip(
+            self.wheels, self.uncertain_travel, strict=True)}
+        return Wheels(tuple(kept), tuple(by_name[wheel.name] for wheel in kept))
 
 
 def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
@@ -185,7 +186,7 @@ def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, 
     if len(slots) == 1 and len(config.odometer.keys) > 1 and len(t):
         found.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                             'marks: only the left wheel is used'))
-    each = [_corrected_travel(samples, t, leg.form, config, found, names[0])]
+    wheels = [_corrected_travel(samples, t, leg.form, config, found, names[0])]
     for slot, name in zip(slots[1:], names[1:], strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
@@ -193,27 +194,27 @@ def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, 
                 Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used'))
-            return _joined(each[:1])
+            return _joined(wheels[:1])
         samples, t = rows(slot)
         if not len(t):
             found.append(Reason(Code.WHEEL_DEAD, f'the {name} wheel has no usable value between '
                                 f'the marks: only the {names[0]} wheel is used'))
-            return _joined(each[:1])
-        each.append(_corrected_travel(samples, t, form, config, found, name))
-    return _joined(each)
+            return _joined(wheels[:1])
+        wheels.append(_corrected_travel(samples, t, form, config, found, name))
+    return _joined(wheels)
 
 
-def _joined(each: list[tuple[Travel, Floats, Floats]]) -> Wheels:
-    return Wheels(tuple(one[0] for one in each), tuple(one[1:] for one in each))
+def _joined(wheels: list[tuple[Travel, Floats, Floats]]) -> Wheels:
+    return Wheels(tuple(one[0] for one in wheels), tuple(one[1:] for one in wheels))
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
                       found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
     name = f"the {side} wheel's counter" if side else 'the counter'
-    doubt_t = doubt = np.empty(0)
+    uncertain_t = uncertain_sigma = np.empty(0)
     if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, why, doubt_t, doubt = correct_rollovers(
+        samples, why, uncertain_t, uncertain_sigma = correct_rollovers(
             t, samples, step, name, only_counter=not side)
         found.extend(why)
     samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
@@ -221,7 +222,8 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
     counts, reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
     counts, more_t, more = with_gap_uncertainty(counts, samples.value, form)
-    return replace(counts, name=side), np.append(doubt_t, more_t), np.append(doubt, more)
+    return (replace(counts, name=side), np.append(uncertain_t, more_t),
+            np.append(uncertain_sigma, more))
 
 
 def _form_text(form: OdometerForm) -> str:

@@ -273,7 +273,7 @@ def test_a_place_in_doubt_already_is_not_called_a_slip():
     options = TOWN | {'seed': 2}
     lost = spun(options, 120.0, 0.01, 5.0)
     assert len(faults(options, right=lost)[1].t)
-    assert faults(options, right=lost, doubt_t=(120.0,))[0] == ()
+    assert faults(options, right=lost, uncertain_t=(120.0,))[0] == ()
 
 
 def test_wheels_of_other_resolution_are_said_with_what_the_mean_then_is():

@@ -273,7 +273,7 @@ def test_increments_that_are_late_are_not_lost(made):
     inputs, found = screened(made, late, form=form)
     straight, _ = screened(made, steps, form=form)
     assert inputs.travel.s[-1] == straight.travel.s[-1]
-    assert not len(inputs.doubt_t)
+    assert not len(inputs.uncertain_t)
     assert set(found) == {Code.ODOMETER_LATE}
 
 

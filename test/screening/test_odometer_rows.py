@@ -54,7 +54,7 @@ def test_a_counter_that_jumps_away_and_back_is_mended(leg, true, value, length):
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
     assert 'are frozen or isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
-    assert inputs.doubt_sigma.sum() == 0
+    assert inputs.uncertain_sigma.sum() == 0
 
 
 @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s
@@ -72,8 +72,8 @@ def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(made, leg, true):
     assert 'a reset, not motion' in codes[Code.COUNTER_RESET]
     # one interval at the speed beside it, uniform between none and two of it
     speed = 12.0 / made.options.scale
-    np.testing.assert_allclose(inputs.doubt_sigma, speed * 0.05 / np.sqrt(3), rtol=0.05)
-    assert abs(inputs.travel.s[-1] - true[-1]) < 3 * inputs.doubt_sigma[0]
+    np.testing.assert_allclose(inputs.uncertain_sigma, speed * 0.05 / np.sqrt(3), rtol=0.05)
+    assert abs(inputs.travel.s[-1] - true[-1]) < 3 * inputs.uncertain_sigma[0]
 
 
 def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
@@ -84,7 +84,7 @@ def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
     # the speed is even there: but for rounding of counts at each side, nothing is lost
     error = abs(inputs.travel.s[-1] - end)
     assert error < 0.01 * lost
-    assert error < 3 * inputs.doubt_sigma[0] < 0.2 * lost
+    assert error < 3 * inputs.uncertain_sigma[0] < 0.2 * lost
     np.testing.assert_allclose(end, true[-1])
 
 

@@ -250,7 +250,7 @@ def _given_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
     extra[outside, D] = ABSENT_VARIANCE
     extra[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
-    for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
+    for at, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
             near = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier

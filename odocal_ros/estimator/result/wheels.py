@@ -119,7 +119,7 @@ def _nodes(s: Floats, quantum: float) -> Ints:
 
 def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
     """Yield spans without usable increments: known slips and gaps of a wheel, s."""
-    for t in leg.doubt_t:
+    for t in leg.uncertain_t:
         yield t - 1.0, t + 1.0
     for wheel in leg.wheels:
         steps = np.diff(wheel.t)
