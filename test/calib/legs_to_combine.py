@@ -85,7 +85,7 @@ class Toy:
         return x[at], (inverse @ inverse.T)[np.ix_(at, at)]
 
 
-def apart(a, b, covariance):
+def largest_deviation(a, b, covariance):
     """Return the largest difference of two solutions, in sigmas."""
     return np.abs((a - b) / np.sqrt(np.diag(covariance))).max()
 

@@ -48,11 +48,11 @@ def on_a_plane(lanes=8, sigma=0.02, seed=0, length=15.0, k=600):
 
     Not in circles: on a circle left and right differ by a multiple of the position itself.
     """
-    way = np.linspace(0.0, lanes * (length + 3.0), 20 * k + 1)
-    lane, along = np.divmod(way, length + 3.0)
+    path = np.linspace(0.0, lanes * (length + 3.0), 20 * k + 1)
+    lane, along = np.divmod(path, length + 3.0)
     turned = np.pi * np.clip((along - length) / 3.0, 0.0, 1.0)       # half turns, left and right
     yaw = np.where(lane % 2 == 0, turned, np.pi - turned)
-    ds, dyaw = np.diff(way), np.diff(yaw)
+    ds, dyaw = np.diff(path), np.diff(yaw)
     direction = np.exp(1j * (yaw[1:] + yaw[:-1]) / 2)
     left = np.cumsum((ds - 0.5 * dyaw) / TRUE[0] * direction)[::20]
     right = np.cumsum((ds + 0.5 * dyaw) / TRUE[1] * direction)[::20]

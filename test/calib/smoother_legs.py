@@ -41,7 +41,7 @@ def smoothed(**options):
     return drive, smooth(leg, config)
 
 
-def said(result):
+def reason_texts(result):
     """Return the texts of the reasons of a result, by code."""
     return {reason.code: reason.text for reason in result.reasons}
 

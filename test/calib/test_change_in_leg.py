@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from drives import ANGLES, cached, off, turned
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made, said as texts
+from smoother_legs import leg_of, made, reason_texts
 
 from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
@@ -50,7 +50,7 @@ def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
     leg = recounted(leg.with_rows(imu=turned(leg.imu, at, turn)),
                     1 + scale * (leg.odometer.stamp_ns[:-1] >= at))
     result = smooth(leg_of(leg, config), with_settings(config, limits))
-    return drive.truth, result.estimates, texts(result)
+    return drive.truth, result.estimates, reason_texts(result)
 
 
 def equations_at(problem, fit, constants):
@@ -160,7 +160,7 @@ def test_a_scale_that_changes_gradually_has_no_step():
     drive, config, _ = made(imu_grade='tactical', duration=400.0, fix_sigma=0.02)
     leg = drive.leg()
     arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(leg.odometer.value) - 1))
-    said = texts(smooth(leg_of(recounted(leg, 1 + arch), config), config))
+    said = reason_texts(smooth(leg_of(recounted(leg, 1 + arch), config), config))
     assert 'from start to end' in said[Code.SCALE_VARIES]
     assert Code.CHANGE_IN_LEG not in said
 
@@ -240,10 +240,10 @@ def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
         assert off(method, drive, name) < 3.3
         # one interval without the continuity of the bias, of 200
         assert method.estimates[name].sigma < 1.3 * plain.estimates[name].sigma
-    said = texts(method)
+    said = reason_texts(method)
     assert not {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.WHEEL_SLIP,
                 Code.CHANGE_IN_LEG} & set(said)
-    assert Code.IMU_BIAS_STEP not in texts(plain)
+    assert Code.IMU_BIAS_STEP not in reason_texts(plain)
     found = re.fullmatch(f'the {SENSORS[stepping]} bias changes by ([0-9.]+) (deg/s|m/s\\^2) near '
                          't = ([0-9]+) s; estimated before and after', said[Code.IMU_BIAS_STEP])
     unit = {'deg/s': np.deg2rad(1.0), 'm/s^2': 1.0}[found[2]]

@@ -9,7 +9,7 @@ from drives import configured, settings
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from smoother_legs import leg_of, made, said as texts, truth
+from smoother_legs import leg_of, made, reason_texts, truth
 
 from odocal_ros.data.leg import part_of
 from odocal_ros.estimator import fit, smooth
@@ -104,7 +104,8 @@ def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
     few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
     assert few.details['iterations'] == 5
     assert (few.verdict, few.details['widened']) == (Verdict.CAUTION, 2.0)
-    assert 'after 5 iterations the estimates still changed' in texts(few)[Code.MODEL_MISMATCH]
+    assert 'after 5 iterations the estimates still changed' in reason_texts(few)[
+        Code.MODEL_MISMATCH]
     a, b = (m.estimates['scale_factor'] for m in (whole, few))
     assert b.sigma > 1.5 * a.sigma
     assert abs(b.value - drive.truth.scale) < 4 * b.sigma

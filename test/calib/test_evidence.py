@@ -91,26 +91,26 @@ def test_fixes_left_out_are_named_with_the_reason():
     assert drive(bad=((7, 'far'),)).excluded_because == ('far off the track',)
 
 
-def straight(way):
+def straight(path):
     """Return the way east: (n, 3)."""
-    return np.outer(way, [1.0, 0.0, 0.0])
+    return np.outer(path, [1.0, 0.0, 0.0])
 
 
 def test_a_section_gives_the_scale_whatever_the_heading():
-    way = np.arange(0.0, 1000.0, 2.0)
-    z = straight(way) + np.outer(30 * np.sin(way / 80), [0.0, 1.0, 0.0])
+    path = np.arange(0.0, 1000.0, 2.0)
+    z = straight(path) + np.outer(30 * np.sin(path / 80), [0.0, 1.0, 0.0])
     turn = np.array([[np.cos(1.0), -np.sin(1.0), 0], [np.sin(1.0), np.cos(1.0), 0], [0, 0, 1]])
-    found = sections(way, z, 1.003 * z @ turn.T + [5.0, 6.0, 7.0], np.full(len(way), 0.02))
+    found = sections(path, z, 1.003 * z @ turn.T + [5.0, 6.0, 7.0], np.full(len(path), 0.02))
     np.testing.assert_allclose(found.ratio, 1.003, rtol=1e-9)
     np.testing.assert_allclose([found.begin[0], found.end[-1]], [0.0, 998.0])
     # on a straight, the closed form of a line through n points: sigma sqrt(12 / n) / length; 100
     # residuals a section, ten sections: the median is good to some per cent
-    z = straight(way)
+    z = straight(path)
     noisy = z + np.random.default_rng(1).normal(0.0, 0.02, z.shape)
-    found = sections(way, z, noisy, np.full(len(way), 1.0))
+    found = sections(path, z, noisy, np.full(len(path), 1.0))
     assert np.median(found.sigma) == pytest.approx(0.02 * np.sqrt(12 / 50) / 100, rel=0.1)
     # perfect fixes: a hundredth of the stated sigma is the least
-    found = sections(way, z, z, np.full(len(way), 2.0))
+    found = sections(path, z, z, np.full(len(path), 2.0))
     assert (found.sigma >= 0.99 * 0.02 * np.sqrt(12 / 50) / 100).all()
 
 
@@ -118,13 +118,13 @@ def test_a_section_gives_the_scale_whatever_the_heading():
 def test_the_sigma_of_a_section_holds(memory, white):
     # a first-order process, 1 m, and white noise on it, 100 drives of 10 sections of 60 fixes
     rng = np.random.default_rng(20261101)
-    way = np.arange(0.0, 6000.0, 10.0)
-    z, pulls = straight(way), []
-    root = np.linalg.cholesky(memory**(np.abs(np.subtract.outer(way, way)) / 10.0))
+    path = np.arange(0.0, 6000.0, 10.0)
+    z, pulls = straight(path), []
+    root = np.linalg.cholesky(memory**(np.abs(np.subtract.outer(path, path)) / 10.0))
     for _ in range(100):
-        noise = root @ rng.standard_normal((len(way), 2))
+        noise = root @ rng.standard_normal((len(path), 2))
         noise += white * rng.standard_normal(noise.shape)
-        found = sections(way, z, z + np.pad(noise, ((0, 0), (0, 1))), np.full(len(way), 3.0))
+        found = sections(path, z, z + np.pad(noise, ((0, 0), (0, 1))), np.full(len(path), 3.0))
         pulls += list((found.ratio - 1.0) / found.sigma)
     # 1000 pulls: 2.2 % of statistics. The process is matched to one drive, where 600 fixes of
     # memory 0.95 are worth 15: sqrt(1 / (2 * 2 * 15)) = 13 % of its sigma. The longer of two
@@ -134,13 +134,13 @@ def test_the_sigma_of_a_section_holds(memory, white):
 
 
 def test_what_the_fixes_do_not_tell_is_nan_and_too_little_is_nothing():
-    way = np.linspace(0.0, 200.0, 20)
-    z = straight(way)
+    path = np.linspace(0.0, 200.0, 20)
+    z = straight(path)
     for n in (0, 5):
-        assert len(sections(way[:n], z[:n], z[:n], np.ones(n)).ratio) == 0
+        assert len(sections(path[:n], z[:n], z[:n], np.ones(n)).ratio) == 0
     with np.errstate(all='raise'):      # a path that stays where it is
-        assert np.isnan(sections(way, 0 * z, z, np.ones(20)).ratio).all()
-    found = sections(way, z, z, np.full(20, 5e4))
+        assert np.isnan(sections(path, 0 * z, z, np.ones(20)).ratio).all()
+    found = sections(path, z, z, np.full(20, 5e4))
     assert len(found.ratio) == 2
     assert np.isnan(found.ratio).all()
 

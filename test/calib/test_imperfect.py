@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The IMU's own errors: judged from the drive, held by the sigma."""
+"""The IMU's own errors: estimated from the drive, and included in the sigma."""
 
 from dataclasses import replace
 import re
@@ -9,7 +9,7 @@ import re
 from drives import ANGLES, configured, off, settings
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made, said as texts
+from smoother_legs import leg_of, made, reason_texts
 
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.prepare import make_problem
@@ -205,7 +205,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
                                     'gnss.lever_arm_sigma': 0.1})
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
-    said = texts(found)
+    said = reason_texts(found)
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in said[Code.LEVER_ARM_OFF]
     # the sigma of this axis is no smaller than that of its setting, but far from it
     arm = found.estimates['antenna_lever_arm_x']
@@ -217,7 +217,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     found = smooth(leg, with_settings(config, {'odometer.time_sigma': 2e-3}))
     assert found.details['posterior_to_prior']['odometer_delay'] > 0.5
     assert found.estimates['odometer_delay'].value is None
-    assert 'odometer delay' in texts(found)[Code.PARAMETER_NOT_DETERMINED]
+    assert 'odometer delay' in reason_texts(found)[Code.PARAMETER_NOT_DETERMINED]
 
 
 def test_what_a_vehicle_shows_beside_its_values_is_said():
@@ -227,7 +227,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
     leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))
     found = smooth(leg, moved)
-    said = texts(found)
+    said = reason_texts(found)
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in said[Code.LEVER_ARM_OFF]
@@ -239,7 +239,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     assert off(found, drive) < 3.0
     assert 'warm tyres' in next(r for r in found.reasons if r.code is Code.SCALE_VARIES).remedy
     # and of a vehicle that has none of it nothing
-    clean = texts(smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config))
+    clean = reason_texts(smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config))
     assert not {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
                 Code.SCALE_VARIES, Code.IMU_AXES_SKEW} & set(clean)
 

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from legs_to_combine import apart, LEGS, NAMES, PRIOR, STEPS, Toy, TRUTH
+from legs_to_combine import largest_deviation, LEGS, NAMES, PRIOR, STEPS, Toy, TRUTH
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ def toy():
 def test_legs_are_one_fit_of_all_rows(toy):
     found, (value, covariance) = of(toy.borders()), toy.batch()
     assert not found.disputed
-    assert apart(found.value, value, covariance) < 1e-9
+    assert largest_deviation(found.value, value, covariance) < 1e-9
     assert np.abs(found.covariance / covariance - 1).max() < 1e-6      # small ones beside large
     sigma = np.sqrt(np.diag(covariance))
     assert np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max() < 1e-9
@@ -38,18 +38,18 @@ def test_errors_of_each_leg_alone_are_unknowns_of_the_fit(toy):
     own = {'z0': 0.3, 'z3': 0.05}
     value, covariance = toy.batch(own=[(NAMES.index(n), s) for n, s in own.items()])
     found = of([b.loosened(own) for b in toy.borders()])
-    assert apart(found.value, value, covariance) < 1e-9
+    assert largest_deviation(found.value, value, covariance) < 1e-9
 
 
 def test_linearisation_and_order_of_legs_are_no_matter(toy):
     moved = [toy.border(j, TRUTH - 0.2 * j) for j in range(LEGS)]
     a, b = of(toy.borders()), of(moved)
-    assert apart(a.value, b.value, a.covariance) < 1e-9
+    assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
     assert a.chi2 == pytest.approx(b.chi2, rel=1e-6)
     borders = toy.borders()
     one = of(borders, np.zeros(LEGS - 1))
     other = of([borders[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
-    assert apart(one.value, other.value, one.covariance) < 1e-6
+    assert largest_deviation(one.value, other.value, one.covariance) < 1e-6
     assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
 
 
@@ -75,7 +75,7 @@ def test_a_leg_without_information_changes_nothing(toy):
     borders = toy.borders()
     nothing = replace(borders[0], information=np.zeros((5, 5)), pull=np.zeros(5))
     a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
-    assert apart(a.value, b.value, a.covariance) < 1e-9
+    assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
     # freedom is a sum of some twenty shares since priors are weighted_copy: alike but for rounding
     assert (a.freedom, a.chi2) == (pytest.approx(b.freedom, rel=1e-12),
                                    pytest.approx(b.chi2, rel=1e-6))
@@ -86,7 +86,7 @@ def test_sections_of_one_leg_are_one_leg(toy):
     still = np.zeros(LEGS - 1)
     whole = of(toy.borders(), still)
     found = fit_jointly(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
-    assert apart(found.value, whole.value, whole.covariance) < 1e-6
+    assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
     assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
     scattered = of(toy.borders(), still, USUAL)

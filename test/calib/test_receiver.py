@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from drives import off, settings
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made, said as texts
+from smoother_legs import leg_of, made, reason_texts
 
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.level_steps import long_span_factors
@@ -37,7 +37,7 @@ def received(**real):
     drive, config, leg = made(**DRIVE, seed=4, real=Real(**real))
     found = smooth(leg, config)
     assert off(found, drive) < 3
-    return found.details, texts(found)
+    return found.details, reason_texts(found)
 
 
 @pytest.mark.parametrize('share', [0.02, -0.003])
@@ -68,7 +68,7 @@ def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
     config = settings(drive, None)
     found = smooth(leg_of(drive.leg(), config), config)
     assert off(found, drive) < 3
-    assert Code.FIXES_FOLLOW_ODOMETER in texts(found)
+    assert Code.FIXES_FOLLOW_ODOMETER in reason_texts(found)
 
 
 def fixes_of(error, t):
@@ -120,7 +120,7 @@ def test_the_rate_of_a_fast_clock_is_stated_and_the_scale_is_that_of_the_wheel(n
     drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
                               duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
     result = smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
-    scale, said = result.estimates['scale_factor'], texts(result)
+    scale, said = result.estimates['scale_factor'], reason_texts(result)
     assert off(result, drive) < 3
     assert scale.sigma / scale.value < FAST / 3     # an error of FAST would show
     text = said[Code.CLOCKS_DRIFT]

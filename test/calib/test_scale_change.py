@@ -6,7 +6,7 @@
 from dataclasses import replace
 import json
 
-from legs_to_combine import apart, leg_result, moved, NO_SCATTER, STEPS, Toy
+from legs_to_combine import largest_deviation, leg_result, moved, NO_SCATTER, STEPS, Toy
 import numpy as np
 import pytest
 from smoother_legs import made, smoothed
@@ -35,7 +35,7 @@ def test_legs_carried_on_are_one_fit_with_those_to_come(first):
     whole = fit_jointly(borders, STEPS, 'k')
     before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').carried
     found = fit_jointly([before, *borders[first:]], STEPS[first - 1:], 'k')
-    assert apart(found.value, whole.value, whole.covariance) < 1e-6
+    assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     sigma = np.sqrt(np.diag(whole.covariance))
     assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 

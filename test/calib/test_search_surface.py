@@ -37,8 +37,8 @@ RANGES = ranges_of(WheelsConfig())
 def test_distances_are_those_of_the_source_summed_step_by_step(monkeypatch):
     rng = np.random.default_rng(1)
     steps, yaw = rng.uniform(0.1, 0.3, (40, 2)), np.cumsum(rng.normal(0, 0.2, 40))
-    way = np.cumsum(steps * np.exp(1j * yaw)[:, None], axis=0)
-    leg = PlanarLeg(np.arange(40.0), plane(way[:, 0]), plane(way[:, 1]),
+    path = np.cumsum(steps * np.exp(1j * yaw)[:, None], axis=0)
+    leg = PlanarLeg(np.arange(40.0), plane(path[:, 0]), plane(path[:, 1]),
                     rng.normal(0.0, 3.0, (40, 2)), np.array([5.0, -3.0]), np.ones(40), 1.0, 1.0)
     sets, d = np.array([[1.0, 1.0, 0.0], [1.1, 0.9, 0.4], [0.9, 1.0, -2.0]]), np.empty((3, 40))
     for k, (a, b, h) in enumerate(sets):

@@ -54,11 +54,11 @@ def test_a_body_that_kerbs_pitch_lifts_its_axle(kerbs, least, most):
 
 def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
     rng = np.random.default_rng(4)
-    way = np.concatenate([np.full(100, 9.0), 0.0158 * rng.standard_normal(100)])
+    path = np.concatenate([np.full(100, 9.0), 0.0158 * rng.standard_normal(100)])
     rest = np.arange(200) >= 100
     # 5 sigma of a variance from a hundred draws
-    assert rest_noise(way, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
-    assert rest_noise(way, rest & (np.arange(200) < 103)) == REST_NOISE**2
+    assert rest_noise(path, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
+    assert rest_noise(path, rest & (np.arange(200) < 103)) == REST_NOISE**2
     assert rest_noise(np.zeros(200), rest) == REST_NOISE**2
 
 

@@ -12,7 +12,7 @@ import pytest
 from smoother_legs import (
     leg_of,
     made,
-    said as texts,
+    reason_texts,
     smoothed,
     truth,
     VELOCITY_SIGMA as SIGMA,
@@ -178,7 +178,7 @@ def test_a_wrong_heading_is_said_and_gives_way():
     drive, config, _ = made(**SHORT)
     method = fitted(drive.leg(), config, alignment__heading=float(drive.truth.heading) + 0.05,
                     alignment__heading_sigma=2e-3)
-    assert 'heading (fixed) differs by' in texts(method)[Code.MODEL_MISMATCH]
+    assert 'heading (fixed) differs by' in reason_texts(method)[Code.MODEL_MISMATCH]
     assert off(method, drive, *BOTH) < 3.3
 
 

@@ -77,11 +77,11 @@ def stepping(moved):
     t = np.arange(leg.t_begin, leg.t_stop, 0.1)
     speed = np.diff(leg.travel.at(np.append(t, t[-1] + 0.1))) / 0.1 * leg.rough_scale
     coarse = CoarseSpeed(step, t, np.floor(speed / step) * step)
-    way = Travel(t, np.cumsum(coarse.value) * 0.1, 0.0, coarse)
+    path = Travel(t, np.cumsum(coarse.value) * 0.1, 0.0, coarse)
     c = np.zeros(layout.M)
     c[layout.LN_K], c[layout.SPEED_OFFSET] = -np.log(leg.rough_scale), 0.1
     state = state.moved(np.zeros((len(state.t), N)), c)
-    return replace(problem, leg=replace(leg, travel=way, rough_scale=1.0)), state
+    return replace(problem, leg=replace(leg, travel=path, rough_scale=1.0)), state
 
 
 def without_steps(problem, state):
@@ -89,8 +89,8 @@ def without_steps(problem, state):
     wheel = Axle(problem, state).wheel / state.scale
     s = np.append(0.0, np.cumsum(np.diff(state.t) * (wheel[1:] + wheel[:-1]) / 2))
     fine = np.arange(state.t[0] - 0.1, state.t[-1] + 0.1, 1e-3)
-    way = Travel(fine, CubicHermiteSpline(state.t, s, wheel)(fine), 0.0)
-    return replace(problem, leg=replace(problem.leg, travel=way))
+    path = Travel(fine, CubicHermiteSpline(state.t, s, wheel)(fine), 0.0)
+    return replace(problem, leg=replace(problem.leg, travel=path))
 
 
 def part_at(problem, state, name):

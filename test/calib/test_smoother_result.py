@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from drives import ANGLES, changed, off
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made, said as texts, smoothed, truth
+from smoother_legs import leg_of, made, reason_texts, smoothed, truth
 
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.estimator import smooth
@@ -56,7 +56,7 @@ def test_scale_and_yaw_are_within_their_sigmas(options):
 
 @pytest.mark.parametrize('share', [0.0, 0.1])
 def test_outliers_among_the_fixes_are_reported(share):
-    found = texts(result(outliers=share, outlier_size=30.0)[1]).get(Code.FIX_OUTLIERS, '')
+    found = reason_texts(result(outliers=share, outlier_size=30.0)[1]).get(Code.FIX_OUTLIERS, '')
     assert bool(found) == bool(share)
     if share:
         count, of, per_cent, metres = map(float, re.fullmatch(
@@ -90,7 +90,7 @@ def test_a_large_mounting_angle_needs_no_guess(yaw_deg):
     _, near = result()
     assert method.estimates['yaw_mounting_angle'].sigma == pytest.approx(
         near.estimates['yaw_mounting_angle'].sigma, rel=0.1)
-    assert Code.YAW_FAR_FROM_NOMINAL in texts(method) or abs(yaw_deg) > 90
+    assert Code.YAW_FAR_FROM_NOMINAL in reason_texts(method) or abs(yaw_deg) > 90
 
 
 def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
@@ -115,8 +115,10 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
 def test_a_limit_that_model_errors_lower_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
-    for doubt, text in ((1.0, ''), (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2, the ')):
-        _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(), doubt)
+    for uncertainty, text in ((1.0, ''),
+                              (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2, the ')):
+        _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(),
+                                        uncertainty)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
         assert len(said) == bool(text)
         assert all(text in one for one in said)
@@ -127,8 +129,9 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     middle = replace(leg, t_begin=40.0, t_stop=145.0, standstills=np.empty((0, 2)))
     method = smooth(middle, config)
     assert method.estimates['yaw_mounting_angle'].value is None
-    told, wanted = map(float, re.findall(r'([\d.]+) deg', texts(method)[Code.YAW_NOT_DETERMINED]))
-    assert told >= wanted > 0.0
+    reported, expected = map(float, re.findall(r'([\d.]+) deg',
+                                               reason_texts(method)[Code.YAW_NOT_DETERMINED]))
+    assert reported >= expected > 0.0
     assert off(method, drive) < 3.3
 
 
@@ -138,7 +141,7 @@ def test_an_imu_said_to_be_without_noise_is_not_taken_so():
         'gyro_noise', 'gyro_bias', 'gyro_bias_walk', 'accel_noise', 'accel_bias',
         'accel_bias_walk', 'gyro_scale_sigma')})
     method = smooth(leg, zero)
-    assert Code.IMU_WORSE_THAN_GRADE in texts(method)
+    assert Code.IMU_WORSE_THAN_GRADE in reason_texts(method)
     assert off(method, drive, *BOTH) < 3.3
 
 
@@ -154,8 +157,8 @@ def test_an_imu_that_is_silent_at_rest_is_not_taken_for_perfect():
 
 def test_the_gyro_scale_has_the_configured_sigma():
     _, config, leg = made(**SHORT)
-    for asked, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
-        asking = with_settings(config, {'imu.gyro_scale_sigma': asked})
+    for required, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
+        asking = with_settings(config, {'imu.gyro_scale_sigma': required})
         assert make_problem(leg, asking).priors.constants[GYRO.start] == prior
 
 
@@ -176,7 +179,7 @@ def test_what_still_moves_far_widens_by_as_much():
     start.constants[YAW] += 0.1         # far off, and but one pass
     method = make_result(leg, problem, fit(problem, start, problem.first_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',
-                           texts(method)[Code.MODEL_MISMATCH])[1])
+                           reason_texts(method)[Code.MODEL_MISMATCH])[1])
     assert move > 10.0
     assert method.details['widened'] == pytest.approx(4 * move, rel=0.05)      # said by two digits
 
@@ -221,5 +224,5 @@ def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, said):
     bias = times * np.radians(20.0) / 3600.0        # rad/s: of the grade's; sold with 0.1 deg/s
     turning = changed(drive.imu, w_i=lambda w: w + [0.0, bias, 0.0])
     method = smooth(leg_of(replace(drive.leg(), imu=turning), config), config)
-    assert (Code.IMU_WORSE_THAN_GRADE in texts(method)) == said
+    assert (Code.IMU_WORSE_THAN_GRADE in reason_texts(method)) == said
     assert off(method, drive, *BOTH) < 3.3

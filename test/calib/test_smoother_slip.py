@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slip of a wheel, by two_point and in the smoother: said, where, and held by the sigma."""
+"""Slip of a wheel, by two_point and in the smoother: its reason, place and uncertainty."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ from drives import drive, off, settings
 import numpy as np
 import pytest
 from reversing_drives import made as by_hand
-from smoother_legs import leg_of, made, said as texts, smoothed
+from smoother_legs import leg_of, made, reason_texts, smoothed
 
 from odocal_ros.calib.slip import find_slips, unforced_sign
 from odocal_ros.estimator import smooth
@@ -39,7 +39,7 @@ def slipping(leg, begin, length, share):
 
 
 def said(method, code=Code.WHEEL_SLIP):
-    return texts(method).get(code, '')
+    return reason_texts(method).get(code, '')
 
 
 @pytest.mark.parametrize(('noise', 'begin', 'length', 'share'), [
@@ -73,7 +73,8 @@ def test_slip_at_starts_is_said(noise):
      'fix_noise': 'rtk'}, {'odometer_delay': 0.3}, {'scale': 0.3, 'nominal_scale': 0.3},
     {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
 def test_wheels_that_hold_without_a_filter_are_not_blamed_for_either(options):
-    assert not {Code.WHEEL_SLIP, Code.SPEED_FILTERED} & set(texts(smoothed(**SHORT, **options)[1]))
+    assert not {Code.WHEEL_SLIP,
+                Code.SPEED_FILTERED} & set(reason_texts(smoothed(**SHORT, **options)[1]))
 
 
 def shaken(leg):
@@ -266,8 +267,8 @@ def test_spins_are_found_of_a_late_or_filtered_odometer(how):
     made = drive(scenario='straight', odometer='speed', slip_events=30.0, slip_size=1.0, seed=2)
     (sound,), (reason,) = (slips(calibrate(leg, settings(made, None))) for leg in (
         made.leg(), held_up(made.leg(), 0.4, how)))
-    found, wanted = (r.text.split('in total at ')[1].split(' place')[0] for r in (reason, sound))
-    assert found == wanted
+    found, expected = (r.text.split('in total at ')[1].split(' place')[0] for r in (reason, sound))
+    assert found == expected
 
 
 @pytest.mark.parametrize(('slip', 'bends'), [(1.0, False), (0.0, False), (0.0, True)])

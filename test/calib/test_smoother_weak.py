@@ -10,7 +10,7 @@ from drives import off, settings
 import numpy as np
 import pytest
 from reversing_drives import made as by_hand
-from smoother_legs import made, said as texts, truth
+from smoother_legs import made, reason_texts, truth
 
 from odocal_ros.estimator import cramer_rao_bound, smooth
 from odocal_ros.estimator.factors import interval_noise
@@ -161,4 +161,4 @@ def test_heading_of_circles_is_found_whatever_it_is(yaw):
     last = (drive.truth.start_ns - drive.options.start_ns) * 1e-9 + method.details['key_t'][-1]
     off = np.arctan2(forward[1], forward[0]) - drive.motion.at(np.array([last])).yaw[0]
     assert abs(wrap(off)) < 0.05      # rad, 0.3 m of a fix at 30 m are 0.01
-    assert Code.FIXES_NOISIER_THAN_SAID not in texts(method)
+    assert Code.FIXES_NOISIER_THAN_SAID not in reason_texts(method)

@@ -41,8 +41,8 @@ T_WAY = np.arange(0.0, 300.0, 0.05)
 
 def fixes_of(rate):
     """Return fixes at 2 Hz of a drive at 10 m/s with these turn rates at T_WAY."""
-    way = np.cumsum(np.exp(1j * np.cumsum(rate) * 0.05)) * 0.5
-    return np.stack([way.real, way.imag], -1)[::10]
+    path = np.cumsum(np.exp(1j * np.cumsum(rate) * 0.05)) * 0.5
+    return np.stack([path.real, path.imag], -1)[::10]
 
 
 def test_good_and_undetermined_values_say_nothing():
@@ -234,9 +234,9 @@ def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():
     k = np.minimum((t / 20).astype(int), 8)
     ends = np.array([20.0 * i + x for i in range(9) for x in (1, 19)])
     for _ in range(300):
-        way = np.cumsum(rng.uniform(-1.5, 1.5, 9))      # rad, where it faces
+        path = np.cumsum(rng.uniform(-1.5, 1.5, 9))      # rad, where it faces
         sign = rng.choice([-1.0, 1.0], 9, p=[0.2, 0.8])
-        faces = np.interp(t, ends, np.repeat(way, 2))
+        faces = np.interp(t, ends, np.repeat(path, 2))
         step = sign[k, None] * np.stack([np.cos(faces), np.sin(faces)], -1) * 0.2
         fixes = np.cumsum(step, axis=0)[::5]
         ratio = turn_ratio(t, np.gradient(faces, t), t[::5], fixes, 1.5)
@@ -251,8 +251,8 @@ def test_the_rows_of_a_mower_are_no_wrong_unit(row):
     number, within = np.divmod(t, row + turn)
     rate = np.where(within > row, np.pi / turn * (1 - 2 * (number % 2)), 0.0)
     heading = np.cumsum(rate) * 0.02
-    way = np.cumsum(np.where(within > row, 0.7, 1.0) * np.exp(1j * heading)) * 0.02
-    fixes = np.stack([way.real, way.imag], -1)[::10]
+    path = np.cumsum(np.where(within > row, 0.7, 1.0) * np.exp(1j * heading)) * 0.02
+    fixes = np.stack([path.real, path.imag], -1)[::10]
     assert gyro_reasons(turn_ratio(t, rate, t[::10], fixes, 0.01), 1.0) == ()
 
 

@@ -17,7 +17,7 @@ from odocal_ros.estimator.result.wheels import (
 )
 
 K = 300             # increments of a drive of five minutes
-WAY = 10.0          # m in each
+PATH = 10.0          # m in each
 NO_READING = 1e-16      # m^2
 
 
@@ -26,8 +26,8 @@ def increments(seed=0, walk=1e-3**2, reading=0.0, k=K, ratio=1e-3):
     draw = np.random.default_rng(seed)
     error = np.sqrt(walk) * draw.standard_normal(k) + np.diff(
         np.sqrt(reading) * draw.standard_normal(k + 1))
-    way = np.full(k, WAY)
-    return Increments(ratio * way + error, way[:, None], np.array([np.inf]), np.zeros(1),
+    path = np.full(k, PATH)
+    return Increments(ratio * path + error, path[:, None], np.array([np.inf]), np.zeros(1),
                       max(reading, NO_READING), np.ones(k), np.zeros(k, int),
                       np.array([2e-3**2]))
 
@@ -75,7 +75,7 @@ def test_of_a_walk_alone_the_ratio_is_that_of_the_ends():
     # the logarithm of a variance by k increments is known to sqrt(2 / k), the prior is far wider
     level, = line.levels
     assert abs(np.log(level / 1e-3**2)) < 4 * np.sqrt(2 / K)
-    assert np.sqrt(line.covariance[0, 0]) == pytest.approx(np.sqrt(level / K) / WAY, rel=1e-4)
+    assert np.sqrt(line.covariance[0, 0]) == pytest.approx(np.sqrt(level / K) / PATH, rel=1e-4)
 
 
 @pytest.mark.parametrize(('walk', 'reading'), [
@@ -93,7 +93,7 @@ def test_kinds_have_walks_of_their_own():
     walk = np.array([0.5e-3, 1e-3, 4e-3])**2
     seen = increments(k=900)
     seen = replace(seen, kind=kind, walk=np.full(3, 2e-3**2),
-                   y=1e-3 * WAY + np.sqrt(walk[kind]) * draw.standard_normal(900))
+                   y=1e-3 * PATH + np.sqrt(walk[kind]) * draw.standard_normal(900))
     # each by 300 increments; the prior that holds them together has a spread of 1 and takes
     # (2 / 300) of their distance from the mean, which is 2.2 at most
     assert np.abs(np.log(fit_line(seen).levels / walk)).max() < 4 * np.sqrt(2 / 300) + 0.02

@@ -130,9 +130,9 @@ def test_what_goes_into_json_is_finite_and_short(levels):
 def test_ranges_follow_the_settings():
     assert_allclose(RANGES.half, [0.05, 0.05, np.deg2rad(10.0)])
     assert RANGES.levels == 7
-    asked = ranges_of(WheelsConfig(radius_range=0.1, heading_range=0.2, levels=4))
-    assert_allclose(asked.half, [0.1, 0.1, 0.2])
-    assert asked.levels == 5            # zero is a level
+    required = ranges_of(WheelsConfig(radius_range=0.1, heading_range=0.2, levels=4))
+    assert_allclose(required.half, [0.1, 0.1, 0.2])
+    assert required.levels == 5            # zero is a level
     assert_allclose(ranges_of(WheelsConfig(), heading_sigma=0.01).half[2], 0.02)
     assert ranges_of(WheelsConfig(), heading_sigma=3.0).half[2] == np.pi
     assert ranges_of(WheelsConfig(levels=2)).levels == 2

@@ -1,9 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A straight drive with a known heading, and one through a town with the looks at it."""
+"""A straight drive with a known heading, and one through a town with its running estimates."""
 
-from foreseeing import drive_of, HEADING, looked
+from foreseeing import drive_of, fit_updates, HEADING
 import pytest
 
 from odocal_ros.settings.config import Config, with_settings
@@ -37,5 +37,5 @@ def town_drive():
 
 
 @pytest.fixture(scope='session')
-def looks(town_drive, exact):
-    return looked(town_drive, exact)
+def updates(town_drive, exact):
+    return fit_updates(town_drive, exact)

@@ -28,7 +28,7 @@ def drive_of(**options):
                                   'imu_grade': 'industrial', 'seed': 7} | options))
 
 
-def looked(drive, config, looks=LOOKS):
+def fit_updates(drive, config, looks=LOOKS):
     """Return what each look at a growing leg gave, and the leg as sketched at the last."""
     whole, cells, so_far, found = drive.leg(), None, SmootherSoFar(), []
     for before, now in zip((-np.inf, *looks), looks, strict=False):

@@ -47,20 +47,20 @@ def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
 def test_the_metres_foreseen_are_those_it_takes(drive, config):
     t_now = 100.0
     first = foreseen(drive, config, t_now)
-    asked = first.scale.sigma / 1.6
-    strict = with_settings(config, {'verdict.max_scale_sigma': asked})
+    required = first.scale.sigma / 1.6
+    strict = with_settings(config, {'verdict.max_scale_sigma': required})
     metres = foreseen(drive, strict, t_now).scale.remaining_m
     speed = drive.truth.distance / 240.0            # driven in about the middle 240 s
     later = [foreseen(drive, strict, t_now + share * metres / speed) for share in (0.5, 1.5)]
     assert later[0].scale.remaining_m > 0 < metres
-    assert later[0].scale.sigma > asked
-    assert (later[1].scale.remaining_m, later[1].scale.sigma <= asked) == (0.0, True)
+    assert later[0].scale.sigma > required
+    assert (later[1].scale.remaining_m, later[1].scale.sigma <= required) == (0.0, True)
     assert later[0].scale.remaining_m < 0.8 * metres
 
 
 def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, config):
-    asked = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
-    yaw = foreseen(drive, asked, 150.0).yaw
+    required = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
+    yaw = foreseen(drive, required, 150.0).yaw
     assert yaw.remaining_m is None
     assert yaw.as_text('yaw', 'deg', math.degrees(1)) == (
         'yaw: limited by the heading uncertainty (0.17 deg)')
@@ -140,15 +140,15 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
 
 
 def test_a_look_gives_up_at_its_next_step_once_the_leg_is_over(drive, config):
-    strict, asked = with_settings(config, {'verdict.max_scale_sigma': 1e-9}), []
+    strict, required = with_settings(config, {'verdict.max_scale_sigma': 1e-9}), []
 
     def is_needed():
-        asked.append(True)
-        return len(asked) < 3
+        required.append(True)
+        return len(required) < 3
 
     with pytest.raises(Abandoned):
         foreseen(drive, strict, 150.0, is_needed=is_needed)
-    assert len(asked) == 3
+    assert len(required) == 3
 
 
 @pytest.fixture(scope='module')

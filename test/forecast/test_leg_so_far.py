@@ -63,7 +63,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
 def test_late_rows_are_put_back_so_far_as_in_the_result(made):
     leg = made.leg()
     late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
-    wanted = screen(late, settings(made))[0].travel
+    expected = screen(late, settings(made))[0].travel
     cells = ThinnedLeg(leg.form)
     sent_ns = late.odometer.stamp_ns
     for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
@@ -71,14 +71,14 @@ def test_late_rows_are_put_back_so_far_as_in_the_result(made):
                                     & (sent_ns < begin + 5 * 10**9)))
     cells.feed('imu', leg.imu)
     cells = cells.leg(leg.start_ns).odometer
-    count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
+    count = np.interp(seconds(leg, cells), expected.t, expected.s)
     # a row is 0.05 s; as sent, cells are off by up to 0.4 s of driving
-    speed = np.gradient(wanted.s, wanted.t).max()
+    speed = np.gradient(expected.s, expected.t).max()
     base = late.odometer.value[0]
-    off = cells.value - base - (count - wanted.s[0])
+    off = cells.value - base - (count - expected.s[0])
     assert np.abs(off - np.median(off)).max() < 0.05 * speed
     raw = np.interp(seconds(leg, cells), seconds(leg, late.odometer), late.odometer.value - base)
-    assert np.abs(raw - (count - wanted.s[0])).max() > 0.2 * speed
+    assert np.abs(raw - (count - expected.s[0])).max() > 0.2 * speed
 
 
 def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
@@ -92,10 +92,10 @@ def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
     assert gaps.reasons(silent_s=0.95)[0].code is Code.IMU_GAP      # within a second
     for row in np.flatnonzero(t >= 40.0):
         gaps.feed(take(rows, slice(row, row + 1)))
-    told, = gaps.reasons()
+    stated, = gaps.reasons()
     whole = replace(leg, imu=without(leg.imu, leg, 40.0, 43.0), stop_ns=int(rows.stamp_ns[-1]))
     result = calibrate(whole, settings(made, leg__max_gap=limit))
-    assert told in result.reasons                    # to the last digit
+    assert stated in result.reasons                    # to the last digit
 
 
 @pytest.mark.parametrize('odd', [np.nan, np.inf, -np.inf, 1e300])

@@ -106,10 +106,10 @@ def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
 
 def test_metres_to_go_are_enough_and_no_more_than_needed():
     drive, sigmas = paper_drive(), Sigmas(config=config(correlation=60.0))
-    asked = predict(drive, sigmas).sigma(SCALE) / 1.5
-    metres = find_remaining_distance(drive, sigmas, SCALE, asked)
-    assert predict(drive.lengthen(metres), sigmas).sigma(SCALE) <= asked
-    assert predict(drive.lengthen(0.97 * metres), sigmas).sigma(SCALE) > asked
+    required = predict(drive, sigmas).sigma(SCALE) / 1.5
+    metres = find_remaining_distance(drive, sigmas, SCALE, required)
+    assert predict(drive.lengthen(metres), sigmas).sigma(SCALE) <= required
+    assert predict(drive.lengthen(0.97 * metres), sigmas).sigma(SCALE) > required
     # fixes alone make it: the sigma falls as the way grows
     assert metres == pytest.approx(0.5 * 11_200, rel=0.03)
     assert find_remaining_distance(drive, sigmas, SCALE, 1.0) == 0.0

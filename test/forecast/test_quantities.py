@@ -99,12 +99,12 @@ def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():
     begun = Forecast(BAD, NO_YAW, None, until_ns=2, estimates=estimates(scale_factor=None))
     done = Forecast(GOOD, NO_YAW, 0.002, until_ns=1, estimates=estimates(
         scale_factor=1e-4, yaw_mounting_angle=0.02))
-    told = combine_sections(done, begun)
-    assert ok(told) == 'yes no yes unknown unknown'
-    assert told.scale.remaining_m == 0.0            # enough is enough
-    assert {name: e.sigma for name, e in told.estimates.items()} == {
+    stated = combine_sections(done, begun)
+    assert ok(stated) == 'yes no yes unknown unknown'
+    assert stated.scale.remaining_m == 0.0            # enough is enough
+    assert {name: e.sigma for name, e in stated.estimates.items()} == {
         'scale_factor': 1e-4, 'yaw_mounting_angle': 0.02}
-    assert told.until_ns == 2
+    assert stated.until_ns == 2
     # what is over goes no further: metres are those of the part that goes on
     coarse = Forecast(ParameterForecast(5e-3, 1e-3, 700.0), YAW, until_ns=3)
     assert combine_sections(begun, coarse).scale == replace(BAD, remaining_m=700.0)
@@ -174,11 +174,11 @@ def test_a_leg_that_would_be_rejected_is_said_before_all_else():
     assert set(quantities_ok(now).values()) == {'no', 'unknown'}
     assert (level(now), level(recording(forecast=enough))) == (b'\x02', b'\x00')
     # a caution is no reason to drive again: it is said, and the rest as before
-    doubt = (Reason(Code.COUNTER_RESET, 'by -70'),)
-    told = hint(recording(forecast=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
-                          faults=doubt))
-    assert told.startswith('COUNTER_RESET: by -70; OK: ')
-    assert level(recording(faults=doubt)) == b'\x01'
+    uncertainty = (Reason(Code.COUNTER_RESET, 'by -70'),)
+    stated = hint(recording(forecast=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
+                            faults=uncertainty))
+    assert stated.startswith('COUNTER_RESET: by -70; OK: ')
+    assert level(recording(faults=uncertainty)) == b'\x01'
 
 
 def test_seconds_to_stand():

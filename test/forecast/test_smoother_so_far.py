@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 import warnings
 
-from foreseeing import drive_of, looked
+from foreseeing import drive_of, fit_updates
 import numpy as np
 import pytest
 
@@ -37,45 +37,45 @@ def errors_in_sigmas(running, drive):
             for n, t in zip(NAMES, true, strict=True)]
 
 
-def test_it_ends_as_the_result_and_is_within_its_sigma_all_along(town_drive, exact, looks):
+def test_it_ends_as_the_result_and_is_within_its_sigma_all_along(town_drive, exact, updates):
     result = calibrate(town_drive.leg(), exact).methods['smoother'].estimates
-    for off, ratio in apart(looks[-1].running.method.estimates, result):
+    for off, ratio in apart(updates[-1].running.method.estimates, result):
         assert abs(off) < 0.5
         assert 0.9 < ratio < 1.3       # a little is put on: noise levels from 150 s of driving
-    for seen in looks:
+    for seen in updates:
         off = errors_in_sigmas(seen.running, town_drive)
         assert np.abs(off).max() < 4    # 24: 1 in 700 by chance
 
 
-def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(exact, looks):
-    passes = [x.running.method.details['iterations'] for x in looks]
+def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(exact, updates):
+    passes = [x.running.method.details['iterations'] for x in updates]
     assert passes[0] > UPDATE_PASSES
     # of 4, with driving, stops and turns in between; the others are cold starts
     assert passes.count(UPDATE_PASSES) >= 2
-    anew = SmootherSoFar().update(looks[-1].leg, exact).method.estimates
-    assert anew['scale_factor'].value != looks[-1].running.method.estimates['scale_factor'].value
-    for off, ratio in apart(looks[-1].running.method.estimates, anew):
+    anew = SmootherSoFar().update(updates[-1].leg, exact).method.estimates
+    assert anew['scale_factor'].value != updates[-1].running.method.estimates['scale_factor'].value
+    for off, ratio in apart(updates[-1].running.method.estimates, anew):
         # both stop within 0.1 sigma and levels within 10 % of where they would end
         assert abs(off) < 0.2
         assert ratio == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(looks):
+def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(updates):
     # from the standstill 20 s before the mark on: 50 s, 80 s, 128 s, 192 s
-    assert [x.cold_start_cpu_s > 0 for x in looks] == [False, False, True, False, True, False,
-                                                       True, False]
+    assert [x.cold_start_cpu_s > 0 for x in updates] == [False, False, True, False, True, False,
+                                                         True, False]
 
 
-def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, looks, monkeypatch):
+def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, updates, monkeypatch):
     monkeypatch.setattr(growing, 'LONG_WINDOW', 70.0)
     monkeypatch.setattr(growing, 'NEXT_WINDOW', 100.0)
-    thinned, so_far = looks[-1].leg, SmootherSoFar()
-    for seen in looks:
+    thinned, so_far = updates[-1].leg, SmootherSoFar()
+    for seen in updates:
         windowed = so_far.update(seen.leg, exact)
     past, t_end = so_far._growing._past
     assert t_end == pytest.approx(60.0, abs=0.2)
     assert so_far._growing._last.state.t[0] == pytest.approx(t_end, abs=0.11)      # of a cell
-    whole = looks[-1].running
+    whole = updates[-1].running
     assert windowed.distance == pytest.approx(whole.distance, rel=0.01)
     assert windowed.agility == pytest.approx(whole.agility, rel=0.1)
     assert (windowed.sigmas < past.sigmas).all()
@@ -89,7 +89,7 @@ def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, looks, monkeypatc
     assert so_far.update(thinned, exact) is past
 
 
-def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, looks, monkeypatch):
+def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, updates, monkeypatch):
     so_far = SmootherSoFar()
 
     def wild(*_):
@@ -98,18 +98,18 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, looks
         warnings.simplefilter('error')       # a node has no place for warnings
         broken.setattr(growing, 'best_fit', wild)
         with pytest.raises(BadData, match='cannot solve the data so far: overflow'):
-            so_far.update(looks[-1].leg, exact)
-    assert so_far.update(looks[-1].leg, exact).method.estimates['scale_factor'].value is not None
+            so_far.update(updates[-1].leg, exact)
+    assert so_far.update(updates[-1].leg, exact).method.estimates['scale_factor'].value is not None
 
 
-def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, looks):
+def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, updates):
     so_far = SmootherSoFar()
-    so_far.update(looks[-3].leg, exact)      # 7 s are to be reckoned on, at speed
-    view = so_far._view(looks[-2].leg, exact)
+    so_far.update(updates[-3].leg, exact)      # 7 s are to be reckoned on, at speed
+    view = so_far._view(updates[-2].leg, exact)
     state = extend_warm_start(so_far._growing._last,
                               make_problem(view, exact, make_imu_steps(view, 1.0))).state
     later = SmootherSoFar()
-    later.update(looks[-2].leg, exact)
+    later.update(updates[-2].leg, exact)
     last = later._growing._last.state
     assert np.linalg.norm(last.v_n[-1]) > 5.0
     # a way of 70 m to a part in a thousand; the place itself was good to 1.5 m / sqrt(fixes)
@@ -127,15 +127,15 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, loo
 def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(exact):
     drive = drive_of(fix_noise='correlated')     # then metres come from the accelerometer
     graded = with_settings(exact, {'imu.accel_scale_sigma': math.nan})
-    first, later, last = (x.running for x in looked(drive, graded, (100.0, 112.0, 165.0)))
+    first, later, last = (x.running for x in fit_updates(drive, graded, (100.0, 112.0, 165.0)))
     # the same priors and a tenth more to see: by the way squared 1.2 times smaller at most
     assert 1 / 1.2 < later.sigmas[0] / first.sigmas[0] < 1.02
     assert later.method.details['posterior_to_prior']['accelerometer_scale_x'] < 1.0
-    leg = looked(drive, graded, (165.0,))[0].running
+    leg = fit_updates(drive, graded, (165.0,))[0].running
     # both stop within 0.1 sigma, so the log odds z^2 / 2 of scale errors 1 to 2 sigmas off differ
     # by 0.2 at most, the mean square of both priors by a tenth; noise levels by another tenth
     assert last.sigmas[0] == pytest.approx(leg.sigmas[0], rel=0.15)
-    blind = looked(drive, exact, (165.0,))[0].running
+    blind = fit_updates(drive, exact, (165.0,))[0].running
     assert last.sigmas[0] > 1.5 * blind.sigmas[0]      # it does decide
 
 
@@ -149,7 +149,7 @@ def test_the_size_of_an_imperfection_is_carried_on(exact):
     for seed in range(3, 11):
         # as large as is usual
         drive = drive_of(accel_scale_error=3e-3, seed=seed, duration=130.0)
-        first, later = looked(drive, graded, (40.0, 60.0))
+        first, later = fit_updates(drive, graded, (40.0, 60.0))
         assert (first.cold_start_cpu_s, later.cold_start_cpu_s) == (0.0, 0.0)
         leg = SmootherSoFar().update(later.leg, graded)
         # two passes of a level that one fit settles: within a tenth of its own sigma of about 1
@@ -164,37 +164,37 @@ def test_the_size_of_an_imperfection_is_carried_on(exact):
 
 
 @pytest.mark.parametrize('allowed', [0, 3])
-def test_a_look_gives_up_between_passes_and_the_next_begins_anew(exact, looks, allowed):
-    so_far, asked = SmootherSoFar(), []
+def test_a_look_gives_up_between_passes_and_the_next_begins_anew(exact, updates, allowed):
+    so_far, required = SmootherSoFar(), []
 
     def is_needed():
-        asked.append(True)
-        return len(asked) <= allowed
+        required.append(True)
+        return len(required) <= allowed
 
     with pytest.raises(Abandoned):
-        so_far.update(looks[0].leg, exact, is_needed)
-    assert len(asked) == allowed + 1
-    assert so_far.update(looks[0].leg, exact).sigmas.shape == (3,)
+        so_far.update(updates[0].leg, exact, is_needed)
+    assert len(required) == allowed + 1
+    assert so_far.update(updates[0].leg, exact).sigmas.shape == (3,)
 
 
-def test_slow_errors_are_allowed_for_before_they_can_be_seen(exact, looks):
+def test_slow_errors_are_allowed_for_before_they_can_be_seen(exact, updates):
     whites = with_settings(exact, {'gnss.correlation_time': 0.0})
 
     def seen(leg, exact):
         return SmootherSoFar().update(leg, exact)
 
     drive = drive_of(fix_noise='correlated', seed=58)
-    leg = looked(drive, exact, (30.0,))[0].leg       # and the standstill
+    leg = fit_updates(drive, exact, (30.0,))[0].leg       # and the standstill
     slow, white = (e.method.estimates['scale_factor'] for e in (seen(leg, exact),
                                                                 seen(leg, whites)))
     assert abs(slow.value - drive.truth.scale) < 3 * slow.sigma
     assert abs(white.value - drive.truth.scale) > 5 * white.sigma
     # white fixes pay for the slow part that they might have: never with a smaller sigma
-    assert (seen(looks[0].leg, exact).sigmas >= 0.95 * seen(looks[0].leg, whites).sigmas).all()
+    assert (seen(updates[0].leg, exact).sigmas >= 0.95 * seen(updates[0].leg, whites).sigmas).all()
 
 
-def test_an_imu_that_faces_down_is_read_as_such(exact, looks):
-    leg = looks[1].leg
+def test_an_imu_that_faces_down_is_read_as_such(exact, updates):
+    leg = updates[1].leg
     down = np.array([1.0, -1.0, -1.0])
     over = replace(leg, imu=replace(leg.imu, w_i=leg.imu.w_i * down, f_i=leg.imu.f_i * down))
     both = [SmootherSoFar().update(one, exact).method.estimates for one in (leg, over)]
@@ -207,8 +207,8 @@ def test_an_imu_that_faces_down_is_read_as_such(exact, looks):
      '^5 fixes and [0-9.]+ s of data; the smoother needs at least 10 fixes and 20 s'),
     ({'imu': slice(0, 0)}, 'needs IMU'), ({'imu': slice(0, 2)}, 'needs IMU'),
     ({'odometer': slice(0, 1)}, 'and odometer')])
-def test_too_little_is_said_and_no_look_is_lost_by_it(exact, looks, changed, words):
-    leg, so_far = looks[0].leg, SmootherSoFar()
+def test_too_little_is_said_and_no_look_is_lost_by_it(exact, updates, changed, words):
+    leg, so_far = updates[0].leg, SmootherSoFar()
     less = leg.with_rows(**{slot: take(leg.rows(slot), rows) for slot, rows in changed.items()})
     with pytest.raises(OdocalError, match=words):
         so_far.update(less, exact)

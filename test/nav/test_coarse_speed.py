@@ -80,14 +80,14 @@ def test_only_speeds_have_a_grid_and_reversed_ones_too():
 @pytest.mark.parametrize(('how', 'offset'), [('floor', KMH / 2), ('round', 0.0)])
 def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
     every = slice(None, None, 10 // rate)
-    told = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).instants
-    z = (told.value + offset - np.interp(told.t, T, SPEED)) / told.sigma
+    stated = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).instants
+    z = (stated.value + offset - np.interp(stated.t, T, SPEED)) / stated.sigma
     # uniform: sqrt(3) sigma at most, but for what the change in a step is known by
     assert np.abs(z).max() < 2.6
     # uniform: 1, some hundred rows tell it to a tenth; a slow change is stated with the rate of
     # quicker ones, of which the fit's level takes off up to a half
     assert 0.5 < np.sqrt((z**2).mean()) < 1.2
-    assert np.abs(told.value).min() > KMH
+    assert np.abs(stated.value).min() > KMH
 
 
 def test_instants_have_their_side_backwards_and_none_beside_zero():
@@ -95,8 +95,8 @@ def test_instants_have_their_side_backwards_and_none_beside_zero():
     np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.side, -1.0)
     # a dead band of a cell: from 0 to 2 at once
     t, v = sent(KMH, 'floor', speed=SPEED / 8)
-    told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).instants
-    assert np.abs(told.value).min() > 1.9 * KMH
+    stated = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).instants
+    assert np.abs(stated.value).min() > 1.9 * KMH
 
 
 def test_a_smooth_start_to_one_cruise_has_no_grid():
@@ -119,11 +119,11 @@ def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
     corners[1::4], corners[3::4] = corners[0::4] + cruise / 0.7, corners[2::4] + cruise / 0.9
     t = np.arange(corners[0], corners[-1], 1 / rate)
     speed = np.interp(t, corners, v)
-    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
-    error = told.value + KMH / 2 - np.interp(told.t, corners, v)
-    assert len(told.t) > 800
-    assert abs((error / told.sigma).mean()) < 3.3 / np.sqrt(len(told.t))
-    assert np.sqrt(((error / told.sigma)**2).mean()) < 1.1
+    stated = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
+    error = stated.value + KMH / 2 - np.interp(stated.t, corners, v)
+    assert len(stated.t) > 800
+    assert abs((error / stated.sigma).mean()) < 3.3 / np.sqrt(len(stated.t))
+    assert np.sqrt(((error / stated.sigma)**2).mean()) < 1.1
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 5.0, 10.0])
@@ -136,32 +136,32 @@ def test_small_steps_between_cruises_of_a_motorway_are_within_the_sigma(rate):
     corners = np.c_[np.r_[0.0, end[:-1]], end - rise].ravel()
     t = np.arange(0.0, corners[-1], 1 / rate)
     speed = np.interp(t, corners, cruise.repeat(2))
-    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
-    z = (told.value + KMH / 2 - np.interp(told.t, corners, cruise.repeat(2))) / told.sigma
+    stated = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
+    z = (stated.value + KMH / 2 - np.interp(stated.t, corners, cruise.repeat(2))) / stated.sigma
     assert len(z) > 600
     # uniform: sqrt(3) at most, but for crossings whose rate is known to a whole step
     assert np.abs(z).max() < 2.6
-    weight = told.value / told.sigma
+    weight = stated.value / stated.sigma
     assert abs(weight @ z) < 3.3 * np.linalg.norm(weight)
 
 
 def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
     rng, step = np.random.default_rng(4), 0.02
     t = np.arange(0.0, 200.0, 0.05)
-    errors, told = [], None
+    errors, stated = [], None
     for _ in range(200):
         # two cruises of 60 s, a stop, and a way up that passes a cell in every row
         speed = np.interp(t, [0, 60, 100, 160, 161], [*[rng.uniform(1, 2)] * 2,
                                                       *[rng.uniform(6, 7)] * 2, 0.0])
         sent = np.rint(speed / step) * step
         found = CoarseSpeed(step, t, sent)
-        told = found.travel_variance(np.arange(0.0, 200.0))
+        stated = found.travel_variance(np.arange(0.0, 200.0))
         errors.append(((sent - speed) * 0.05).sum())
     # nothing while it stands, and of the way up less than of 60 s at a speed
-    assert told[162:].max() == 0.0
-    assert told[60:100].sum() < 0.02 * told.sum()
+    assert stated[162:].max() == 0.0
+    assert stated[60:100].sum() < 0.02 * stated.sum()
     # in all, by 200 drives to 1 / sqrt(400): three of those
-    assert np.var(errors) == pytest.approx(told.sum(), rel=0.15 * 2)
+    assert np.var(errors) == pytest.approx(stated.sum(), rel=0.15 * 2)
 
 
 def town(t):
@@ -183,8 +183,8 @@ def test_a_held_speed_is_known_by_its_step(scale):
     np.repeat(town(AT[::5]), 5), coarse(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
     np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
 def test_other_speeds_are_not_taken_for_held(value):
-    way = make_travel(AT, value, RATE)[0]
-    assert way.coarse is None or way.coarse.truncation
+    path = make_travel(AT, value, RATE)[0]
+    assert path.coarse is None or path.coarse.truncation
 
 
 def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
@@ -208,11 +208,11 @@ def test_the_path_has_no_more_than_the_error_of_its_cruises():
 
 def test_reversed_counts_are_held_on_the_other_side():
     value = held(town(AT), STEP)
-    way, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
-                                                             reversed_counts=True)[0]
-    assert_allclose(back.s, way.s)
-    assert_allclose(back.coarse.value, way.coarse.value)
-    assert_allclose(back.coarse.instants.value, way.coarse.instants.value)
+    path, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
+                                                              reversed_counts=True)[0]
+    assert_allclose(back.s, path.s)
+    assert_allclose(back.coarse.value, path.coarse.value)
+    assert_allclose(back.coarse.instants.value, path.coarse.instants.value)
 
 
 # to and fro, each stop and start at an acceleration of its own
@@ -226,10 +226,10 @@ BAND = 0.25
 def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
     zeroed = np.where(np.abs(TO_AND_FRO) < BAND, 0.0, TO_AND_FRO)
     raw, _ = make_travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
-    way, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
+    path, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
     true, _ = make_travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
     lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
-    left = np.abs(np.diff(way.s)).sum() - np.abs(np.diff(true.s)).sum()
+    left = np.abs(np.diff(path.s)).sum() - np.abs(np.diff(true.s)).sum()
     assert lost < -0.8          # 40 times v^2 / 2a
     # a band ends within a row: half a row's speed of 1.1 m/s^2, of 0.25 m/s
     assert abs(left) < 0.11 * abs(lost)
@@ -241,6 +241,6 @@ def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
 
 def test_a_speed_that_falls_to_zero_stays_as_it_is():
     exact, _ = make_travel(AT, TO_AND_FRO, RATE)
-    way, t, _ = with_gap_uncertainty(exact, TO_AND_FRO, RATE)
-    np.testing.assert_array_equal(way.s, exact.s)
+    path, t, _ = with_gap_uncertainty(exact, TO_AND_FRO, RATE)
+    np.testing.assert_array_equal(path.s, exact.s)
     assert not len(t)

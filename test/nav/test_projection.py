@@ -37,9 +37,9 @@ def test_utm_is_four_in_ten_thousand_short_on_its_meridian():
 @pytest.mark.parametrize(('degrees', 'zone'), [
     (116.0, 117.0), (-0.1, -3.0), (0.0, 3.0), (5.99, 3.0), (6.0, 9.0), (-180.0, -177.0)])
 def test_zone_of_a_longitude(degrees, zone):
-    asked = ProjectionConfig(kind='gauss_krueger', ellipsoid='Krassovsky')
-    assert plane_for(asked, np.deg2rad(degrees)) == Plane(zone, 1.0, 'Krassovsky')
-    given = replace(asked, central_meridian=114.0)
+    required = ProjectionConfig(kind='gauss_krueger', ellipsoid='Krassovsky')
+    assert plane_for(required, np.deg2rad(degrees)) == Plane(zone, 1.0, 'Krassovsky')
+    given = replace(required, central_meridian=114.0)
     assert plane_for(given, np.deg2rad(degrees)) == Plane(114.0, 1.0, 'Krassovsky')
 
 
