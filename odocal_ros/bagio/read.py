@@ -172,9 +172,9 @@ class Bag:
 
     def _batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Yield messages of some topics in order of bag time, many at a time."""
-        wanted = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
-        for together in group_overlapping(self._parts):
-            yield from _merged(together, wanted)
+        types = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
+        for group in group_overlapping(self._parts):
+            yield from _merged(group, types)
 
 
 def _merged(parts: list[AnyBagFile], topics: Mapping[str, str]) -> Iterator[Batch]:

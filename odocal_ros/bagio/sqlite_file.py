@@ -248,13 +248,13 @@ class SqliteFile(BagFile):
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time; as written if damaged."""
-        wanted, last = self._channels_of(topics), -1
+        channels, last = self._channels_of(topics), -1
         if not self._leaf_pages:
             try:
                 for row, key, time_ns, raw in self._query(AS_STORED if self._sorted else BY_TIME):
-                    if key in wanted and is_valid_time(time_ns):
+                    if key in channels and is_valid_time(time_ns):
                         # text and numbers are not messages: readers count b'' as unreadable
-                        yield wanted[key], time_ns, raw if isinstance(raw, bytes) else b''
+                        yield channels[key], time_ns, raw if isinstance(raw, bytes) else b''
                     last = row
                 self._refuse_if_changed()
                 return
@@ -263,9 +263,9 @@ class SqliteFile(BagFile):
                 self._use_leaf_pages(error)
                 self._count()
         assert self._leaf_pages
-        for key, time_ns, raw in self._leaf_pages.rows(wanted, last if self._sorted else -1):
+        for key, time_ns, raw in self._leaf_pages.rows(channels, last if self._sorted else -1):
             if is_valid_time(time_ns):
-                yield wanted[key], time_ns, raw
+                yield channels[key], time_ns, raw
 
     def _refuse_if_changed(self) -> None:
         """Raise BadBag if the file was written since it was opened: SQL may see a mixture."""

@@ -175,8 +175,11 @@ def _legs(numbers: list[str]) -> str:
             runs[-1].append(number)
         else:
             runs.append([number])
-    said = [word for run in runs for word in (run if len(run) < 3 else [f'{run[0]} to {run[-1]}'])]
-    return f'legs {", ".join(said[:-1])} and {said[-1]}' if len(said) > 1 else f'legs {said[0]}'
+    ranges = [word for run in runs
+              for word in (run if len(run) < 3 else [f'{run[0]} to {run[-1]}'])]
+    if len(ranges) == 1:
+        return f'legs {ranges[0]}'
+    return f'legs {", ".join(ranges[:-1])} and {ranges[-1]}'
 
 
 def lines_of_bags(legs: tuple[LegResult, ...], width: int) -> list[str]:

@@ -148,9 +148,9 @@ def isolated_outliers(x: Floats, least: float) -> Bools:
         beside = reduce(np.maximum, (far[ROWS_BESIDE + k:][:m]
                                      for d in range(2, edge) for k in (-d, d)))
         at = far[ROWS_BESIDE:][:m]
-        apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
+        difference = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
         is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
-                         & (apart < EQUAL_NEIGHBOURS * at))
+                         & (difference < EQUAL_NEIGHBOURS * at))
         return reduce_columns(np.logical_or, is_off)
 
     found = np.zeros(len(x), bool)

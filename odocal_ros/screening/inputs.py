@@ -52,7 +52,7 @@ class Inputs:
     scale_unit: str
     has_accelerometer: bool = True     # False: f_b is assumed gravity
     local: bool = False                # True: fixes are positions in a local frame
-    # clocks that were seconds from the IMU's, by group of settings: s, > 0 late; moved and said
+    # clocks that were seconds from the IMU's, by group of settings: s, > 0 late; corrected
     aligned: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property

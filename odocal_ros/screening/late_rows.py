@@ -206,8 +206,8 @@ def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
         weight = np.ones(len(rows))
         for other in times:
             if other is not time:
-                apart = time - other        # 0 for simultaneous rows, or at an end
-                weight *= (here - other) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
+                difference = time - other        # 0 for simultaneous rows, or at an end
+                weight *= (here - other) / np.where(np.abs(difference) > 1e-9, difference, 1e-9)
         meant += weight * (travel[at] - travel[rows])
     return np.where((rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last), -meant, 0.0)
 

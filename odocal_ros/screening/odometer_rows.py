@@ -98,16 +98,16 @@ def held_counts(value: Values, modulus: int) -> Bools:
     """
     size = np.abs(counter_steps(value, modulus))
     update = np.flatnonzero(size) + 1
-    apart = np.diff(update)
+    interval_rows = np.diff(update)
     # an update of several counts after rows without one: judgement, fewer are rounding
     fewest_counts = 3.0
-    if len(update) < FEWEST_STEPS or np.median(apart) < 2 or (
+    if len(update) < FEWEST_STEPS or np.median(interval_rows) < 2 or (
             np.median(size[update - 1]) < fewest_counts * size[update - 1].min()):
         return np.zeros(len(value), bool)
-    moving = apart < 2 * np.median(apart)
+    moving = interval_rows < 2 * np.median(interval_rows)
     row = np.arange(len(value))
     k = np.searchsorted(update, row)
-    interval = np.floor((np.append(update, row[-1])[k] - row) / np.mean(apart[moving]))
+    interval = np.floor((np.append(update, row[-1])[k] - row) / np.mean(interval_rows[moving]))
     interval[np.r_[False, moving, False][k]] = 0.0
     out: Bools = np.append(False, size == 0) & np.append(interval[1:] == interval[:-1], False)
     return out

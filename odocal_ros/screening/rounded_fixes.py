@@ -64,13 +64,13 @@ def common_step(angle: Floats) -> float:
 
     It is their greatest common divisor, by Euclid's algorithm with a tolerance.
     """
-    apart = np.diff(np.unique(angle))
-    apart = apart[apart > FINEST_ANGLE]
-    if len(apart) < FEWEST_DIFFERENCES:
+    differences = np.diff(np.unique(angle))
+    differences = differences[differences > FINEST_ANGLE]
+    if len(differences) < FEWEST_DIFFERENCES:
         return 0.0
-    step = float(apart.min())
+    step = float(differences.min())
     while step > FINEST_ANGLE:
-        rest = abs(apart - step * np.rint(apart / step))
+        rest = abs(differences - step * np.rint(differences / step))
         rest = rest[rest > OFF_GRID * step]
         if not len(rest):
             return step

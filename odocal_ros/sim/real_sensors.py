@@ -18,7 +18,7 @@ from odocal_ros.sim.real import Real
 
 # physical: Hz, width, share: wheel hop, engine
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
-APART_NS = 50_000    # judgement: between the stamps of one batch
+LEAST_GAP_NS = 50_000    # judgement: between the stamps of one batch
 # definition: ages, in time constants, and weights of a first-order filter: Gauss-Legendre rule on
 # pieces, fine enough for the kinks of a route
 EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
@@ -125,11 +125,11 @@ def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
     """Return stamps, ns, of samples at ``ns``: late (none early), in order, in batches."""
     late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
     stamp = ns + np.rint(late * 1e9).astype(np.int64)
-    apart = APART_NS * np.arange(len(ns))
+    offsets_ns = LEAST_GAP_NS * np.arange(len(ns))
     if batch > 1:
         last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
         stamp = stamp[last]
-    return np.maximum.accumulate(stamp - apart) + apart
+    return np.maximum.accumulate(stamp - offsets_ns) + offsets_ns
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
