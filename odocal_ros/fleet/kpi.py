@@ -47,36 +47,37 @@ def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
         'undecided': _ratio(good[Decision.UNDECIDED] + bad[Decision.UNDECIDED], goods + bads)}
 
 
-def _ratio(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
+def _ratio(part: int, all_counts: int) -> float | None:
+    return part / all_counts if all_counts else None
 
 
 def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
         limits: Limits) -> dict[str, Any]:
     """Return the rates from rows of vehicles.parquet and legs.parquet, of all and by duration."""
-    last: dict[str, list[dict[str, Any]]] = {}
+    legs_since_change: dict[str, list[dict[str, Any]]] = {}
     for leg in legs:
-        kept = last.setdefault(leg['vehicle'], [])
-        if kept and leg['period'] != kept[-1]['period']:
-            kept.clear()          # by date: a change of the vehicle starts a new reference
-        kept.append(leg)
+        vehicle_legs = legs_since_change.setdefault(leg['vehicle'], [])
+        if vehicle_legs and leg['period'] != vehicle_legs[-1]['period']:
+            vehicle_legs.clear()          # by date: a change of the vehicle starts a new reference
+        vehicle_legs.append(leg)
     counts = {end: Counter[tuple[bool, Decision]]() for end in (*MINUTES, math.inf)}
-    judged = {'good': 0, 'bad': 0, 'on_the_limit': 0}
+    vehicle_counts = {'good': 0, 'bad': 0, 'on_the_limit': 0}
     for row in vehicles:
-        pieces = last.get(row['vehicle'], [])
-        decision = _decision(row | _sigmas_with_scatter(row, pieces, limits), limits)
-        if decision is Decision.UNDECIDED or len(pieces) < FEWEST:
-            judged['on_the_limit'] += 1
+        vehicle_legs = legs_since_change.get(row['vehicle'], [])
+        decision = _decision(row | _sigmas_with_scatter(row, vehicle_legs, limits), limits)
+        if decision is Decision.UNDECIDED or len(vehicle_legs) < FEWEST:
+            vehicle_counts['on_the_limit'] += 1
             continue
         good = decision is Decision.PASS
-        judged['good' if good else 'bad'] += 1
-        for leg in pieces:
+        vehicle_counts['good' if good else 'bad'] += 1
+        for leg in vehicle_legs:
             end = next(end for end in counts if leg['duration_s'] / 60 <= end)
             counts[end][good, _decision(leg, limits)] += 1
-    whole = sum(counts.values(), Counter[tuple[bool, Decision]]())
-    return {'limits': limits, 'vehicles': judged, 'all': _rates(whole), 'by_minutes': [
-        {'up_to': None if math.isinf(end) else end} | _rates(count)
-        for end, count in counts.items() if count]}
+    all_counts = sum(counts.values(), Counter[tuple[bool, Decision]]())
+    by_minutes = [{'up_to': None if math.isinf(end) else end} | _rates(count)
+                  for end, count in counts.items() if count]
+    return {'limits': limits, 'vehicles': vehicle_counts, 'all': _rates(all_counts),
+            'by_minutes': by_minutes}
 
 
 def _decision(row: dict[str, Any], limits: Limits) -> Decision:

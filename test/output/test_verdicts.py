@@ -4,6 +4,7 @@
 """A method's row follows the leg: its figures are shown, but not as good."""
 
 from dataclasses import replace
+import json
 
 import pytest
 
@@ -12,9 +13,10 @@ from odocal_ros.output.files import as_json
 from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
 from odocal_ros.output.tables import leg_verdicts, shown_verdict
-from odocal_ros.output.value_text import join_same_reasons
+from odocal_ros.output.value_text import accept_line, join_same_reasons
+from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
 DEAD = Reason(Code.WHEEL_DEAD, 'the left wheel does not count')
@@ -86,3 +88,12 @@ def test_what_several_legs_share_is_said_once():
     assert [(r.code, r.text) for r in join_same_reasons(tuple(Reason(*one) for one in said))] == [
         (slip, 'legs 1, 3 and 4: it spun'), (slip, 'leg 2: it slid'), (slip, 'it spun'),
         (dead, 'leg 2: it spun')]
+
+
+def test_the_line_of_a_decision_names_each_reason_once(good):
+    reasons = [Reason(Code.ODOMETER_STILL, 'one'), Reason(Code.NO_FIX, 'two'),
+               Reason(Code.ODOMETER_STILL, 'three')]
+    config = with_settings(Config(), {'accept.scale_ratio_min': 0.9})
+    result = replace(good, reasons=tuple(reasons))
+    line = json.loads(accept_line(result, accept(result, config), config))
+    assert line['reasons'] == ['ODOMETER_STILL', 'NO_FIX']
