@@ -159,9 +159,9 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
     # straights to a fit with turns than to one without
     gyro_noise = 2e-4
-    left_over = [np.minimum(1.0, ((y - A @ x) / (
+    losses = [np.minimum(1.0, ((y - A @ x) / (
         TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
-    return fits[int(np.argmin(left_over))][:2]
+    return fits[int(np.argmin(losses))][:2]
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:
