@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors raised on purpose; each door catches OdocalError once and shows its one sentence."""
+"""Errors raised on purpose; commands and nodes catch OdocalError once and show its sentence."""
 
 
 class OdocalError(Exception):
@@ -21,4 +21,4 @@ class BadBag(OdocalError):
 
 
 class BadUsage(OdocalError):
-    """A command was asked for something it cannot do as asked: call it again, corrected."""
+    """An option or argument is invalid: correct the call."""

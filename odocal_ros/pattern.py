@@ -70,10 +70,10 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
     if side < LEAST_SIDE:
         raise BadConfig(f'rectangle: the pattern has {max(side, 0):.2f} m, required: '
                         f'{LEAST_SIDE:g} m; enlarge the rectangle or lower margin')
-    once = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight}[
+    pattern_pieces = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight}[
         config.pattern](inner)
-    first = (once[0].x, once[0].y)
-    return tuple(_alternating([*_lines([start, first]), *(once * config.rounds)]))
+    first = (pattern_pieces[0].x, pattern_pieces[0].y)
+    return tuple(_alternating([*_lines([start, first]), *(pattern_pieces * config.rounds)]))
 
 
 def _alternating(pieces: list[Piece]) -> list[Piece]:
@@ -152,12 +152,12 @@ def command(route: Sequence[Piece], now: Progress, pose: Pose, t: float,
         return 0.0, 0.0, replace(now, speed=0.0)
     piece = route[now.piece]
     along, left = piece.located(*pose[:2])
-    off = _angle(pose[2] - piece.heading - piece.curvature * along)
-    if abs(off) > HALF_TURN:
-        off = math.copysign(off, -piece.side)
-    if now.turning and abs(off) > TURN_TO:
-        rate = max(min(1.5 * abs(off), config.turn_rate), SLOWEST_TURN)
-        return 0.0, -math.copysign(rate, off), replace(now, speed=0.0)
+    heading_error = _angle(pose[2] - piece.heading - piece.curvature * along)
+    if abs(heading_error) > HALF_TURN:
+        heading_error = math.copysign(heading_error, -piece.side)
+    if now.turning and abs(heading_error) > TURN_TO:
+        rate = max(min(1.5 * abs(heading_error), config.turn_rate), SLOWEST_TURN)
+        return 0.0, -math.copysign(rate, heading_error), replace(now, speed=0.0)
     to_go = piece.length - along
     if to_go <= 0:
         rests = piece.rests
@@ -165,7 +165,7 @@ def command(route: Sequence[Piece], now: Progress, pose: Pose, t: float,
             now, piece=now.piece + 1, turning=rests, speed=0.0 if rests else now.speed,
             rest_until=t + config.rest if rests else now.rest_until)
         return command(route, after, pose, t, config)
-    if abs(off) > TURN_FROM:
+    if abs(heading_error) > TURN_FROM:
         return 0.0, 0.0, replace(now, turning=True, speed=0.0)
     limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / 1.5,
                 now.speed + config.acceleration * step)
@@ -173,19 +173,19 @@ def command(route: Sequence[Piece], now: Progress, pose: Pose, t: float,
         limit = min(limit, math.sqrt(2 * config.acceleration * to_go))
     speed = min(max(limit, SLOWEST), config.speed)
     # across'' = -across / REACH^2 - 2 across' / REACH, by distance: critically damped
-    bend = piece.curvature - left / REACH**2 - 2 * off / REACH
-    rate = max(-config.turn_rate, min(speed * bend, config.turn_rate))
+    curvature = piece.curvature - left / REACH**2 - 2 * heading_error / REACH
+    rate = max(-config.turn_rate, min(speed * curvature, config.turn_rate))
     return speed, rate, replace(now, turning=False, speed=speed)
 
 
-def moved(before: Pose, after: Pose) -> bool:
+def has_moved(before: Pose, after: Pose) -> bool:
     """Return True if a robot surely moves between two poses."""
     return (math.dist(before[:2], after[:2]) > MOVED
             or abs(_angle(after[2] - before[2])) > MOVED_TURN)
 
 
-def why_stop(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bool,
-             driven_s: float, timeout_s: float) -> str:
+def stop_cause(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bool,
+               driven_s: float, timeout_s: float) -> str:
     """
     Return the cause to stop at once, empty without one.
 

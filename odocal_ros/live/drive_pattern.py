@@ -102,7 +102,7 @@ class DrivePattern(SettledNode):
     def _stop_reason(self) -> str:
         now = time.monotonic()
         driven_s = now - self._started_s if self._route else 0.0
-        return pattern.why_stop(self._pose, now - self._pose_at, self._rectangle, self._bumped,
+        return pattern.stop_cause(self._pose, now - self._pose_at, self._rectangle, self._bumped,
                                 driven_s, self.config.timeout)
 
     def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -163,7 +163,8 @@ class DrivePattern(SettledNode):
     def _is_stuck(self, commanded: float) -> bool:
         pose, now = self._pose, time.monotonic()
         assert pose is not None
-        if not commanded or self._last_motion is None or pattern.moved(self._last_motion[0], pose):
+        if not commanded or self._last_motion is None \
+                or pattern.has_moved(self._last_motion[0], pose):
             self._last_motion = pose, now
         return now - self._last_motion[1] > STUCK_S
 

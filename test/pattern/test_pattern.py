@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.pattern import command, Progress, rectangle_of, route_of, why_stop
+from odocal_ros.pattern import command, Progress, rectangle_of, route_of, stop_cause
 from odocal_ros.settings.node_configs import PatternConfig
 
 pytestmark = pytest.mark.core
@@ -122,8 +122,8 @@ def test_a_rectangle_that_cannot_be_is_refused(given, message):
 def test_why_a_robot_stops(change, message):
     given = {'pose': (0.0, 0.0, 0.0), 'age_s': 0.1, 'rectangle': rectangle_of(settings()),
              'bumped': False, 'driven_s': 1.0, 'timeout_s': 600.0} | change
-    assert message in why_stop(**given)
-    assert bool(why_stop(**given)) == bool(message)
+    assert message in stop_cause(**given)
+    assert bool(stop_cause(**given)) == bool(message)
 
 
 def test_corners_in_any_order_are_the_same_rectangle():
