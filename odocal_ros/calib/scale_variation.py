@@ -33,6 +33,13 @@ SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one
 WINDOWS = 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0     # s, definition
 PARTS, FEWEST_WINDOWS = 8, 12      # judgement: parts of the leg for a sigma; windows for a result
 NO_WINDOWS = np.empty((0, 4))    # definition
+# judgement: s, longest cell, in which the speed hardly varies, and shortest; intended number
+LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
+SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
+FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
+# judgement: spread of the speeds over their mean, below which an offset is not separable
+LEAST_SPREAD = 0.1
+NO_BINS = np.empty((0, 4))    # definition: no bins
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +201,6 @@ def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, 
     left = (top.sum() - top) / (bottom.sum() - bottom)
     sigma = np.sqrt((PARTS - 1) / PARTS * ((left - left.mean())**2).sum())
     return float(top.sum() / bottom.sum()), float(sigma), len(i)
-
-
-# judgement: s, longest cell, in which the speed hardly varies, and shortest; intended number
-LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
-SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
-FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
-# judgement: spread of the speeds over their mean, below which an offset is not separable
-LEAST_SPREAD = 0.1
-NO_BINS = np.empty((0, 4))    # definition: no bins
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,8 @@ STOPS = 0.5          # m/s, a speed below is a stop: judgement
 BRAKES_BESIDE = 1.0  # s around a slip searched for braking, a keyframe interval: judgement
 # s, delays of the odometer that are tested: judgement; a bus or a filter has less
 TESTED_DELAYS = 0.05 * np.arange(-10, 21)
+# s, judgement: between rows in the search for slips, which last a second or more
+SLIP_GRID = 0.1
 
 
 class Slips(NamedTuple):
@@ -218,10 +220,6 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+z.2f} m at t = {t[0]:.1f} '
             's: the wheel spun or slid'),)
     return (*found, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
-
-
-# s, judgement: between rows in the search for slips, which last a second or more
-SLIP_GRID = 0.1
 
 
 def _none(kind: type = float) -> NDArray[Any]:

@@ -32,6 +32,11 @@ ONE_MOTION_RATIO = 0.6, 1.6
 NOISIER_WORTH = 1.25
 PIECE_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
 PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
+# rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
+# and drift
+FLIP = np.deg2rad(135.0)
+# s around a reversal, within which a fix error disappears. Judgement: duration of multipath
+ERROR_LASTS = 60.0
 
 
 def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
@@ -187,13 +192,6 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
                        + ('track as configured' if configured else 'uncalibrated track')
                        + f' {np.sqrt(was.mean()):.2g} m')]
     return []
-
-
-# rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
-# and drift
-FLIP = np.deg2rad(135.0)
-# s around a reversal, within which a fix error disappears. Judgement: duration of multipath
-ERROR_LASTS = 60.0
 
 
 class Pieces(NamedTuple):

@@ -65,7 +65,7 @@ def _smooth(x: Floats, reach: int) -> Floats:
 
 
 def fit_signals(two: WheelPair, signals: Floats, metres_per_unit: float,
-           ) -> tuple[Floats, Floats] | tuple[None, None]:
+                ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return the coefficients of the signals, fitted to cells of a second, and covariance."""
     at = np.arange(0, len(two.t), MEAN_STEPS)
     A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])

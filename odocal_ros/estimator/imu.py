@@ -41,6 +41,11 @@ from odocal_ros.settings.nominal import G, Grade
 STEP = 0.1
 # judgement: samples whose arrays stay in the cache; keyframes, which limits the memory
 SAMPLES_IN_CACHE, KEYFRAMES_IN_CACHE = 8192, 64
+# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
+# seconds, and slopes of a few per cent over a minute. Judgement
+NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
+CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
+CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
 
 def imu_rows(leg: SmootherLeg) -> tuple[int, Floats]:
@@ -161,13 +166,6 @@ def _summed(leg: SmootherLeg, edges: Ints) -> Steps:
     mean = np.add.reduceat((turned + turn / 2) * dt, first) / np.add.reduceat(dt, first)
     return Steps(rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
                  np.maximum.reduceat(dt[:, 0], first))
-
-
-# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
-# seconds, and slopes of a few per cent over a minute. Judgement
-NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
-CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
-CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:

@@ -31,6 +31,12 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.strapdown import prefix_product
 
+# judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
+STEPS_AT_A_TIME = 2048
+# definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f
+# with its bias): the g-sensitivity of the gyro has the latter, so that b_a does not turn
+OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
+
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
@@ -86,12 +92,6 @@ class Points:
         """Return the points selected by an index."""
         return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
-
-# judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
-STEPS_AT_A_TIME = 2048
-# definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f
-# with its bias): the g-sensitivity of the gyro has the latter, so that b_a does not turn
-OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 Some = TypeVar('Some', Intervals, Points)
 

@@ -37,6 +37,9 @@ ACCELERATION, TURN_RATE, TURN_ACCELERATION = 0.5, 0.8, 2.0
 REST, END_REST = 3.0, 5.0
 PATTERNS = 'straight', 'square', 'figure_eight', 'spot'
 Move = tuple[float, float, float]      # m forward, m to the left, rad to the left, at once
+# m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
+NO_SIDE_SLIP = 1e-7
+FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estimator uses
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +133,6 @@ def _pattern_moves(name: str, size: float) -> list[Move]:
         return [(FULL_TURN * radius, 0, side * FULL_TURN) for side in (1, -1)]
     turn = math.pi if name == 'straight' else FULL_TURN + math.pi
     return [(size, 0, 0), (0, 0, turn), (size, 0, 0), (0, 0, -turn)]
-
-
-# m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
-NO_SIDE_SLIP = 1e-7
-FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estimator uses
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,6 +44,8 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import grade_of
 
 HEADING_TOPICS = ('heading_topic', 'imu_orientation')
+WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
+SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +149,6 @@ def _true_state(motion: _Motion, key: Ints) -> State:
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
                  np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),
                  np.zeros(M)).level()
-
-
-WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
-SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway
 
 
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,

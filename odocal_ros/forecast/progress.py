@@ -79,7 +79,7 @@ def clock_difference_text(clocks: list[tuple[str, float]]) -> str:
     """Return the sentence about clocks that differ from the IMU's."""
     seen = ', '.join(
         f'{slot} stamps are {_format_difference(abs(s))} {"ahead of" if s > 0 else "behind"} '
-                     'the IMU stamps' for slot, s in clocks)
+        'the IMU stamps' for slot, s in clocks)
     return f'CLOCKS_DIFFER: {seen}. {clock_remedy(max((s for _, s in clocks), key=abs))}'
 
 

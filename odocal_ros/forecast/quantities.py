@@ -40,6 +40,7 @@ PLANAR_QUANTITIES = {
     OMNI: ('the scale', 'the rotation lever (in turns)',
            'the factor of each wheel (in sideways motion)')}
 METHOD_WITHOUT_HEADING = 'smoother'   # the method that needs no external heading
+YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,6 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
             source = 'course'
     return with_settings(config, {'alignment.heading_source': source,
                                   'alignment.heading_sigma': sigma})
-
-
-YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,20 @@ A = 6378137.0                  # m, semi-major axis
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
 OMEGA = 7.292115e-5            # rad/s, Earth rate
+# definition: in the Atlantic, so that the positions are not mistaken for real ones
+FRAME_LONGITUDE = math.radians(-30.0)
+# definition: normal gravity here, 9.806 m/s^2, differs least from that of other latitudes
+USUAL_LATITUDE_DEG = 45.0
+# m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
+# Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
+LARGEST_FRAME = 20_000.0
+# m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
+# rest drifts by many metres, SLAM and motion capture by centimetres
+GNSS_MOVES, LOCAL_MOVES = 20.0, 0.5
+# semi-major axis m, inverse flattening
+ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
+              'Krassovsky': (6378245.0, 298.3)}
+ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 
 
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
@@ -112,18 +126,6 @@ def C_en(latitude: ArrayLike, longitude: ArrayLike) -> Floats:
                      np.stack([zero, cp, sp], -1)], -2)
 
 
-# definition: in the Atlantic, so that the positions are not mistaken for real ones
-FRAME_LONGITUDE = math.radians(-30.0)
-# definition: normal gravity here, 9.806 m/s^2, differs least from that of other latitudes
-USUAL_LATITUDE_DEG = 45.0
-# m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
-# Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
-LARGEST_FRAME = 20_000.0
-# m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
-# rest drifts by many metres, SLAM and motion capture by centimetres
-GNSS_MOVES, LOCAL_MOVES = 20.0, 0.5
-
-
 def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
     """
     Return latitude, longitude, rad, and height, m, from (n, 3) m in a local frame: (n,) each.
@@ -151,12 +153,6 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
         return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
                           given, known, np.full(n, LOCAL))
     return build
-
-
-# semi-major axis m, inverse flattening
-ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
-              'Krassovsky': (6378245.0, 298.3)}
-ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 
 
 @dataclass(frozen=True)

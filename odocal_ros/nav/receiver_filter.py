@@ -22,7 +22,7 @@ LEAST_LAG2 = 1e-4
 
 
 def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
-              ) -> tuple[Floats, Floats]:
+                    ) -> tuple[Floats, Floats]:
     """
     Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
 

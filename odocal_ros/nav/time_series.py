@@ -14,6 +14,11 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import by_step, enclosing_slices, Floats
 
+# statistical: medians of |x|, x normal with sigma 1, and of the length of two such, sqrt(2 ln 2)
+NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
+MISSING_INTERVALS = 2.5  # judgement: median intervals, a message or more is missing
+GAP_INTERVALS = 5.0      # judgement: median intervals, a longer step is a gap
+
 
 class Integral:
     """The integral of (n, ...) by the trapezoid rule, over consecutive pieces."""
@@ -76,12 +81,6 @@ def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
         return
     for k in range(x.shape[1]):
         out[:, k] = np.interp(times, t, x[:, k])
-
-
-# statistical: medians of |x|, x normal with sigma 1, and of the length of two such, sqrt(2 ln 2)
-NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
-MISSING_INTERVALS = 2.5  # judgement: median intervals, a message or more is missing
-GAP_INTERVALS = 5.0      # judgement: median intervals, a longer step is a gap
 
 
 def robust_sigma(residual: NDArray[np.float64]) -> float:

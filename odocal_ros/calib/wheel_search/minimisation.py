@@ -21,6 +21,11 @@ from odocal_ros.calib.wheel_search.parameter_sets import sets_of, Space
 from odocal_ros.calib.wheel_search.planar import coefficients, loss, PlanarLeg, repeats, weights
 from odocal_ros.data.arrays import Bools, Floats
 
+SETTLED = 1e-11      # judgement: relative, rad, largest last step
+HALVINGS = 40    # judgement: of a step, at most
+DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right minus left
+BENT = 1e-4          # judgement: share of path length: bend of any track by gyro, slip, tyres
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -186,12 +191,6 @@ class _Walk:
             return False
         self.half, self.w = wider, self.first_width
         return True
-
-
-SETTLED = 1e-11      # judgement: relative, rad, largest last step
-HALVINGS = 40    # judgement: of a step, at most
-DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right minus left
-BENT = 1e-4          # judgement: share of path length: bend of any track by gyro, slip, tyres
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,10 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.config import WheelsConfig
 
+NAMES = ('left', 'right', 'heading')
+# definition: columns mean, difference (right minus left), heading; held: mean, heading
+FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -129,11 +133,6 @@ def design_for(levels: int) -> Design:
     if levels < 3:
         return Design(f'all {levels**3} combinations', full_factorial((levels,) * 3))
     return Design(f'L{levels**2}({levels}^{levels + 1})', bose(levels, 3))
-
-
-NAMES = ('left', 'right', 'heading')
-# definition: columns mean, difference (right minus left), heading; held: mean, heading
-FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,13 @@ from odocal_ros.nav.rotations import rotate, skew, transpose
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
+# m/s, initial: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
+FIRST_SIGMA = 0.5
+VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
+# 1 sigma of the delay, s, and of the squared filter time constant, s^2: physical, of receivers
+# up to 0.25 s each
+TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
+
 
 class Fixes(PointRows):
     """Residuals (fix less prediction) and their derivatives at one state."""
@@ -138,14 +145,6 @@ def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
     C[no_height, 2, 2] = 1e6**2     # m^2, of a missing height
     return np.linalg.inv(np.linalg.cholesky(C))
-
-
-# m/s, initial: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
-FIRST_SIGMA = 0.5
-VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
-# 1 sigma of the delay, s, and of the squared filter time constant, s^2: physical, of receivers
-# up to 0.25 s each
-TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,19 @@ ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn: one crossroads does not determine sideslip, two do. Judgement
 NO_TURN = np.pi / 2
 SIDEWAYS = ('side', 'side_turn', 'up')
+# levels of the road, variance per second as those of IMU, and the axis of the vehicle
+ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
+INTERVAL = (*IMU, *ROAD)
+# definition: Gauss and Legendre's nodes and weights on 0 to 1
+GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
+    np.polynomial.legendre.leggauss(2)[1] / 2
+# rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
+TURNING_RATE = 0.05
+# m in a second, minimum error of an odometer at rest: physical, play of a drive train
+REST_NOISE = 5e-4
+# rad/s, m/s^2, 1 sigma of the motion between samples: judgement, of a car in town
+HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
+ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
 
 
 def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
@@ -80,21 +93,6 @@ def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
         f'less than the limit of {np.rad2deg(2 * NO_TURN):.0f} deg. '
         f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed; the uncertainties of the mounting angles '
         'depend on it', 'Drive with left and right turns.')]
-
-
-# levels of the road, variance per second as those of IMU, and the axis of the vehicle
-ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
-INTERVAL = (*IMU, *ROAD)
-# definition: Gauss and Legendre's nodes and weights on 0 to 1
-GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
-    np.polynomial.legendre.leggauss(2)[1] / 2
-# rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
-TURNING_RATE = 0.05
-# m in a second, minimum error of an odometer at rest: physical, play of a drive train
-REST_NOISE = 5e-4
-# rad/s, m/s^2, 1 sigma of the motion between samples: judgement, of a car in town
-HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
-ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
 
 
 @dataclass(eq=False)

@@ -43,6 +43,10 @@ REACH = 0.5
 STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
 BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
+# definition: Gauss and Laguerre's nodes, less the mean delay, and weights of a first-order filter
+FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
+    np.polynomial.laguerre.laggauss(5)[1]
+LEAST_FILTER = 0.2      # s, judgement: speeds closer in time differ by vibration
 
 
 def stamp_of(t: Floats, constants: Floats) -> Floats:
@@ -133,12 +137,6 @@ def once_a_rest(still: Bools) -> Floats:
     for first, last in zip(starts, stops, strict=True):
         weight[first:last] = 1 / (last - first)
     return weight
-
-
-# definition: Gauss and Laguerre's nodes, less the mean delay, and weights of a first-order filter
-FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
-    np.polynomial.laguerre.laggauss(5)[1]
-LEAST_FILTER = 0.2      # s, judgement: speeds closer in time differ by vibration
 
 
 class SpeedSteps(PointRows):

@@ -61,6 +61,10 @@ SHARED: dict[str, slice | Ints] = {
     'body_lean': layout.constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
     'speed_truncation': layout.constants_from('speed_offset'),
     'heading': layout.constants_from('heading_offset'), 'velocity': layout.VELOCITY}
+# 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.
+# Physical, judgement: wind, an engine and people move it on its springs, and tilt it more than
+# they turn it
+STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
 class PriorRows(Factor):
@@ -159,12 +163,6 @@ class PriorRows(Factor):
         """Yield names and effects, (3, k), of errors that all legs share."""
         for name, where in self.shared.items():
             yield name, covariance[:PARAMETER_COUNT, where] / self.priors.constants[where]
-
-
-# 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.
-# Physical, judgement: wind, an engine and people move it on its springs, and tilt it more than
-# they turn it
-STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
 class Rests(Factor):

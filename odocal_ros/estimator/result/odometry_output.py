@@ -28,6 +28,7 @@ from odocal_ros.settings.config import SIDES
 from odocal_ros.settings.nominal import G, Grade
 
 AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocity faster
 
 
 def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
@@ -139,9 +140,6 @@ def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
     row = np.array([1.0, -1 / G])
     return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
             'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
-
-
-SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocity faster
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,13 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
+# factor on the variance of an interval that is a slip. Statistical: 3.7 sigmas, by chance once in
+# 4200
+SLIP_VARIANCE = 1.5
+LEAST_SLIP = 0.05    # m: a shorter slip is not reported. Judgement
+# effective rows of a level that is reported. Statistical: its root, with a sigma of root / sqrt(2
+# rows), is then REMARK_SIGMAS above zero
+LEVEL_ROWS = REMARK_SIGMAS**2 / 2
 
 
 def bias_sigmas(near: JointMarginals, widen: float) -> Floats:
@@ -110,15 +117,6 @@ def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     sigma = np.sqrt(covariance_root**2 @ factor**2)
     known = fixes.existing_components()
     return np.where(known, value, np.nan), np.where(known, sigma, np.nan)
-
-
-# factor on the variance of an interval that is a slip. Statistical: 3.7 sigmas, by chance once in
-# 4200
-SLIP_VARIANCE = 1.5
-LEAST_SLIP = 0.05    # m: a shorter slip is not reported. Judgement
-# effective rows of a level that is reported. Statistical: its root, with a sigma of root / sqrt(2
-# rows), is then REMARK_SIGMAS above zero
-LEVEL_ROWS = REMARK_SIGMAS**2 / 2
 
 
 @dataclass(frozen=True)

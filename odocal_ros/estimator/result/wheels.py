@@ -50,6 +50,13 @@ NUISANCE = range(2, 5)  # definition: nuisance parameters of a line
 # physical: 1 sigma of it by sideslip and body motion; 20 mm of 2.7 m in docs/decisions/0022
 PLACE_SHARE = 8e-3
 WHEELBASE = 5.0         # m, 1 sigma of the distance of a steered wheel ahead. Physical: of a lorry
+# prior sigmas of the logarithm of a level: all walks together may differ by a factor of a thousand
+# from their first value, each from their mean by three; reading errors are those of rounding.
+# Judgement
+WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
+# judgement: iterations of the search for outliers, until variances change by less than a tenth;
+# each removes nine tenths of their effect on a level
+TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,15 +226,6 @@ def _wheel(line: Line, moved: Floats, of_fit: Floats) -> Wheel:
     x = float(np.sqrt(max(line.x[-1], 0.0) / a))
     sigma = float(np.sqrt(covariance[2, 2])) / (2 * a * max(x, 0.1))
     return replace(whole, x=x, x_sigma=float(np.hypot(sigma, PLACE_SHARE * x)))
-
-
-# prior sigmas of the logarithm of a level: all walks together may differ by a factor of a thousand
-# from their first value, each from their mean by three; reading errors are those of rounding.
-# Judgement
-WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
-# judgement: iterations of the search for outliers, until variances change by less than a tenth;
-# each removes nine tenths of their effect on a level
-TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
 
 
 def fit_line(seen: Increments) -> Line:
