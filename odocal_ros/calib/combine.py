@@ -18,7 +18,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 
-DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: changes with each power-up
+INDEPENDENT_SOURCES = {'initial_level'}    # an accelerometer bias: changes with each power-up
 
 
 def combine_method(name: str, results: Sequence[MethodResult],
@@ -103,7 +103,8 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     shared = {n: weight @ g for n, g in by_leg.items()}
     variance = weight @ own @ weight
     # allowed differences: own errors of the legs, and shared errors with different effects
-    allowed = own + np.diag(sum((((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
+    allowed = own + np.diag(sum((((g if n in INDEPENDENT_SOURCES else g
+                                   - shared[n])**2).sum(axis=1)
                                  for n, g in by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
     chi2 = float((y - mean) @ np.linalg.solve(allowed, y - mean)) if freedom else 0.0

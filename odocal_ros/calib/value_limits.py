@@ -16,7 +16,7 @@ from odocal_ros.settings.levels import SCALE_LIMIT, TYRE_SPREAD
 SPEED_UNITS = {1.0: 'm/s', 1 / 3.6: 'km/h', 0.44704: 'mph', 1852 / 3600: 'knots', 0.3048: 'ft/s',
                0.01: 'cm/s', 1e-3: 'mm/s'}
 # likely cause of a ratio to the nominal scale, by unit of the scale. Physical, definitions
-MISTAKEN = {
+UNIT_RATIOS = {
     '1': {factor: f'speeds in {name}' for factor, name in SPEED_UNITS.items() if factor != 1}
     | {0.3048: 'speeds in ft/s, or for rad/s of a wheel of this radius in m'},
     'm/rad': {np.pi / 180: 'angles in degrees', 2 * np.pi: 'whole turns',
@@ -24,14 +24,14 @@ MISTAKEN = {
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',
                 0.5: 'counting two edges per pulse (x2)'}}
 PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
-ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change larger than tyres cause: physical
-TYRES = 'tyre pressure, wear, load or another tyre'
-OTHER = 'another vehicle, gear, counter or unit: tyres do not change this much'
+TYRE_CHANGE_LIMIT = 2 * TYRE_SPREAD    # relative change larger than tyres cause: physical
+TYRE_CAUSE = 'tyre pressure, wear, load or another tyre'
+OTHER_CAUSE = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
 
 def _probable_unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return the probable unit of a scale this far from its nominal, and the setting for it."""
-    for known, what in MISTAKEN.get(unit, {}).items():
+    for known, what in UNIT_RATIOS.get(unit, {}).items():
         if abs(ratio / known - 1) < 0.04:      # tolerance for tyres: the ratios are farther apart
             return f', typical for {what}', (
                 f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or correct the '
@@ -92,7 +92,7 @@ def format_relative(relative: float, sign: str = '') -> str:
 
 def cause_of_change(relative: float) -> str:
     """Return the likely cause of a relative change of the scale."""
-    return OTHER if abs(relative) > ANOTHER_SCALE else TYRES
+    return OTHER_CAUSE if abs(relative) > TYRE_CHANGE_LIMIT else TYRE_CAUSE
 
 
 def format_change(relative: float) -> str:

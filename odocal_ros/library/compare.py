@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.value_limits import ANOTHER_SCALE, format_change, OTHER, TYRES
+from odocal_ros.calib.value_limits import format_change, OTHER_CAUSE, TYRE_CAUSE, TYRE_CHANGE_LIMIT
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.nav.rotations import wrap
@@ -23,7 +23,7 @@ ANGLES = {'yaw_mounting_angle', 'pitch_mounting_angle'}
 ORDER = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
          'yaw_mounting_angle', 'pitch_mounting_angle')
 CAUSES = {
-    'scale': f'{TYRES}; calibrate again to be sure, then use the newer value',
+    'scale': f'{TYRE_CAUSE}; calibrate again to be sure, then use the newer value',
     'track': 'another rim or tyre; calibrate again to be sure',
     'yaw': 'the IMU was moved, or the heading comes from another source; calibrate again to be '
            'sure',
@@ -214,8 +214,8 @@ def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     cause = next((text for key, text in CAUSES.items() if key in words),
                  'unknown; calibrate again')
     before = stored[difference.since].value(change.parameter) or 0.0
-    if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * before:
-        cause = f'{OTHER}; compare calibrations of the same odometer'
+    if 'scale' in words and abs(difference.change) > TYRE_CHANGE_LIMIT * before:
+        cause = f'{OTHER_CAUSE}; compare calibrations of the same odometer'
     return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
             f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
             f'{stored[difference.since].name}; likely cause: {cause}')

@@ -31,24 +31,26 @@ CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
 AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
-ANOTHER_IMU = 4.0       # statistical: of the sigma of the grade, for scales and axes
+IMU_ERROR_LIMIT = 4.0       # statistical: of the sigma of the grade, for scales and axes
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
-FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
-                    'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
-                    'Use wheel pulses, or a wheel that is not driven.')
+SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
+                      'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
+                      'Use wheel pulses, or a wheel that is not driven.')
 # factor on the variance of a second of a bias's walk, judgement: reported steps have 480 and more,
 # 60 drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
 # share and number of outliers among the fixes that are reported. Judgement
-OUTLIER_SHARE, FEWEST_OUTLYING = 0.02, 3
+OUTLIER_SHARE, LEAST_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
-OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
+POSE_COVARIANCE_REMEDY = (
+    'Uncertainties were increased to match the residuals. Check the map, and the '
             'covariance that this source of positions states.')
-SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
+LEVER_ARM_REMEDY = (
+    'Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
           'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
           'keep the setting.')
 
@@ -101,18 +103,18 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
     skew = float(np.linalg.norm(off[AXES]))
-    if skew > ANOTHER_IMU:
+    if skew > IMU_ERROR_LIMIT:
         seen = np.rad2deg(np.linalg.norm(c[AXES][off[AXES] > 0]))
         reasons.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
                               f'{seen:.2f} deg off perpendicular, '
                               f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
-                              f'(limit {ANOTHER_IMU:g}); accounted for'))
+                              f'(limit {IMU_ERROR_LIMIT:g}); accounted for'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
-    if off[worst] > ANOTHER_IMU:
+    if off[worst] > IMU_ERROR_LIMIT:
         name = layout.CONSTANTS[worst].replace('_', ' ')
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} is '
                               f'{100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
-                              f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
+                              f'the {config.imu.grade} grade (limit {IMU_ERROR_LIMIT:g}); '
                               'accounted for'))
     return reasons + _lever_arm_reasons(c, sigma, ratio, config)
 
@@ -126,7 +128,7 @@ def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
                    f'{factor:.1f} times as large as their covariance states (limit '
                    f'{FIX_NOISE_LIMIT:g})',
-                   OF_POSES if problem.leg.origin.local else '')]
+                   POSE_COVARIANCE_REMEDY if problem.leg.origin.local else '')]
 
 
 def _outlier_reasons(fit: Fit) -> list[Reason]:
@@ -134,7 +136,7 @@ def _outlier_reasons(fit: Fit) -> list[Reason]:
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
     count, of = int(outlier.sum()), len(outlier)
-    if count < max(FEWEST_OUTLYING, OUTLIER_SHARE * of):
+    if count < max(LEAST_OUTLIERS, OUTLIER_SHARE * of):
         return []
     far = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {of} fixes ({100 * count / of:.0f} %) are '
@@ -154,7 +156,7 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
         return []
     less = texts[0].startswith('-') and 'speed' in texts[0]
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
+                   'value is the mean over this leg', SPEED_SCALE_REMEDY if less else '')]
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
@@ -219,7 +221,8 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
                 texts.append(f'{name} {axis}: not set, estimated {text}{rough}')
                 actions.append(f'Measure {name} {axis} and set it.')
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for', ' '.join(
-        [*actions, SLIDES] if any('easure' in x for x in actions) else actions))] if texts else []
+        [*actions, LEVER_ARM_REMEDY] if any('easure' in x for x in actions)
+        else actions))] if texts else []
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
