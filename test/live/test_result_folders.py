@@ -79,13 +79,13 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
         assert words in status['message']
     assert node.text.count('the journal cannot be written') == 1
     assert abs(float(status['scale_factor']) - SCALE) < 5 * float(status['scale_factor_sigma'])
-    assert not client.calls('save').success
+    assert not client.call('save').success
     assert list(folder.iterdir()) == []
     # and no journal is missed where none is wanted
     assert client.set(journal__max_bytes=0).successful
     client.until(journal='', journal_trouble='')
     folder.chmod(0o755)
-    answer = client.calls('save')
+    answer = client.call('save')
     assert answer.success, answer.message
     one, = results(folder)
     assert true(whole_content(one))
@@ -93,7 +93,7 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     assert client.until(save_trouble='')['saved'] == str(one)
     # the folder of the next save can be set after the leg, too
     assert client.set(output__directory=str(tmp_path / 'other')).successful
-    answer = client.calls('save')
+    answer = client.call('save')
     assert answer.success, answer.message
     other, = results(tmp_path / 'other')
     assert true(whole_content(other))
