@@ -4,7 +4,7 @@
 """
 Planar estimator: wheel constants of a robot on a level floor from wheels and positions.
 
-``drive`` has the kinematics, ``problem`` input and result, ``start`` the first values, ``chain``
-the linear equations, ``fit`` the fit, ``result`` the estimates. Poses are of base_link in
-the frame of the positions: x, y in m, heading in rad.
+``run`` has the kinematics, input and result, ``first_values`` the cold start, ``chain`` the linear
+equations, ``fit`` the fit, ``result`` the estimates. Poses are of base_link in the frame of the
+positions: x, y in m, heading in rad.
 """

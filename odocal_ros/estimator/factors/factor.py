@@ -4,10 +4,10 @@
 """
 A factor of the likelihood: the residuals of one sensor or one prior.
 
-Each factor is a file. It holds residuals and derivatives at one state, initial and minimum noise
-levels, and its terms of the normal equations, the cost, the variance components and the error
-budget. It is created without weights; ``weighted_copy`` returns a copy at given levels, to whose
-residuals ``apply_step`` applies a step.
+It holds residuals and derivatives at one state, initial and minimum noise levels, and its terms of
+the normal equations, the cost, the variance components and the error budget. It is created
+without weights; ``weighted_copy`` returns a copy at given levels, to whose residuals
+``apply_step`` applies a step.
 """
 
 from collections.abc import Iterable
