@@ -33,9 +33,9 @@ def read(path):
         return contents(bag), bag.notes
 
 
-def same(found, wanted):
-    return found.keys() == wanted.keys() and all(
-        found[k].tobytes() == wanted[k].tobytes() for k in wanted)
+def same(found, expected):
+    return found.keys() == expected.keys() and all(
+        found[k].tobytes() == expected[k].tobytes() for k in expected)
 
 
 def file_of(path):

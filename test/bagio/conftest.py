@@ -15,5 +15,5 @@ def plain(tmp_path_factory):
 
 
 @pytest.fixture(scope='session')
-def wanted(plain):
+def expected(plain):
     return read(plain)[0]

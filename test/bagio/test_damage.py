@@ -33,16 +33,16 @@ def truncated(notes):
     ('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('sqlite3', 'none'),
     ('sqlite3', 'file')])
 @pytest.mark.parametrize('share', [0.35, 0.5, 0.65])
-def test_bag_cut_off_gives_what_is_there(tmp_path, wanted, storage, compression, share):
+def test_bag_cut_off_gives_what_is_there(tmp_path, expected, storage, compression, share):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(), storage, compression)
     data = file_of(path).read_bytes()
     file_of(path).write_bytes(data[:int(len(data) * share)])
     found, notes = read(path)
     for key, column in found.items():          # a prefix of the whole, row for row
-        assert column.tobytes() == wanted[key][:len(column)].tobytes()
+        assert column.tobytes() == expected[key][:len(column)].tobytes()
     if compression == 'none':
         # index and definitions take some of the file: never more than a third of this one
-        rows = len(found['imu', 'stamp_ns']) / len(wanted['imu', 'stamp_ns'])
+        rows = len(found['imu', 'stamp_ns']) / len(expected['imu', 'stamp_ns'])
         assert share - 0.35 < rows <= min(1, share + 0.35)
     last = max(max(found[slot, 'received_ns'], default=0) for slot in SLOTS.values())
     missing = (T0 + 9_990_001_000 - last) * 1e-9
@@ -51,11 +51,11 @@ def test_bag_cut_off_gives_what_is_there(tmp_path, wanted, storage, compression,
     assert 'without metadata.yaml the lost time is unknown' in str(read(path)[1])
 
 
-def test_an_mcap_that_lost_only_its_index(tmp_path, plain, wanted):
+def test_an_mcap_that_lost_only_its_index(tmp_path, plain, expected):
     path = shutil.copytree(plain, tmp_path / 'bag')
     file_of(path).write_bytes(file_of(path).read_bytes()[:-100])
     found, notes = read(path)
-    assert same(found, wanted)
+    assert same(found, expected)
     assert notes == ('drive.mcap is damaged (cut off), but all 1550 messages were read',)
 
 
@@ -88,7 +88,7 @@ def test_what_is_left_is_no_bag(tmp_path, storage):
             pass
 
 
-def test_metadata_that_cannot_be_used(tmp_path, plain, wanted):
+def test_metadata_that_cannot_be_used(tmp_path, plain, expected):
     for text in ('{', '[]', 'rosbag2_bagfile_information: 3', '', None):
         path = shutil.copytree(plain, tmp_path / f'bag{text and len(text)}')
         if text is None:
@@ -96,7 +96,7 @@ def test_metadata_that_cannot_be_used(tmp_path, plain, wanted):
         else:
             (path / 'metadata.yaml').write_text(text)
         found, notes = read(path)
-        assert same(found, wanted)
+        assert same(found, expected)
         assert ('names no existing file' if text is None else 'cannot be parsed') in notes[0]
 
 

@@ -63,31 +63,31 @@ def test_bags_that_cannot_be_read(data_dir, name, says):
 @pytest.mark.parametrize(('storage', 'compression'), [
     ('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('mcap', 'message'),
     ('sqlite3', 'none'), ('sqlite3', 'file'), ('sqlite3', 'message')])
-def test_storages_and_compressions_hold_the_same(tmp_path, wanted, storage, compression):
+def test_storages_and_compressions_hold_the_same(tmp_path, expected, storage, compression):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(), storage, compression)
     found, notes = read(path)
-    assert same(found, wanted)
+    assert same(found, expected)
     assert notes == ()
     for way_in in (file_of(path), path / 'metadata.yaml'):
-        assert same(read(way_in)[0], wanted)
+        assert same(read(way_in)[0], expected)
     (path / 'metadata.yaml').unlink()
     found, (note,) = read(path)
-    assert same(found, wanted)
+    assert same(found, expected)
     assert 'metadata.yaml is missing' in note
     shutil.copy(file_of(path), tmp_path / 'drive.active')       # another ending
-    assert same(read(tmp_path / 'drive.active')[0], wanted)
+    assert same(read(tmp_path / 'drive.active')[0], expected)
 
 
-def test_rosbag1(tmp_path, wanted):
+def test_rosbag1(tmp_path, expected):
     path = ros_bags.write(tmp_path / 'drive.bag', ros_bags.drive(), 'rosbag1')
-    assert same(read(path)[0], wanted)
+    assert same(read(path)[0], expected)
     with open_bag(path) as bag:
         assert bag.name == 'drive'
         assert (bag.start_ns, bag.end_ns) == (T0 + 1000, T0 + 9_990_001_000)
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3', 'rosbag1'])
-def test_split_files_in_number_order(tmp_path, wanted, storage):
+def test_split_files_in_number_order(tmp_path, expected, storage):
     rows = ros_bags.drive()
     folder = tmp_path / 'split'
     folder.mkdir()
@@ -95,12 +95,12 @@ def test_split_files_in_number_order(tmp_path, wanted, storage):
         piece = ros_bags.write(tmp_path / f'p{k}', rows[k * 150:(k + 1) * 150 if k < 10 else None],
                                storage)
         shutil.copy(file_of(piece), folder / f'bag_{k}{file_of(piece).suffix or ".bag"}')
-    assert same(read(folder)[0], wanted)
+    assert same(read(folder)[0], expected)
     with open_bag(folder) as bag:
         assert [f.name.split('.')[0] for f in bag.files] == [f'bag_{k}' for k in range(11)]
 
 
-def test_files_that_overlap_are_merged_by_time(tmp_path, wanted, monkeypatch):
+def test_files_that_overlap_are_merged_by_time(tmp_path, expected, monkeypatch):
     monkeypatch.setattr(any_bag_file, 'BLOCK', 64)    # so that a topic crosses many batches
     rows = ros_bags.drive()
     folder = tmp_path / 'both'
@@ -109,10 +109,10 @@ def test_files_that_overlap_are_merged_by_time(tmp_path, wanted, monkeypatch):
         piece = ros_bags.write(tmp_path / f'p{k}', rows[k::2])
         shutil.copy(piece / f'p{k}.mcap', folder)
     found, _ = read(folder)
-    assert same(found, wanted)
+    assert same(found, expected)
 
 
-def test_changes_still_in_the_wal(tmp_path, wanted):
+def test_changes_still_in_the_wal(tmp_path, expected):
     rows = ros_bags.drive()
     path = ros_bags.write(tmp_path / 'bag', rows, 'sqlite3')
     db = sqlite3.connect(path / 'bag.db3')
@@ -222,12 +222,12 @@ def test_the_frame_is_that_of_the_first_message_that_can_be_read(tmp_path):
     """Big endian too, which has no layout; frames that are no text are no frames."""
     little, odd = (bytearray(make.cdr(make.imu(T0, frame=frame))) for frame in ('a é', 'axx'))
     odd[17] = 0xff
-    for first, wanted in ((little[:40], 'b'), (odd, 'b'), (little, 'a é'),
-                          (make.cdr(make.imu(T0, frame='big'), False), 'big'),
-                          (make.cdr(make.imu(T0, frame='')), '')):
-        path = ros_bags.write(tmp_path / wanted / f'{len(first)}', [
+    for first, expected in ((little[:40], 'b'), (odd, 'b'), (little, 'a é'),
+                            (make.cdr(make.imu(T0, frame='big'), False), 'big'),
+                            (make.cdr(make.imu(T0, frame='')), '')):
+        path = ros_bags.write(tmp_path / expected / f'{len(first)}', [
             ('/imu', T0, bytes(first)), ('/imu', T0 + 1, make.imu(T0 + 1, frame='b'))],
             types={'/imu': 'sensor_msgs/msg/Imu'})
         with open_bag(path) as bag:
-            assert bag.frame('/imu') == wanted
-            assert next(m for _, m in bag.messages('/imu')).header.frame_id == wanted
+            assert bag.frame('/imu') == expected
+            assert next(m for _, m in bag.messages('/imu')).header.frame_id == expected

@@ -135,10 +135,10 @@ def test_two_wheels_have_two_counters_or_two_joints(tmp_path, odometer, topics):
 def test_blocks_leave_no_trace(tmp_path, drive, monkeypatch):
     whole = messages(write_bag(tmp_path / 'whole', drive_topics(drive), 'sqlite3'))
     monkeypatch.setattr('odocal_ros.bagio.write.BLOCK', 7)
-    told = []
-    write_bag(tmp_path / 'parts', drive_topics(drive), 'sqlite3', progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    reported = []
+    write_bag(tmp_path / 'parts', drive_topics(drive), 'sqlite3', progress=reported.append)
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
     rows = [sqlite3.connect(tmp_path / name / f'{name}.db3').execute(
         'SELECT topic_id, timestamp, data FROM messages ORDER BY id').fetchall()
         for name in ('whole', 'parts')]
@@ -180,12 +180,12 @@ def test_no_other_folder_is_replaced_and_a_bad_one_is_one_sentence(tmp_path):
         write_bag(tmp_path / 'file' / 'bag', counts())
 
 
-@pytest.mark.parametrize(('storage', 'compression', 'told'), [
+@pytest.mark.parametrize(('storage', 'compression', 'reported'), [
     ('rar', 'none', '--storage rar: required: one of mcap'),
     ('mcap', 'lz77', '--compression lz77: required: one of none'),
     ('sqlite3', 'storage', '--compression storage is not available for --storage sqlite3')])
-def test_what_cannot_be_written_is_said(tmp_path, storage, compression, told):
-    with pytest.raises(BadUsage, match=told):
+def test_what_cannot_be_written_is_said(tmp_path, storage, compression, reported):
+    with pytest.raises(BadUsage, match=reported):
         write_bag(tmp_path / 'bag', counts(), storage, compression)
     assert not (tmp_path / 'bag').exists()
 

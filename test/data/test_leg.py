@@ -51,9 +51,9 @@ def rows(leg):
 
 
 def assert_same(leg, other):
-    wanted = rows(other)
+    expected = rows(other)
     for name, column in rows(leg).items():
-        np.testing.assert_array_equal(column, wanted[name], err_msg=name)
+        np.testing.assert_array_equal(column, expected[name], err_msg=name)
 
 
 TOPICS = {slot: topic(slot, np.random.default_rng(7))

@@ -126,8 +126,8 @@ def test_a_median_of_many_rows_is_numpys(kind):
 @pytest.mark.parametrize('rows', [0, 5, PIECE_ROWS, 2 * PIECE_ROWS + 100])
 def test_evenly_spaced_rows_are_those_of_a_slice(rows):
     x = np.arange(3 * rows).reshape(-1, 3)
-    for wanted in (4, 1000, PIECE_ROWS):
-        np.testing.assert_array_equal(thinned(x, wanted), x[::max(1, rows // wanted)])
+    for expected in (4, 1000, PIECE_ROWS):
+        np.testing.assert_array_equal(thinned(x, expected), x[::max(1, rows // expected)])
 
 
 def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():

@@ -66,11 +66,11 @@ def test_each_bag_has_one_row_with_what_replay_says_of_it(fleet, output, tmp_pat
     config = fleet.folder / fleet.rows[0]['config']
     assert main(['replay', str(bag), '--config', str(config), '--method', 'two_point', '--quiet',
                  '--output', str(tmp_path), '--set', 'output.formats=[legs]']) == 0
-    told = json.loads((tmp_path / 'calibration.json').read_text())
+    reported = json.loads((tmp_path / 'calibration.json').read_text())
     row = rows[str(bag)]
-    assert row.sha256 == told['inputs'][0]['sha256']
+    assert row.sha256 == reported['inputs'][0]['sha256']
     estimates = json.loads(row.legs)[0]['methods']['two_point']['estimates']
-    found = told['result']['scale_factor']
+    found = reported['result']['scale_factor']
     assert [estimates['scale_factor'][key] for key in ('value', 'sigma', 'unit')] == [
         found[key] for key in ('value', 'sigma', 'unit')]
 
@@ -84,12 +84,12 @@ def test_a_vehicle_is_what_replay_of_its_bags_since_the_change_says(fleet, outpu
     config = fleet.folder / f'{changed["model"]}.yaml'
     main(['replay', *map(str, since), '--config', str(config), '--method', 'two_point', '--quiet',
           '--output', str(tmp_path), '--set', 'output.formats=[legs]'])
-    told = json.loads((tmp_path / 'calibration.json').read_text())
+    reported = json.loads((tmp_path / 'calibration.json').read_text())
     by_files = json.loads(
         (output / 'vehicles' / changed['vehicle'] / 'calibration.json').read_text())
     drawn = json.loads((output / 'reports' / changed['vehicle'] / 'calibration.json').read_text())
     for name in ('scale_factor', 'scale_ratio'):
-        found = told['result'][name]
+        found = reported['result'][name]
         assert (row[name], row[f'{name}_sigma']) == (found['value'], found['sigma'])
         assert by_files['result'][name] == drawn['result'][name] == found
     assert 'report.html' in {p.name for p in (output / 'reports' / changed['vehicle']).iterdir()}
@@ -167,20 +167,20 @@ def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, o
     argv = ['fleet', fleet.manifest, '--output', str(output), '--scheduler',
             client.scheduler.address, '--method', 'two_point', '--reports', 'none', '--quiet']
     assert main([*argv, '--accept', 'scale_ratio=0.9:1.1']) == 1
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert {one['vehicle'] for one in told} == {v['vehicle'] for v in fleet.truth}
+    reported = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {one['vehicle'] for one in reported} == {v['vehicle'] for v in fleet.truth}
     broken = {v['vehicle'] for v in fleet.truth if v['changes'][0]['value'] == 'counter'}
     # its good drives are of the past
-    assert {one['vehicle']: one['decision'] for one in told} == {
+    assert {one['vehicle']: one['decision'] for one in reported} == {
         v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else 'PASS' for v in fleet.truth}
-    why, = [one['why'] for one in told if one['vehicle'] in broken]
+    why, = [one['why'] for one in reported if one['vehicle'] in broken]
     assert re.match(r'rejected: ODOMETER_STILL: the last \d legs, since \S+, are all rejected: '
                     'the fixes move', why)
     assert main([*argv, '--accept', 'scale_ratio=0.9:1.01']) == 1      # the shuttle is at 1.014
-    told = {(one := json.loads(line))['vehicle']: one['decision']
-            for line in capsys.readouterr().out.splitlines()}
-    assert told == {v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else
-                    'PASS' if v['scale_ratio'] < 1.01 else 'FAIL' for v in fleet.truth}
+    reported = {(one := json.loads(line))['vehicle']: one['decision']
+                for line in capsys.readouterr().out.splitlines()}
+    assert reported == {v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else
+                        'PASS' if v['scale_ratio'] < 1.01 else 'FAIL' for v in fleet.truth}
     table = table_of(output)
     worst_first = ['FAIL', 'UNDECIDED', 'PASS']
     assert list(table.decision) == sorted(table.decision, key=worst_first.index)

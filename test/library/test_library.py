@@ -39,9 +39,10 @@ def printed(capsys, *argv):
 
 def test_the_command_gives_what_the_function_gives(town, calibration, tmp_path, capsys):
     bag = town[1]
-    told = printed(capsys, 'replay', bag, '--config', bag.parent / 'calibrator.yaml', '--output',
-                   tmp_path / 'out')
-    assert without_time(told) == json.loads(json.dumps(without_time(calibration.to_dict())))
+    reported = printed(
+        capsys, 'replay', bag, '--config', bag.parent / 'calibrator.yaml', '--output',
+        tmp_path / 'out')
+    assert without_time(reported) == json.loads(json.dumps(without_time(calibration.to_dict())))
     calibration.save(tmp_path / 'saved')
     saved, out = ({p.name for p in (tmp_path / name).iterdir()} for name in ('saved', 'out'))
     assert saved == out
@@ -231,12 +232,13 @@ def test_what_is_said_on_the_way_is_kept(town):
 
 
 def test_a_plan_is_what_the_command_prints(capsys):
-    told = printed(capsys, 'plan', '--distance', 500, '--speed', 10, '--turns', 2, '--imu-grade',
-                   'tactical', '--fix-sigma', 1, '--set', 'method=two_point')
+    reported = printed(
+        capsys, 'plan', '--distance', 500, '--speed', 10, '--turns', 2, '--imu-grade',
+        'tactical', '--fix-sigma', 1, '--set', 'method=two_point')
     found = plan(distance=500, speed=10, turns=2, fix=1.0, config={
         'imu.grade': 'tactical', 'method': 'two_point'})
-    assert told == json.loads(json.dumps(found.to_dict()))
-    assert found.sigma('scale_factor') == told['estimates']['scale_factor']['sigma']
+    assert reported == json.loads(json.dumps(found.to_dict()))
+    assert found.sigma('scale_factor') == reported['estimates']['scale_factor']['sigma']
     with pytest.raises(OdocalError, match='one drive'):
         plan(speed=10)
 
@@ -244,8 +246,8 @@ def test_a_plan_is_what_the_command_prints(capsys):
 def test_a_comparison_is_what_the_command_prints(calibration, tmp_path, capsys):
     calibration.save(tmp_path / 'a')
     calibration.save(tmp_path / 'b')
-    told = printed(capsys, 'compare', tmp_path / 'a', tmp_path / 'b')
-    assert compare(tmp_path / 'a', tmp_path / 'b').to_dict() == told
+    reported = printed(capsys, 'compare', tmp_path / 'a', tmp_path / 'b')
+    assert compare(tmp_path / 'a', tmp_path / 'b').to_dict() == reported
     same = compare(calibration, tmp_path / 'b')
     assert same.changed is False
     assert [change.parameter for change in same.changes][:1] == ['scale_factor']

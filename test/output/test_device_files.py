@@ -92,8 +92,8 @@ def test_each_wheel_has_its_multiplier_and_a_told_width_none(good):
     assert found['diff_drive_controller'] == pytest.approx({
         'left_wheel_radius_multiplier': 1.02, 'right_wheel_radius_multiplier': 1.03,
         'wheel_separation_multiplier': 1.02})
-    told = with_estimates(wheels(good), track_width=Estimate(1.5, None, 'm'))
-    found = controllers(told, odometer__nominal_scale=0.04, odometer__track_width=1.5)
+    reported = with_estimates(wheels(good), track_width=Estimate(1.5, None, 'm'))
+    found = controllers(reported, odometer__nominal_scale=0.04, odometer__track_width=1.5)
     assert 'wheel_separation_multiplier' not in found['diff_drive_controller']
 
 

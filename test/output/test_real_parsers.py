@@ -52,9 +52,9 @@ def test_ros2_param_load_reads_every_value(good, tmp_path):
 def test_the_parameter_file_has_every_name_the_node_declares(good, nothing):
     pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
     from odocal_ros.live import params
-    wanted = {name.removeprefix('result.') for name in params.RESULTS}
+    expected = {name.removeprefix('result.') for name in params.RESULTS}
     for calibration in (good, nothing):
-        assert wanted <= set(parameters(texts(calibration)['calibration.yaml'])['result'])
+        assert expected <= set(parameters(texts(calibration)['calibration.yaml'])['result'])
 
 
 def test_a_rejected_result_is_no_file_to_drive_by(rejected):
@@ -97,11 +97,11 @@ def test_the_three_transforms_are_one_and_the_same(good):
     assert joint.find('parent').attrib == {'link': 'rear_axle'}
     assert joint.find('child').attrib == {'link': 'imu_top'}
     node = ElementTree.fromstring(written['imu_transform.launch.xml']).find('node')
-    wanted = ('--x 0.5 --y -0.1 --z 1.0 --roll 0.0 --pitch 0.0 --yaw -0.0174533 '
-              '--frame-id rear_axle --child-frame-id imu_top')
-    assert node.attrib['args'] == wanted
+    expected = ('--x 0.5 --y -0.1 --z 1.0 --roll 0.0 --pitch 0.0 --yaw -0.0174533 '
+                '--frame-id rear_axle --child-frame-id imu_top')
+    assert node.attrib['args'] == expected
     assert node.attrib['pkg'] == 'tf2_ros'
-    assert written['imu_transform.txt'].endswith(f'static_transform_publisher {wanted}\n')
+    assert written['imu_transform.txt'].endswith(f'static_transform_publisher {expected}\n')
 
 
 def test_without_a_yaw_there_is_no_transform(good):
@@ -176,10 +176,10 @@ def test_rcl_reads_each_value_of_each_parameter_file(smoothed, tmp_path):
         path = tmp_path / 'file.yaml'
         path.write_text(text, encoding='utf-8')
         for key, block in yaml.safe_load(text).items():
-            wanted = dict(flat(block['ros__parameters']))
+            expected = dict(flat(block['ros__parameters']))
             node = 'some_node' if key == '/**' else key.rpartition('/')[2]
-            read = as_rcl_reads(path, node, wanted)
-            for (parameter, value), got in zip(wanted.items(), read, strict=True):
+            read = as_rcl_reads(path, node, expected)
+            for (parameter, value), got in zip(expected.items(), read, strict=True):
                 # an empty list has no type: rcl leaves it out, and the node takes its default
                 assert same(got, value or None if isinstance(value, list) else value), (
                     name, parameter, got)

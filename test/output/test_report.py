@@ -138,8 +138,8 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
     assert 'figures of the newest legs only, none of legs 1, 2.' in text
     # one alone is shown however large it is: the newest
     monkeypatch.setattr(report, 'MOST_BYTES', 10)
-    told, _, missing = report._draw_figures(replace(good, legs=legs))
-    assert [bool(leg['figures']) for leg in told] == [False, False, True]
+    reported, _, missing = report._draw_figures(replace(good, legs=legs))
+    assert [bool(leg['figures']) for leg in reported] == [False, False, True]
     assert missing == [1, 2]
 
 
@@ -166,15 +166,15 @@ def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error)
         raise error
 
     monkeypatch.setattr(report, 'report_html', fail)
-    told = []
-    write_results(good, Config(), tmp_path, INPUTS, CREATED, tell=told.append)
+    reported = []
+    write_results(good, Config(), tmp_path, INPUTS, CREATED, tell=reported.append)
     assert (tmp_path / 'calibration.json').exists()
-    assert len(told) == 1
-    assert 'report.html: could not be drawn' in told[0]
+    assert len(reported) == 1
+    assert 'report.html: could not be drawn' in reported[0]
     page, why = report_or_error_page(good, Config(), {})
     assert 'calibration.json' in page
     assert '<odd>' not in page
-    assert why in told[0]
+    assert why in reported[0]
 
 
 def test_the_four_most_important_values_stand_under_the_verdict_of_a_result(good, nothing):

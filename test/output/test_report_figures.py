@@ -114,8 +114,8 @@ def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
     page.write_text(html.replace('</body>', probe))
     import json
     for width in (1280, 500):      # 500: the least that a headless window can be
-        told = shown(page, tmp_path, f'--window-size={width},900', '--dump-dom')
-        layout = json.loads(unescape(re.search(r'<title>(.*?)</title>', told).group(1)))
+        reported = shown(page, tmp_path, f'--window-size={width},900', '--dump-dom')
+        layout = json.loads(unescape(re.search(r'<title>(.*?)</title>', reported).group(1)))
         assert layout['wide'] <= layout['view'], width
         assert len(layout['figures']) == 11
         assert min(w for w, _ in layout['figures']) > 0.8 * min(width, 1280 / 2.4) - 40

@@ -202,9 +202,9 @@ def test_what_many_legs_say_in_other_figures_is_one_reason(good):
     reasons = [Reason(Code.LEG_TOO_SHORT, f'leg {n}: {60 + n} m between the marks')
                for n in range(1, 36) if n not in (4, 30)]
     reasons += [Reason(Code.WHEEL_SLIP, f'leg {n}: slip of {n} m') for n in (2, 9)]
-    told = [r.text for r in join_same_reasons((*reasons, GAP))]
-    assert told == ['legs 1 to 3, 5 to 29 and 31 to 35; of leg 1: 61 m between the marks',
-                    'leg 2: slip of 2 m', 'leg 9: slip of 9 m', GAP.text]
+    reported = [r.text for r in join_same_reasons((*reasons, GAP))]
+    assert reported == ['legs 1 to 3, 5 to 29 and 31 to 35; of leg 1: 61 m between the marks',
+                        'leg 2: slip of 2 m', 'leg 9: slip of 9 m', GAP.text]
 
 
 @pytest.mark.parametrize(('error', 'sigma', 'shown'), [
