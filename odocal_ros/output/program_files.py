@@ -157,8 +157,6 @@ def _xml(root: Any, note: str) -> str:
     return f'<!-- {text_formats.for_xml_comment(note)} -->\n{text}\n'
 
 
-
-
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
     """
     Return both with the frame of the IMU set.
