@@ -48,11 +48,11 @@ OUTLIER_SHARE, LEAST_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 POSE_COVARIANCE_REMEDY = (
     'Uncertainties were increased to match the residuals. Check the map, and the '
-            'covariance that this source of positions states.')
+    'covariance that this source of positions states.')
 LEVER_ARM_REMEDY = (
     'Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
-          'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
-          'keep the setting.')
+    'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
+    'keep the setting.')
 
 
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
