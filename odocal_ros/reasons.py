@@ -170,15 +170,17 @@ class Code(Enum):
                                   'dual-antenna heading topic, or a gyrocompass-grade gyro.')
     GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
                                     'longer standstill, or another heading source.')
-    HEADING_UNAVAILABLE = CAUTION, 'Check the heading source, or set alignment.heading_source.'
+    HEADING_UNAVAILABLE = CAUTION, ('Check the topic or setting of the heading source, or set '
+                                     'alignment.heading_source to auto.')
     PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that publishes ellipsoidal height.'
     SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
-    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. If the fixes are '
-                                      'the largest error, use RTK; if it is travel noise or slip, '
-                                      'use a wheel that is not driven. The limit is '
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. If the largest '
+                                      'error is fixes, use RTK; if gyro or accelerometer noise, a '
+                                      'better IMU. If it is travel noise or slip, use a wheel '
+                                      'that is not driven. The limit is '
                                       'verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '

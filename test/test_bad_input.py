@@ -179,7 +179,8 @@ def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil
     leg = spoil(made.leg())
     result, said = run(leg, made)
     assert Code.IMU_UNITS in rejecting(result)
-    assert f'set {setting} to {value}' in said[Code.IMU_UNITS]
+    remedy = next(r.remedy for r in result.reasons if r.code is Code.IMU_UNITS)
+    assert f'Set {setting} to {value:.10g}, or publish' in remedy
     sound(run(leg, made, **{setting: value})[0], made.truth)
 
 

@@ -145,8 +145,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes deviate from the track more than their '
         'covariance states, or are rounded to steps that it does not include (float32, NMEA with '
         '4 decimals of a minute). Their sigma was increased to match.',
-        Code.FIX_OUTLIERS: 'At least 2 % of the fixes are more than 4.2 sigmas from the track, '
-        'where the weight of a fix is one half; it falls with the distance.',
+        Code.FIX_OUTLIERS: 'At least 2 % of the fixes are more than 4.2 sigmas from the track. '
+        'The weight of a fix is one half at this distance, and smaller beyond it.',
         Code.VELOCITY_UNUSABLE: 'Displacements from the GNSS velocity were compared with the '
         'displacements between fixes, 10 s apart. They differ by more than 10 % in size or '
         'direction. Usual causes: north and east swapped, vehicle axes, a speed without '
@@ -181,8 +181,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.TRAVEL_MISSING: 'Within a few seconds the odometer travelled less than the vehicle, '
         'which did not brake by 0.5 m/s^2. A sliding wheel brakes, a spinning one travels '
         'farther, so no wheel slipped: the odometer lost travel, often at a start from rest.',
-        Code.TRAVEL_EXCESS: 'The odometer travelled farther than a vehicle that brakes to a stop: '
-        'brakes do not spin a wheel. The speed is likely held or late there.',
+        Code.TRAVEL_EXCESS: 'While the vehicle braked to a stop, the odometer counted more travel '
+        'than the vehicle moved. Brakes cannot spin a wheel, so this is not slip. Likely, the '
+        'speed signal is held or late.',
         Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature: the scale is not '
         'constant in this leg. The stated value is its mean over the path; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',
@@ -245,8 +246,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.WHEEL_DEPARTS: 'The factor of one wheel differs from the median of the others by '
         'more than 1 %.',
         Code.WHEEL_REVERSED: 'One wheel counts down while the other counts up.',
-        Code.WHEEL_COUNTERS_DIFFER: 'The two counters differ: another modulus, another kind, or '
-        'one counts much more than the other.',
+        Code.WHEEL_COUNTERS_DIFFER: 'The two counters differ in modulus or kind (counter, '
+        'angle, speed), or one counts much more than the other.',
         Code.SEARCH_WIDENED: 'The best values were on the edge of the search range, which was '
         'then widened around them.',
         Code.SEARCH_NOT_SETTLED: 'The search ended before its values converged, or away from the '

@@ -4,6 +4,7 @@
 """Assignment of a bag's topics to inputs, by message type if exactly one topic fits."""
 
 from collections.abc import Iterable
+import difflib
 import re
 
 from odocal_ros.bagio.read import TopicInfo
@@ -153,7 +154,8 @@ def topic_named(topics: Topics, slot: str, topic: str) -> str:
     """Return the topic that a user named, with or without its leading slash."""
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
-        wrong = 'no such topic'
+        similar = difflib.get_close_matches(topic, topics, 1)
+        wrong = 'no such topic' + (f'; did you mean {similar[0]}?' if similar else '')
     elif not topics[name].count:
         wrong = 'the topic has no message'
     elif not _fits_slot(topics[name].msgtype, slot):

@@ -242,7 +242,7 @@ def _findings(found: dict[str, Any]) -> list[str]:
         return ['all data for a calibration is available'] if found['command'] else []
     lines = []
     for only, title in ((None, 'before calibrating'), (
-            'two_point', 'affects the two-point method only')):
+            'two_point', 'affects the two-point method only; the smoother needs none of it')):
         reasons = [reason for reason in found['findings'] if reason['only'] == only]
         lines += [title] * bool(reasons)
         for reason in reasons:

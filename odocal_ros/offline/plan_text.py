@@ -85,8 +85,9 @@ def _result(before: Plan) -> str:
     by: dict[str | None, list[str]] = {}
     for parameter in PARAMETERS:
         by.setdefault(before.by(parameter), []).append(WORDS[parameter])
-    return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all"} '
-                     f'{"by " + method if method else "unknown"}' for method, names in by.items())
+    return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all values"} '
+                     f'{"from " + method if method else "unknown"}'
+                     for method, names in by.items())
 
 
 def _shown(parameter: str, sigma: float | None) -> str:

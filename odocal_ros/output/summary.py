@@ -36,7 +36,7 @@ PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of 
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
-MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the reasons first',
+MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
            Verdict.REJECTED: 'do not use these values'}
 
 
@@ -207,7 +207,7 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int)
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
     shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
-    where = '   (if it does not slide)' * (arm.startswith('odometer') and width >= WIDTH)
+    where = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= WIDTH)
     return _line(f'{word} {", ".join(found)}', f'{shown} m{where}') if found else ''
 
 

@@ -271,10 +271,14 @@ def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fix
         dr = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
         dr = dr - dr[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
-        long_enough = np.hypot(*dr.T) >= max(COURSE_DISTANCE, 8 * sigma_fix)
+        least = max(COURSE_DISTANCE, 8 * sigma_fix)
+        long_enough = np.hypot(*dr.T) >= least
         if long_enough.any():
             k = int(np.argmax(long_enough))
             yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
             return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
-    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course: the fixes move less than '
-                               f'{COURSE_DISTANCE:.0f} m within {course_time:.0f} s'),)
+        what = f'less than {least:.0f} m from the start within {course_time:.0f} s'
+    else:
+        what = f'fewer than 2 fixes within {course_time:.0f} s of the start'
+    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {what}',
+                               'Drive straight on right after the start mark, under open sky.'),)

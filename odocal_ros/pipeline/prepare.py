@@ -114,7 +114,9 @@ def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...]
                                      inputs.t_stop, inputs.least_motion)
     if refusal_reasons or not placed.rough:
         return refusal_reasons or (Reason(
-            Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale'),)
+            Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
+            'Drive farther between the marks. If the vehicle did, check the receiver (static '
+            'hold off).'),)
     covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
     fewest_rows = 4    # of the IMU between the marks, for an attitude
     if covered.sum() < fewest_rows:

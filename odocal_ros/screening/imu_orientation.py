@@ -190,15 +190,18 @@ def unit_and_axis_reasons(mean: Floats, w_b: Floats, C_bi: Floats,
         return tuple(reasons), False
     if not 0.85 * G < size < 1.15 * G:
         if 0.85 < size < 1.15:
-            what = (f'the IMU measures {size:.3f} at rest, so its unit is probably g: set '
-                    f'imu.accel_scale to {9.80665 * imu.accel_scale:.10g}')
+            what = f'gravity is {size:.3f} instead of 9.8 m/s^2: the unit is probably g'
+            do = (f'Set imu.accel_scale to {9.80665 * imu.accel_scale:.10g}, or publish m/s^2 '
+                  '(REP-145).')
         else:
-            what = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2'
-        reasons.append(Reason(Code.IMU_UNITS, what))
+            what, do = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2', ''
+        reasons.append(Reason(Code.IMU_UNITS, what, do))
     if fast > MAX_RATE:
-        reasons.append(Reason(Code.IMU_UNITS, f'the gyro measures {fast:.3g} rad/s, more than a '
-                              'vehicle can turn, so its unit is probably deg/s: set '
-                              f'imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG!r}'))
+        reasons.append(Reason(
+            Code.IMU_UNITS, f'the gyro measures {fast:.3g} rad/s; the limit for a vehicle is '
+            f'{MAX_RATE:g} rad/s: the unit is probably deg/s',
+            f'Set imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
+            '(REP-145).'))
     up = mean / size
     upright = int(np.argmax(np.abs(up @ C_bi)))
     if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()

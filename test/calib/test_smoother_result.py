@@ -116,7 +116,7 @@ def test_a_limit_that_model_errors_lower_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
     for uncertainty, text in ((1.0, ''),
-                              (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2, the ')):
+                              (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2: ')):
         _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(),
                                         uncertainty)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]

@@ -109,15 +109,16 @@ class TestImu:
         assert self.say([np.sin(0.2), 0, np.cos(0.2)]) == ((), False)      # parked on a hill
 
     @pytest.mark.parametrize(('sent', 'text'), [
-        ({'size': 1.0}, 'probably g: set imu.accel_scale to 9.80665'),
+        ({'size': 1.0}, 'probably g. Set imu.accel_scale to 9.80665, or publish'),
         ({'size': 0.5}, 'a gravity of 0.5 m/s^2 instead of 9.8'),
-        ({'fast': 20.0}, '0.017453292519943295'),
-        ({'fast': 20.0, 'imu': ImuConfig(gyro_scale=180 / np.pi)}, 'set imu.gyro_scale to 1.0'),
-        ({'size': 1.0, 'imu': ImuConfig(accel_scale=2.0)}, 'set imu.accel_scale to 19.6133')])
+        ({'fast': 20.0}, 'limit for a vehicle is 8 rad/s: the unit is probably deg/s. Set '
+         'imu.gyro_scale to 0.01745329252, or'),
+        ({'fast': 20.0, 'imu': ImuConfig(gyro_scale=180 / np.pi)}, 'Set imu.gyro_scale to 1, or'),
+        ({'size': 1.0, 'imu': ImuConfig(accel_scale=2.0)}, 'Set imu.accel_scale to 19.6133')])
     def test_units_are_known_by_their_size_and_the_factor_holds_what_is_set(self, sent, text):
         (reason,), _ = self.say([0, 0, 1], **sent)
         assert reason.code is Code.IMU_UNITS
-        assert text in reason.text
+        assert text in f'{reason.text}. {reason.remedy}'
 
     @pytest.mark.parametrize(('up', 'C_bi', 'code', 'text'), [
         ([0, 0, -1], None, Code.IMU_LOOKS_Z_DOWN, ''),      # and is turned over

@@ -113,7 +113,7 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     assert main(['plan', *drive, '--duration', '300']) == 0
     out = capsys.readouterr().out
     assert 'CHORD_TOO_SHORT' in out
-    assert '(result: all by smoother' in out
+    assert '(result: all values from smoother' in out
     answer = plan_of(capsys, *drive, *TWO_POINT)
     assert answer['methods']['two_point']['estimates']['scale_factor']['sigma'] is None
     assert answer['verdict'] == 'rejected'
@@ -165,7 +165,7 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
     # an IMU whose axes are off by half a degree: without turns no pitch against the plane of them
-    assert '(result: scale by smoother, yaw and pitch unknown' in out
+    assert '(result: scale from smoother, yaw and pitch unknown' in out
     plain_text = ' '.join(out.split())
     assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in plain_text
     assert 'Drive with stops, starts and turns' in plain_text

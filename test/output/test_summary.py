@@ -158,7 +158,7 @@ def test_the_coordinates_of_a_lever_arm_share_a_line(good):
         ('x', -0.0058, 0.0031), ('y', None, None), ('z', 0.25, 0.06))}
     lines = screen(replace(good, estimates=dict(good.estimates) | arm)).splitlines()
     assert [line for line in lines if 'odometer at' in line or 'lever' in line] == [
-        '  odometer at x, z    -0.0058 ± 0.0031, +0.250 ± 0.060 m   (if it does not slide)']
+        '  odometer at x, z    -0.0058 ± 0.0031, +0.250 ± 0.060 m   (assumes no sideslip)']
 
 
 def whole(good):

@@ -137,8 +137,8 @@ def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, y
     """Return the reasons for mounting angles that are not determined, or far from nominal."""
     reasons, limit_text = [], f'; the limit is {np.rad2deg(limit / factor):.2g} deg'
     if factor > 1:
-        limit_text += (f' ({np.rad2deg(limit):.2g} deg / {factor:.2g}, the factor on '
-                       'uncertainties)')
+        limit_text += (f' ({np.rad2deg(limit):.2g} deg / {factor:.2g}: model errors increase all '
+                       f'uncertainties {factor:.2g} times)')
     off = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[layout.YAW] > limit / factor:
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (

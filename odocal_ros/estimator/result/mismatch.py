@@ -212,8 +212,8 @@ def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]
                      'one.')
     if vibrating:
         texts.append(f'{_cause_of(vibrating, worse)} is vibration: '
-                     f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from the '
-                     'engine.')
+                     f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
+                     'engine and motors.')
     texts += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
               f'this is its normal noise, {_setting(name, level)}' for name in own_noise]
     texts += [f'The cause of the {NAMES[name]} noise is unknown: ' + (

@@ -49,6 +49,9 @@ VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forw
 POSE_COVARIANCE_REMEDY = (
     'Uncertainties were increased to match the residuals. Check the map, and the '
     'covariance that this source of positions states.')
+POSE_OUTLIER_REMEDY = (
+    'Check the map and the source of positions for jumps. The comparison of track and fixes '
+    'includes these positions.')
 LEVER_ARM_REMEDY = (
     'Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
     'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
@@ -90,7 +93,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             config: Config) -> list[Reason]:
     """Return reasons; sigma : (M,) of the constants; ratio : (M,) posterior to prior sigma."""
     c = fit.state.constants
-    reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(fit),
+    reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(problem, fit),
                *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
                *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
                                  c[layout.FIX_TIME], sigma_by_wheels_in_map(problem, c, sigma)),
@@ -112,10 +115,12 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     worst = max(IMU_SCALES, key=lambda i: off[i])
     if off[worst] > IMU_ERROR_LIMIT:
         name = layout.CONSTANTS[worst].replace('_', ' ')
+        setting = 'gyro_scale' if name.startswith('gyro') else 'accel_scale'
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} is '
                               f'{100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
                               f'the {config.imu.grade} grade (limit {IMU_ERROR_LIMIT:g}); '
-                              'accounted for'))
+                              'accounted for', f'Set imu.{setting}_sigma, or imu.grade, to the '
+                              f'data sheet of this IMU. If its unit is wrong, set imu.{setting}.'))
     return reasons + _lever_arm_reasons(c, sigma, ratio, config)
 
 
@@ -131,7 +136,7 @@ def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
                    POSE_COVARIANCE_REMEDY if problem.leg.origin.local else '')]
 
 
-def _outlier_reasons(fit: Fit) -> list[Reason]:
+def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
     """Return the reason for fixes that are outliers."""
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
@@ -140,7 +145,8 @@ def _outlier_reasons(fit: Fit) -> list[Reason]:
         return []
     far = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {of} fixes ({100 * count / of:.0f} %) are '
-                   f'outliers, up to {far:.1f} m from the track; they were down-weighted')]
+                   f'outliers, up to {far:.1f} m from the track; they were down-weighted',
+                   POSE_OUTLIER_REMEDY if problem.leg.origin.local else '')]
 
 
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
