@@ -3,7 +3,7 @@
 
 """Assignment of a bag's topics to inputs, by message type if exactly one topic fits."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 import difflib
 import re
 
@@ -27,6 +27,8 @@ ESTIMATES = re.compile(
     'filtered|fused|ekf|estimat|gps|gnss|fix|global|ground_truth|localiz|mapping|kinematic_state|'
     'visual|lidar|laser|vins|steer')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
+
+NO_MESSAGES_REMEDY = 'Check the driver and the QoS of the recorder, then record again.'
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
 REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
@@ -167,6 +169,13 @@ def topic_named(topics: Topics, slot: str, topic: str) -> str:
                    f'{_described(topics, topics)}')
 
 
+def topics_without_messages(types: Mapping[str, tuple[str, int]], slot: str) -> list[str]:
+    """Return the names of topics of a slot's type without messages; types : type and count."""
+    msgtype = {'imu': IMU, 'fix': FIX}.get(slot)      # other types have more uses than one
+    return [name for name, (found_type, count) in types.items()
+            if found_type == msgtype and not count]
+
+
 def _fits_slot(msgtype: str, slot: str) -> bool:
     """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
@@ -189,6 +198,9 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
         return (f'{len(found)} topics can be the {INPUTS[slot].label}; choose one with '
                 f'{topic_option(slot)}: {_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
+    empty = topics_without_messages({t.name: (t.msgtype, t.count) for t in topics.values()}, slot)
+    if empty:
+        return f'no {INPUTS[slot].label}: {", ".join(empty)} has no messages in the bag'
     if slot == 'fix':
         return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')

@@ -20,6 +20,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.arguments import EACH_STOP, LegSpan
 from odocal_ros.library.find_legs import find_legs, marked_legs, standstills_of
+from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data_reasons
@@ -221,8 +222,12 @@ def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
                              'odometer'), ('fix', Code.NO_FIX, 'fixes')):
         facts = topics.get(mapping.get(slot, ''), {})
         if not facts and (slot != 'imu' or config.odometer.needs_imu):
-            reasons.append(Reason(code, f'no topic for the {word}',
-                                  f'Record it, or name it with --{slot}-topic.'))
+            empty = topics_without_messages(
+                {name: (topic['type'], topic['count']) for name, topic in topics.items()}, slot)
+            reasons.append(Reason(
+                code, f'{", ".join(empty)} has no messages', NO_MESSAGES_REMEDY) if empty else
+                Reason(code, f'no topic for the {word}',
+                       f'Record it, or name it with --{slot}-topic.'))
         elif 'trouble' in facts and 'timing' not in facts:
             reasons.append(Reason(code, f'{facts["name"]}: no message can be used: '
                                   f'{facts["trouble"]}',

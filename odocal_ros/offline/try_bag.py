@@ -38,6 +38,16 @@ MISSING = {'imu': 'record sensor_msgs/Imu', 'odometer': 'select an odometer of a
            'sensor_msgs/NavSatFix'}
 
 
+def _missing_action(slot: str, topics: Collection[dict[str, Any]]) -> str:
+    """Return the action for a slot without a topic; topics : name, type and count of each."""
+    from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
+    empty = topics_without_messages({one['name']: (one['type'], one['count']) for one in topics},
+                                    slot)
+    if not empty:
+        return MISSING[slot]
+    return f'{", ".join(empty)} has no messages. {NO_MESSAGES_REMEDY.rstrip(".")}'
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: the calibration options of replay, and --no-browser."""
     add = parser.add_argument
@@ -60,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
         print_text(text(found | {'open': '', 'findings': [
             finding for finding in found['findings'] if finding['code'] not in codes]}))
         labels = ', '.join(INPUTS[slot].label for slot in missing)
-        raise BadData(f'{args.bag}: no topic was found for: {labels}; '
-                      + '; '.join(MISSING[slot] for slot in missing))
+        raise BadData(f'{args.bag}: no usable topic for: {labels}; '
+                      + '; '.join(_missing_action(slot, found['topics']) for slot in missing))
     options = [*_suggested_options(found['command'], bool(args.leg)), *_user_options(args)]
     print_text('\n'.join(_overview(found, choices, options, args.settings)))
     parser = argparse.ArgumentParser()

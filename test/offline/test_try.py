@@ -131,11 +131,25 @@ def test_a_bag_without_the_inputs_shows_what_it_has(tmp_path, monkeypatch, capsy
     write_bag(tmp_path / 'bag', [imu('/imu/data', drive(scenario='straight', duration=200.0).imu)])
     assert main(['try', 'bag']) == 2
     out, err = capsys.readouterr()
-    assert 'no topic was found for: odometer, fix' in err
+    assert 'no usable topic for: odometer, fix' in err
     assert err.count('\n') == 1
     assert '/imu/data' in out
     assert 'NO_ODOMETER' not in out       # the error states it
     assert 'no odometer' not in out
+
+
+def test_a_fix_topic_without_messages_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = drive(scenario='straight', duration=200.0)
+    none = replace(made.fix, **{name: value[:0] for name, value in vars(made.fix).items()
+                                if isinstance(value, np.ndarray)})
+    write_bag(tmp_path / 'bag', [imu('/imu/data', made.imu), fix('/fix', none)])
+    assert main(['try', 'bag']) == 2
+    assert '/fix has no messages. Check the driver and the QoS' in capsys.readouterr().err
+    assert main(['inspect', 'bag']) == 0
+    text = capsys.readouterr().out
+    assert 'NO_FIX: /fix has no messages. Check the driver' in text
+    assert 'no fix: /fix has no messages in the bag' in ' '.join(text.split())
 
 
 def test_the_rate_of_equal_stamps_is_unknown(tmp_path, monkeypatch, capsys):
