@@ -227,7 +227,7 @@ class Code(Enum):
     MODEL_MISMATCH = CAUTION, ('Check slip, lever arms, delays, sky view and the unit of heights. '
                                'The residuals are larger than the noise model predicts; '
                                'uncertainties were increased.')
-    METHOD_REJECTED = CAUTION, ('See docs/reasons.md for the code named. The values come from '
+    METHOD_REJECTED = CAUTION, ('Follow the remedy of the reason named. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
                              'affected.')

@@ -117,7 +117,7 @@ class AutomaticLegs(LegCompletion):
         for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
                 self._warned.add(reason.text)
-                self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')
+                self._log.warning(f'{reason.code.name}: {reason.text}. {reason.remedy}')
 
 
 def _foreign_result_reason(found: Stored, config: Config) -> str:

@@ -89,6 +89,7 @@ def test_a_rejected_method_is_named_where_one_behind_it_gives():
     fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
     found, = rejected_method_reasons(several(method('two_point'), fell), 'auto')
     assert found.code is Code.METHOD_REJECTED
+    assert found.remedy.endswith('which may not detect this problem.')
     assert found.text == 'smoother is not used, because of CHORD_TOO_SHORT: a loop'
     # said by the leg already; behind the one that gives; nothing gives; not asked for
     assert rejected_method_reasons(several(method('two_point'), fell), 'auto',
