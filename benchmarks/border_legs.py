@@ -76,7 +76,7 @@ def run_vehicle(vehicle, legs, grade, fixes):
     from odocal_ros.estimator.several import combine_legs
     begin = time.process_time()
     results, times, config, truth = driven(vehicle, legs, grade, fixes)
-    good = [(r, t) for r, t in zip(results, times, strict=True) if r.border]
+    good = [(r, t) for r, t in zip(results, times, strict=True) if r.marginal]
     together = combine_legs(*zip(*good, strict=True), config)
     return {'seed': vehicle, 'legs': [off(r, truth) for r in results],
             'border': off(together, truth),

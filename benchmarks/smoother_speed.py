@@ -34,7 +34,7 @@ def run(name, options, seed):
     """Print one line of figures."""
     from odocal_ros.estimator import make_smoother_leg, smooth
     from odocal_ros.nav.standstill import standstills
-    from odocal_ros.screening.inputs import place
+    from odocal_ros.screening.inputs import locate_fixes
     from odocal_ros.screening.screen import screen
     from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -44,10 +44,11 @@ def run(name, options, seed):
     config = configured(drive)
     leg = drive.leg()
     inputs, _ = screen(leg, config)
-    placed = place(inputs, config)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
+    located = locate_fixes(inputs, config)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough,
                         config.leg.standstill)
-    ready = make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
+    ready = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
+                              located.rough)
     t2, cpu = time.perf_counter(), time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result = smooth(ready, config)

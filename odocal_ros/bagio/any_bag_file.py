@@ -26,7 +26,12 @@ ZSTD = b'\x28\xb5\x2f\xfd'
 
 
 class AnyBagFile:
-    """A file of a bag; ``file`` has its metadata."""
+    """
+    The messages of one file of a bag in any format, each message decompressed.
+
+    path : the user's file, for errors.   file, kind : the unpacked file and its format, from
+    ``sources.unpack``.   total : size of the whole bag, bytes.   convert : ROS 1 message to CDR.
+    """
 
     def __init__(self, path: Path, file: Path, kind: str, total: int,
                  convert: Callable[..., Any]) -> None:
@@ -46,7 +51,7 @@ class AnyBagFile:
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch]:
         """Yield the messages of some topics (name -> type), many at a time, as CDR."""
-        batches = self._file.batches(topics)
+        batches = self._file.batches(topics)     # None: the format has no fast reader
         first = next(batches, {}) if batches else {}
         if batches and not any(_is_compressed(raws[0]) for _, raws in first.values()):
             yield from chain([first] * bool(first), batches)
@@ -66,6 +71,7 @@ class AnyBagFile:
                 yield channel, time_ns, raw
 
     def _messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
+        """Return the messages (connection or Channel, time, raw), decompressed."""
         stream: Iterator[tuple[Any, ...]] = self._file.messages(topics)
         first = next(stream, None)
         if first is None:

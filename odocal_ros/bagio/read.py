@@ -77,7 +77,7 @@ class Bag:
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
-            span = metadata.of_file.get(part.path.name) or (
+            span = metadata.file_spans.get(part.path.name) or (
                 metadata.whole if len(self._parts) == 1 else None)
             note = f'{part.path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:

@@ -20,14 +20,14 @@ from odocal_ros.safe_io.text_formats import safe_loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
-# judgement: bytes at a time: after each zstd frame, of 9 bytes at least, the rest is copied
-FRAMES_READ = 2**13
+# judgement: bytes read at a time. Small: the rest is copied after each frame of 9 bytes or more
+READ_BYTES = 2**13
 ENDINGS = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 
 
 @dataclass(frozen=True)
 class Span:
-    """Content of metadata.yaml on a bag or one of its files."""
+    """End time and number of messages of a bag or of one of its files, from metadata.yaml."""
 
     end_ns: int
     count: int
@@ -38,15 +38,14 @@ class BagMetadata:
     """
     Content of metadata.yaml on a bag.
 
-    foreign_formats : serialization formats, if none is cdr.   trouble : reason why it cannot be
-    used.
+    foreign_formats : serialization formats, if none is cdr.   fault : why it cannot be used.
     """
 
     file_names: tuple[str, ...] = ()
-    whole: Span | None = None
-    of_file: Mapping[str, Span] = field(default_factory=dict)      # by name
+    whole: Span | None = None       # of the bag
+    file_spans: Mapping[str, Span] = field(default_factory=dict)      # by name of the file
     foreign_formats: str = ''
-    trouble: str = ''
+    fault: str = ''
 
 
 @dataclass(frozen=True)
@@ -72,27 +71,29 @@ def find_source(path: Path) -> Source:
         path = path.parent
     if path.is_dir():
         return _folder(path)
-    beside = path.parent / 'metadata.yaml'
-    metadata = _read_metadata(beside) if beside.exists() else BagMetadata()
+    metadata_path = path.parent / 'metadata.yaml'
+    metadata = _read_metadata(metadata_path) if metadata_path.exists() else BagMetadata()
     if path.name not in metadata.file_names:
         return Source(_stem(path), (path,))
-    whole = metadata.of_file.get(path.name) or (
+    whole = metadata.file_spans.get(path.name) or (
         metadata.whole if metadata.file_names == (path.name,) else None)
-    return Source(_stem(path), (path,), metadata=replace(metadata, whole=whole, of_file={}))
+    return Source(_stem(path), (path,), metadata=replace(metadata, whole=whole, file_spans={}))
 
 
 def _folder(path: Path) -> Source:
-    beside = path / 'metadata.yaml'
-    metadata = _read_metadata(beside) if beside.exists() else None
+    """Return the source of a folder: files of metadata.yaml that exist, or all files of bags."""
+    metadata_path = path / 'metadata.yaml'
+    metadata = _read_metadata(metadata_path) if metadata_path.exists() else None
     listed = metadata.file_names if metadata else ()
-    notes: list[Reason | str] = [metadata.trouble] if metadata and metadata.trouble else []
+    notes: list[Reason | str] = [metadata.fault] if metadata and metadata.fault else []
     files = _distinct([path / file for file in listed if limits.is_file(path / file)])
-    lost = [file for file in listed if not limits.is_file(path / file)]
-    if lost and files:
-        named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
-        notes.append(Reason(Code.BAG_TRUNCATED, f'{path.resolve().name}: {len(lost)} of '
-                            f'{len(listed)} files named in metadata.yaml are missing ({named}); '
-                            'the others are read', 'Copy the missing files into the folder.'))
+    missing = [file for file in listed if not limits.is_file(path / file)]
+    if missing and files:
+        missing_text = ', '.join(missing[:10]) + ' ...' * (len(missing) > 10)
+        notes.append(Reason(
+            Code.BAG_TRUNCATED, f'{path.resolve().name}: {len(missing)} of {len(listed)} files '
+            f'named in metadata.yaml are missing ({missing_text}); the others are read',
+            'Copy the missing files into the folder.'))
     if not files:
         files = _distinct(sorted((f for f in path.iterdir()
                                   if f.name.endswith(ENDINGS) and limits.is_file(f)),
@@ -112,8 +113,8 @@ def _distinct(files: list[Path]) -> list[Path]:
     """Return the files without links to an earlier one, so that each is read once."""
     found: dict[tuple[int, int], Path] = {}
     for file in files:
-        about = file.stat()
-        found.setdefault((about.st_dev, about.st_ino), file)
+        status = file.stat()
+        found.setdefault((status.st_dev, status.st_ino), file)
     return list(found.values())
 
 
@@ -138,20 +139,20 @@ def _stem(path: Path) -> str:
 
 
 def _read_metadata(path: Path) -> BagMetadata:
-    """Return the content of a metadata.yaml; with ``trouble`` if it is invalid."""
+    """Return the content of a metadata.yaml; with ``fault`` if it is invalid."""
     import yaml
     if not limits.is_file(path):
-        return BagMetadata(trouble=f'{path}: is not a regular file and is ignored')
+        return BagMetadata(fault=f'{path}: is not a regular file and is ignored')
     try:
         return _parse_metadata(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
     except (OSError, MemoryError):
         raise
     except limits.LimitReached as error:
-        return BagMetadata(trouble=f'{error}; it is ignored')
+        return BagMetadata(fault=f'{error}; it is ignored')
     except Exception as error:      # any error: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
             'not the structure that rosbag2 writes')
-        return BagMetadata(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
+        return BagMetadata(fault=f'{path}: cannot be parsed ({why}) and is ignored')
 
 
 def _parse_metadata(content: dict[str, dict[str, Any]]) -> BagMetadata:
@@ -221,7 +222,7 @@ def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path
     with path.open('rb') as packed, target.open('wb') as out:
         frames = 1
         frame, data = zstd.ZstdDecompressor(), b''   # also decompresses a truncated file
-        while data or not (frame.needs_input or frame.eof) or (data := packed.read(FRAMES_READ)):
+        while data or not (frame.needs_input or frame.eof) or (data := packed.read(READ_BYTES)):
             if frame.eof:
                 frames += 1
                 allowance.check_frames(frames, packed.tell())
@@ -251,4 +252,5 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
 
 
 def file_names(paths: Sequence[Path]) -> str:
+    """Return the names of files as text."""
     return ', '.join(path.name for path in paths)

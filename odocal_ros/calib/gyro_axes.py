@@ -24,7 +24,7 @@ from odocal_ros.nav.time_series import gaps_longer, integral_at, twice_integral_
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.gravity_fit import gravity_fit
 from odocal_ros.screening.imu_orientation import ImuOrientation
-from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.screening.inputs import Inputs, LocatedFixes
 
 Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a correct gyro
@@ -59,14 +59,14 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
                   for axis in nearest]
 
 
-def turning(inputs: Inputs, placed: Placed, faces: ImuOrientation | None,
+def turning(inputs: Inputs, located: LocatedFixes, faces: ImuOrientation | None,
             gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
-                       inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
+                       inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.least_motion)
     found = gyro_reasons(ratio, gyro_scale)
     if not any(one.code is Code.GYRO_SIGN for one in found):
-        return ratio, gyro_axes(inputs, placed, faces) or found
+        return ratio, gyro_axes(inputs, located, faces) or found
     text = found[0].text
     if faces and abs(faces.inward) > max(-INVERTED, FAR_SIGMAS * faces.inward_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
@@ -76,22 +76,23 @@ def turning(inputs: Inputs, placed: Placed, faces: ImuOrientation | None,
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
 
-def gyro_axes(inputs: Inputs, placed: Placed, faces: ImuOrientation | None) -> tuple[Reason, ...]:
+def gyro_axes(inputs: Inputs, located: LocatedFixes,
+              faces: ImuOrientation | None) -> tuple[Reason, ...]:
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    placed : the fixes in metres and approximate scale.   faces : fit of the accelerations. A flat
+    located : the fixes in metres and approximate scale.   faces : fit of the accelerations. A flat
     road does not show roll and pitch, a straight one no yaw.
     """
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
     axes, names = sensor_axes(up / np.linalg.norm(up))
-    found = by_course(inputs, placed, w_i, axes, names)
+    found = by_course(inputs, located, w_i, axes, names)
     if not found and inputs.has_accelerometer:
         inverted = faces and faces.inward < min(INVERTED, -FAR_SIGMAS * faces.inward_sigma)
         if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
-        found = by_gravity(inputs, placed, w_i, f_i, axes, names)
+        found = by_gravity(inputs, located, w_i, f_i, axes, names)
         if faces and inverted:
             return _inverted_turns(faces, found, names)
     if not found:
@@ -124,12 +125,12 @@ def _inverted_turns(faces: ImuOrientation, found: Found, names: list[str]) -> tu
                    'and accelerometer together.'),)
 
 
-def by_course(inputs: Inputs, placed: Placed, w_i: Floats, axes: Floats,
+def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
               names: list[str]) -> Found:
     """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
         return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
-                          placed.fixes_n, placed.fix_sigma, inputs.least_motion)
+                          located.fixes_n, located.fix_sigma, inputs.least_motion)
 
     def one_motion(ratio: float | None) -> bool:
         return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
@@ -145,10 +146,10 @@ def by_course(inputs: Inputs, placed: Placed, w_i: Floats, axes: Floats,
     return found
 
 
-def by_gravity(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, axes: Floats,
+def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
                names: list[str]) -> Found:
     """Return the gyro axes that measure the turn of gravity about another axis."""
-    fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, placed.rough)
+    fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough)
     found: Found = []
     if fit is None:
         return found

@@ -65,7 +65,7 @@ def fit_jointly(borders: Sequence[MarginalInformation], steps: Sequence[float] |
     legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
     bent = _add_linearisation_errors(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
-    drives = legs.joined(same)
+    drives = legs.combine_sections(same)
     scatter = _scatter(drives, usual)
     # a single leg has no scatter
     alone = len(drives.borders) == 1 and not borders[0].evidence

@@ -66,7 +66,7 @@ class LinkedEquations:
         size = np.maximum(size, LEG_ROUNDING)
         return V @ (self.g @ self._parts[1] / size), V / size @ V.T
 
-    def of(self, keep: Ints) -> tuple[Floats, Floats]:
+    def eliminate_others(self, keep: Ints) -> tuple[Floats, Floats]:
         """Return H and g of some unknowns, the others eliminated."""
         gone = np.setdiff1d(np.arange(len(self.g)), keep)
         if not len(gone):
@@ -97,7 +97,7 @@ class LinkedLegs:
         # 0.1 ppm of ln K: any vehicle changes more; with smaller sigmas rounding is too large
         self.steps = np.maximum(steps, 1e-7)
 
-    def joined(self, same: Sequence[bool]) -> 'LinkedLegs':
+    def combine_sections(self, same: Sequence[bool]) -> 'LinkedLegs':
         """Return these legs, with the sections of the same leg added up."""
         is_new_leg = [not together for together in same] or [True] * len(self.steps)
         if all(is_new_leg):
@@ -185,7 +185,7 @@ class LinkedLegs:
                 evidence: dict[str, Floats]) -> MarginalInformation:
         """Return the information of all legs at ``value``; evidence : of the scatter, by name."""
         equations = self.equations(self.information(), spread, prior=False)
-        D, pull = equations.of(self.place(len(self.borders) - 1))
+        D, pull = equations.eliminate_others(self.place(len(self.borders) - 1))
         D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
         return MarginalInformation(self.names, value, D, pull
                                    - D @ (value - self.borders[-1].value),

@@ -114,7 +114,7 @@ NUMBERS = [f for f in fields(MarginalInformation) if f.name not in ('names', 'ev
 class CarriedInformation:
     """Information of all legs so far, with the scale at the last leg."""
 
-    border: MarginalInformation
+    marginal: MarginalInformation      # on the constants
     unit: str      # of the scale
     first_ns: int  # start of the first leg
     last_ns: int   # start of the last leg
@@ -130,17 +130,17 @@ class CarriedInformation:
 
         keeps : share of its prior sigma by which each constant may have changed until use.
         """
-        border = self.border.only(names)
-        return replace(self, border=border.loosened(
-            dict(zip(border.names, (keeps * border.used).tolist(), strict=True))))
+        marginal = self.marginal.only(names)
+        return replace(self, marginal=marginal.loosened(
+            dict(zip(marginal.names, (keeps * marginal.used).tolist(), strict=True))))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for calibration.json."""
-        border = {f.name: np.asarray(getattr(self.border, f.name)).tolist() for f in NUMBERS}
-        border |= {'names': list(self.border.names),
-                   'evidence': {n: x.tolist() for n, x in self.border.evidence.items()}}
+        entry = {f.name: np.asarray(getattr(self.marginal, f.name)).tolist() for f in NUMBERS}
+        entry |= {'names': list(self.marginal.names),
+                  'evidence': {n: x.tolist() for n, x in self.marginal.evidence.items()}}
         return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
-                'legs': self.legs, 'border': border}
+                'legs': self.legs, 'border': entry}
 
 
 def read_carried(content: dict[str, Any]) -> CarriedInformation:

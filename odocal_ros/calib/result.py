@@ -71,8 +71,8 @@ class MethodResult:
     parameters: tuple[str, ...] = ()  # names, in the order of the rows of the sources
     sources: tuple[Source, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
-    # of the leg, or of all; None: the method has none
-    border: MarginalInformation | None = None
+    # on the constants, the keyframes eliminated, of the leg or of all; None: the method has none
+    marginal: MarginalInformation | None = None
 
     @cached_property
     def verdict(self) -> Verdict:

@@ -45,7 +45,7 @@ INPUTS = {
                       (1e4, 2e5)),
 }
 # sensors other than IMU, odometer and fixes
-OUTSIDE = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))
+EXTERNAL_SLOTS = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))
 TOPICS = {slot: one.topic for slot, one in INPUTS.items() if one.topic}
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data import samples as kinds
 from odocal_ros.data.arrays import by_row, Ints, runs
-from odocal_ros.data.inputs import INPUTS, OUTSIDE, WHEELS
+from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, WHEELS
 from odocal_ros.data.samples import (
     FixSamples,
     ImuSamples,
@@ -35,7 +35,7 @@ EMPTY: dict[str, Callable[[], Samples]] = {
     'imu_other': OtherImuSamples.none,
     **{slot: getattr(kinds, one.kind).none for slot, one in INPUTS.items()}}
 SLOTS = tuple(EMPTY)
-OTHERS = (*WHEELS[2:], *OUTSIDE)      # definition: slots without a field of a leg
+OTHERS = (*WHEELS[2:], *EXTERNAL_SLOTS)      # definition: slots without a field of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 

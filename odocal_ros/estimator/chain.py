@@ -141,10 +141,10 @@ class JointMarginals:
 
     def __getitem__(self, k: int) -> Floats:
         """Return the covariance of one interval: (2n + m, 2n + m)."""
-        out: Floats = self.of(np.array([k % len(self)]))[0]
+        out: Floats = self.covariances(np.array([k % len(self)]))[0]
         return out
 
-    def of(self, rows: Ints) -> Floats:
+    def covariances(self, rows: Ints) -> Floats:
         """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
         n, size = self._own.shape[1], self._across.shape[2] + self._own.shape[1]
         out = np.empty((len(rows), size, size))
@@ -169,20 +169,20 @@ class JointMarginals:
                                for rows in blocks(len(self))])
 
     def variances_of(self, rows: Ints, own: Floats, border: Floats, ahead: Floats | None,
-                     of: slice) -> Floats:
+                     ahead_columns: slice) -> Floats:
         """
         Return the variances of sums over the unknowns of some intervals: (k, c).
 
         own, border : (k, n, c), (k, m, c) factors of block and border.   ahead : (k, a, c) of the
-        unknowns ``of`` of the next block, or None.
+        unknowns ``ahead_columns`` of the next block, or None.
         """
         n, across = own.shape[1], self._across[rows]
         by_own = self._own[rows] @ own + 2 * (across[:, :, n:] @ border)
         by_border = self._corner @ border
         if ahead is not None:
-            by_own += 2 * (across[:, :, :n][:, :, of] @ ahead)
-            by_ahead = self._own[rows + 1][:, of, of] @ ahead
-            by_ahead += 2 * (self._across[rows + 1][:, of, n:] @ border)
+            by_own += 2 * (across[:, :, :n][:, :, ahead_columns] @ ahead)
+            by_ahead = self._own[rows + 1][:, ahead_columns, ahead_columns] @ ahead
+            by_ahead += 2 * (self._across[rows + 1][:, ahead_columns, n:] @ border)
         out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
         return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
 
@@ -205,7 +205,7 @@ class JointMarginals:
     def blocks(self) -> Iterator[Floats]:
         """Yield the covariances of all intervals in chunks: (k, 2n + m, 2n + m)."""
         for rows in blocks(len(self)):
-            yield self.of(np.arange(rows.start, rows.stop))
+            yield self.covariances(np.arange(rows.start, rows.stop))
 
 
 def solve(normal: Normal) -> Solved:

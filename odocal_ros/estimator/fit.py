@@ -45,32 +45,34 @@ class Convergence:
     """
     Convergence limits: steps of the constants in the last pass, in sigmas.
 
-    Judgement: the remaining change is then far below the stated sigma. Measured: with ``moves`` of
-    0.03, results differ by 0.02 sigma (rms of 29 drives; at most 0.08), passes are 1.11 times as
-    many. With ``sigmas`` of 0.05, some sigmas are up to 19 % too large. Without ``last_sigmas``,
-    those of 3 of 21 motorways with RTK at 1 Hz are 3 to 6 times too large. A change that grows has
-    not converged: one sigma of a gyro without its y axis was 25 % too large, for 1.01 times the
-    passes (60 drives).
+    Judgement: the remaining change is then far below the stated sigma. Measured: with ``max_step``
+    of 0.03, results differ by 0.02 sigma (rms of 29 drives; at most 0.08), passes are 1.11 times
+    as many. With ``max_sigma_change`` of 0.05, some sigmas are up to 19 % too large. Without
+    ``max_last_sigma_change``, those of 3 of 21 motorways with RTK at 1 Hz are 3 to 6 times too
+    large. A change that grows has not converged: one sigma of a gyro without its y axis was 25 %
+    too large, for 1.01 times the passes (60 drives).
     """
 
     # residuals are noise from the first on, and no more from the second; the first step with
     # derivatives by the fitted signal takes back what noise made of it, however much
     fitted_below: float = 1.0
     measured_above: float = 4.0
-    moves: float = 0.08         # a constant may still
-    others: float = 0.3         # weight of the other constants in ``moves``
-    nearly: float = 0.1         # scale and mounting, after the last pass
-    creeping: float = 0.5       # the same: values that are worth having, with wider sigmas
-    sigmas: float = 0.02        # relative change of the sigmas of scale and mounting
+    max_step: float = 0.08         # of any constant, in the last pass
+    other_weight: float = 0.3      # of the constants but scale and mounting, in ``max_step``
+    max_final_step: float = 0.1    # of scale and mounting, when the passes are used up
+    # the same, for a fit that converges slowly: its values are reported with wider sigmas
+    max_slow_step: float = 0.5
+    max_sigma_change: float = 0.02    # relative, of the sigmas of scale and mounting
     # the same, one pass earlier: a single small change may be between a rise and a fall
-    last_sigmas: float = 0.06
+    max_last_sigma_change: float = 0.06
     # rad, sigma: an angle known no better drifts where the cost is flat, and is refused
     flat_angle: float = 0.1
 
 
 CONVERGENCE = Convergence()
 # definition: weights of steps of the constants, and sigmas from which they do not count
-STEP_WEIGHTS = np.where(np.arange(layout.M) < factor.PARAMETER_COUNT, 1.0, CONVERGENCE.others)
+STEP_WEIGHTS = np.where(np.arange(layout.M) < factor.PARAMETER_COUNT, 1.0,
+                        CONVERGENCE.other_weight)
 FLAT_SIGMAS = np.full(layout.M, np.inf)
 FLAT_SIGMAS[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
 # share of the last step from which on a step that turns back is shortened. Judgement: smaller
@@ -101,8 +103,9 @@ class WarmStart:
 class FitSummary(WarmStart):
     """The result of the iteration without the equations, which are large."""
 
-    settled: bool
-    creeping: bool           # converged, but the noise levels still change
+    converged: bool          # also if slowly
+    # scale and mounting still change by up to ``max_slow_step`` sigmas: sigmas are widened
+    slowly_converging: bool
     iterations: int
     likelihood: float        # restricted, its logarithm but for a constant; NaN: not iterated
 
@@ -124,7 +127,8 @@ class Fit(FitSummary):
     def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
         return FitSummary(self.state, self.levels, self.priors, self.first, self.variance_factors,
-                          self.settled, self.creeping, self.iterations, self.likelihood)
+                          self.converged, self.slowly_converging, self.iterations,
+                          self.likelihood)
 
 
 class _Progress:
@@ -133,7 +137,7 @@ class _Progress:
     def __init__(self, fitted: bool, frozen: bool, fewest: int) -> None:
         """Begin; fitted : derivatives by the fitted signal; fewest : passes with free levels."""
         self.fitted = self.was_fitted = fitted      # in the next pass, in the last
-        self.frozen, self.fewest, self.settled = frozen, fewest, False
+        self.frozen, self.fewest, self.converged = frozen, fewest, False
         # of scale and mounting: sigmas, their relative change, the larger of it and the last step
         self.sigma, self.change, self.last = np.ones(factor.PARAMETER_COUNT), np.inf, np.inf
         self.move, self.taken = np.inf, np.zeros(layout.M)     # largest step in sigmas, all steps
@@ -146,10 +150,10 @@ class _Progress:
         before, self.sigma, last_change = self.sigma, sigma[:factor.PARAMETER_COUNT], self.change
         self.change = np.abs(np.log(self.sigma / before)).max()
         self.last = max(step[:factor.PARAMETER_COUNT].max(), self.change)
-        steady = count > self.fewest and last_change < CONVERGENCE.last_sigmas \
-            and self.change < min(CONVERGENCE.sigmas, last_change)
-        self.settled = bool(self.fitted and self.move < CONVERGENCE.moves
-                            and (self.frozen or steady))
+        steady = count > self.fewest and last_change < CONVERGENCE.max_last_sigma_change \
+            and self.change < min(CONVERGENCE.max_sigma_change, last_change)
+        self.converged = bool(self.fitted and self.move < CONVERGENCE.max_step
+                              and (self.frozen or steady))
         first_fitted, self.was_fitted = self.fitted and not self.was_fitted, self.fitted
         self.fitted = first_fitted or self.move < (
             CONVERGENCE.measured_above if self.fitted else CONVERGENCE.fitted_below)
@@ -158,25 +162,26 @@ class _Progress:
         self.taken = np.zeros(layout.M) if fits_next else solved.step_border
 
 
-def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,
-        about: WarmStart | None = None, trace: Trace | None = None) -> Fit:
+def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40, *,
+        frozen: bool = False, warm_start: WarmStart | None = None,
+        trace: Trace | None = None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
 
-    problem, state, levels : the leg and the initial values.   most : iterations.   frozen : keep
-    the noise levels constant.   about : from an earlier fit, whose slips and priors are used.
-    trace : called after each pass, for progress and benchmarks.
+    problem, state, levels : the leg and the initial values.   frozen : keep the noise levels
+    constant.   warm_start : from an earlier fit, whose slips and priors are used.   trace :
+    called after each pass, for progress and benchmarks.
     """
-    priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
-    variance_factors = about.variance_factors if about else np.ones((len(state.t) - 1,
-                                                                     factor.VARIANCE_FACTOR_COUNT))
+    priors, first = (warm_start.priors, warm_start.first) if warm_start else (problem.priors,) * 2
+    variance_factors = warm_start.variance_factors if warm_start else np.ones(
+        (len(state.t) - 1, factor.VARIANCE_FACTOR_COUNT))
     # passes in which heavy tails are updated: earlier, the residuals contain the start; later,
     # the tails are constant
-    tails, last_tails = 1 if about else 3, 15
+    tails, last_tails = 1 if warm_start else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
-    sample_size_pass = 3 if about is None else 0 if problem.rows_per_independent else 1
+    sample_size_pass = 3 if warm_start is None else 0 if problem.rows_per_independent else 1
     pace: dict[str, tuple[float, float]] = {}
-    progress = _Progress(about is not None, frozen, tails + 2)
+    progress = _Progress(warm_start is not None, frozen, tails + 2)
     count, state = 0, state.level()
     while True:
         count += 1
@@ -187,7 +192,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         weighted.apply_step(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved, progress.move)
-        if progress.settled or count >= most:
+        if progress.converged or count >= max_iterations:
             break
         if count == sample_size_pass:
             problem.rows_per_independent = find_rows_per_independent(problem, weighted)
@@ -202,13 +207,13 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
                 priors = relax_priors(first, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # the largest memory of a long leg
-    settled = progress.settled or bool(progress.last < CONVERGENCE.nearly)
-    creeping = not settled and bool(progress.last < CONVERGENCE.creeping)
+    converged = progress.converged or bool(progress.last < CONVERGENCE.max_final_step)
+    slowly_converging = not converged and bool(progress.last < CONVERGENCE.max_slow_step)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
-    return Fit(state, levels, priors, first, variance_factors, settled or creeping, creeping,
-               count,
-               likelihood, weighted, solved, by_levels, find_constant_steps(weighted, solved))
+    return Fit(state, levels, priors, first, variance_factors, converged or slowly_converging,
+               slowly_converging, count, likelihood, weighted, solved, by_levels,
+               find_constant_steps(weighted, solved))
 
 
 def damp_step(solved: Solved, taken: Floats) -> Solved:
@@ -275,7 +280,7 @@ def relax_priors(first: Priors, now: Priors, state: State, solved: Solved,
 
 
 def _widen(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
-    """Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first."""
+    """Return sigmas of which ``off`` is RELAXATION_SIGMAS at most, none below the first."""
     # at most 30 times the first: a larger difference is a wrong setting, which is reported
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)

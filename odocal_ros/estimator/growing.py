@@ -112,7 +112,7 @@ class GrowingFit:
             with raise_on_overflow():
                 problem = make_problem(view, config, make_imu_steps(view, SPACING))
                 best = self._fit(last, problem, config, trace)
-                if not best.settled:
+                if not best.converged:
                     raise BadData('the smoother has not converged on the data so far')
                 method = make_result(view, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
@@ -132,11 +132,11 @@ class GrowingFit:
             self.cold_start_cpu_s = self._cpu_s() - begin if last is not None else 0.0
             return best
         # the levels are kept until the state of the new section is estimated as well
-        near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
+        near = fit(problem, begun.state, begun.levels, 1, frozen=True, warm_start=begun,
                    trace=trace).summary()
-        best = fit(problem, near.state, near.levels, UPDATE_PASSES, about=near, trace=trace)
-        if not best.settled or best.creeping:
-            best = fit(problem, best.state, best.levels, WARM_START_PASSES, about=best,
+        best = fit(problem, near.state, near.levels, UPDATE_PASSES, warm_start=near, trace=trace)
+        if not best.converged or best.slowly_converging:
+            best = fit(problem, best.state, best.levels, WARM_START_PASSES, warm_start=best,
                        trace=trace)
         return best
 
@@ -144,7 +144,8 @@ class GrowingFit:
 def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
     # tyres warm up from the begin of a leg: each window has its own rate
-    legs = [replace(one.method, border=_border(one.method).loosened({CONSTANTS[BY_TIME]: np.inf}))
+    legs = [replace(one.method, marginal=_information(one.method).loosened(
+                {CONSTANTS[BY_TIME]: np.inf}))
             for one in (past, now)]
     whole = combine_legs(legs, [0] * len(legs), config)
     sigmas = _parameter_sigmas(whole)
@@ -152,7 +153,7 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
     smaller = np.where(np.isfinite(now.sigmas), sigmas / now.sigmas, 1.0)[:, None]
     reasons = {(r.code, r.text): r for r in (*now.method.reasons, *whole.reasons)}
     method = replace(
-        now.method, estimates=now.method.estimates | whole.estimates, border=whole.border,
+        now.method, estimates=now.method.estimates | whole.estimates, marginal=whole.marginal,
         reasons=tuple(reasons.values()),
         sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
     return RunningEstimate(method, sigmas, past.distance + now.distance, past.agility
@@ -162,7 +163,7 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
 
 def _parameter_sigmas(method: MethodResult) -> Floats:
     """Return the sigmas of ln scale, yaw and pitch, also of undetermined ones: (3,)."""
-    border = _border(method)
+    border = _information(method)
     legs = LinkedLegs([border], CONSTANTS[LN_K], np.empty(0))
     at = legs.place(0)[:PARAMETER_COUNT]
     sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[at]), MODEL_FLOOR)
@@ -174,9 +175,9 @@ def _parameter_sigmas(method: MethodResult) -> Floats:
     return sigmas
 
 
-def _border(method: MethodResult) -> MarginalInformation:
-    assert method.border is not None, 'a fit has one'
-    return method.border
+def _information(method: MethodResult) -> MarginalInformation:
+    assert method.marginal is not None, 'a fit has one'
+    return method.marginal
 
 
 def _motion_summary(state: State) -> tuple[float, float, float]:

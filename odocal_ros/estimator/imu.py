@@ -92,7 +92,7 @@ class ImuSteps(Steps):
     key: Ints   # (K + 1,) step that begins at each keyframe
 
     @classmethod
-    def of(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
+    def from_leg(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
         """Return the steps of a leg, from begin to stop, with keyframes ``spacing`` s apart."""
         return cls.between(leg, keyframes(leg, spacing))
 

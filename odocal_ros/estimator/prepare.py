@@ -80,7 +80,7 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
 
 def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
     """Return the problem of a leg; ``imu``: its steps, if keyframes are given."""
-    imu = ImuSteps.of(leg, SPACING) if imu is None else imu
+    imu = ImuSteps.from_leg(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
     still = is_standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])

@@ -26,7 +26,7 @@ from odocal_ros.estimator.result.estimates import (
 from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
 from odocal_ros.estimator.result.outcome import SCALES, with_model_floor
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
-from odocal_ros.estimator.result.wheel_result import joined, wheel_details, wheel_estimates
+from odocal_ros.estimator.result.wheel_result import combine_wheels, wheel_details, wheel_estimates
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -57,7 +57,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
     days = np.diff(np.asarray(times_ns)[order]) / DAY_NS
-    borders = _share_sizes([leg.border for leg in legs])
+    borders = _share_sizes([leg.marginal for leg in legs])
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
         if config.leg.automatic else []
@@ -78,7 +78,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates, refusals = estimate_constants(found.value[at], sigma, ratio, scale.unit,
                                              nominal, config)
     estimates |= combine_as_sent(legs, estimates['scale_factor'])
-    wheels = joined(legs)
+    wheels = combine_wheels(legs)
     if wheels:
         wheel_values, wheel_reasons = wheel_estimates(wheels, wheels, estimates['scale_factor'],
                                                       config)

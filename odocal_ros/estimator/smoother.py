@@ -88,11 +88,11 @@ def _fix_speed_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
     summary = now.summary()
     del now             # the equations of one fit at a time
     sure = 1e-3 * coarse.step       # practically fixed
-    about = replace(summary, priors=_fix_offset_priors(summary.priors, known, sure),
-                    first=_fix_offset_priors(summary.first, known, sure))
-    last = fit(problem, replace(about.state, constants=constants), about.levels, WARM_START_PASSES,
-               about=about, frozen=True, trace=trace)
-    return replace(last, iterations=about.iterations + last.iterations)
+    warm_start = replace(summary, priors=_fix_offset_priors(summary.priors, known, sure),
+                         first=_fix_offset_priors(summary.first, known, sure))
+    last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
+               WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
+    return replace(last, iterations=warm_start.iterations + last.iterations)
 
 
 def _fix_offset_priors(priors: Priors, value: float, sigma: float) -> Priors:
@@ -112,10 +112,12 @@ def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> F
         starts += [other] * bool(abs(turned) > AMBIGUOUS_HEADING)
     if len(starts) == 1:
         return fit(problem, start.state, _initial_levels(problem, start), passes, trace=trace)
-    about = max((fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
-                 for one in starts), key=lambda f: f.likelihood).summary()
-    last = fit(problem, about.state, about.levels, passes, about=about, trace=trace)
-    return replace(last, iterations=about.iterations + last.iterations)
+    trials = (fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
+              for one in starts)
+    warm_start = max(trials, key=lambda f: f.likelihood).summary()
+    last = fit(problem, warm_start.state, warm_start.levels, passes, warm_start=warm_start,
+               trace=trace)
+    return replace(last, iterations=warm_start.iterations + last.iterations)
 
 
 def _initial_levels(problem: Problem, start: Start) -> Levels:

@@ -38,7 +38,7 @@ from odocal_ros.screening.imu_orientation import (
     orientation_reasons,
     UNUSABLE,
 )
-from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
@@ -104,8 +104,8 @@ def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs IMU, odometer and fixes between the marks; check the bag '
                       'with odocal inspect')
-    placed = _place_or_raise(inputs, config)
-    origin, scale = placed.origin, placed.rough
+    located = _locate_or_raise(inputs, config)
+    origin, scale = located.origin, located.rough
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
     step = max(DRIVE_STEP, (last - first) / 5e4)
@@ -117,17 +117,18 @@ def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
     speed = np.where(resting, 0.0, path_length * scale / (2 * profile_window))
     speed[~resting & (np.abs(speed) <= REST_SPEED)] = 2 * REST_SPEED   # too short to count as rest
     yaw = _yaw(inputs, spans, t)
-    return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, placed.fixes_n),
-                        np.zeros_like(t), origin.latitude, origin.longitude, origin.height)
+    first_course = _first_course(t, speed, yaw, inputs.t_fix, located.fixes_n)
+    return PlannedDrive(t, speed, yaw + first_course, np.zeros_like(t), origin.latitude,
+                        origin.longitude, origin.height)
 
 
-def _place_or_raise(inputs: Inputs, config: Config) -> Placed:
+def _locate_or_raise(inputs: Inputs, config: Config) -> LocatedFixes:
     """Return the fix positions and the metres per count; raise BadData without them."""
-    placed = place(inputs, config)
-    if not placed.rough:
+    located = locate_fixes(inputs, config)
+    if not located.rough:
         raise BadData('the scale is not known yet: the fixes moved too little and '
                       'odometer.nominal_scale is not set')
-    return placed
+    return located
 
 
 def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
@@ -164,7 +165,7 @@ def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:
     return {'fix': float(np.sqrt((middle[0] + middle[1]) / 2)),
             'fix_up': float(np.sqrt(middle[2])),
             'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside]))),
-            'quantum': inputs.travel.quantum * _place_or_raise(inputs, config).rough}
+            'quantum': inputs.travel.quantum * _locate_or_raise(inputs, config).rough}
 
 
 class SmootherSoFar:
@@ -209,19 +210,19 @@ class SmootherSoFar:
         if few:
             raise BadData(few.text)
         _refuse_unusable(seen.reasons)
-        placed = place(inputs, config)
-        if not placed.rough:
+        located = locate_fixes(inputs, config)
+        if not located.rough:
             raise BadData('the scale is not known yet')
-        _refuse_unusable(orientation_reasons(estimate_orientation(inputs, placed.rough),
+        _refuse_unusable(orientation_reasons(estimate_orientation(inputs, located.rough),
                                              config.imu.nominal_yaw))
-        if vars(placed.origin) != (self._origin and vars(self._origin)):
-            self._origin = placed.origin
+        if vars(located.origin) != (self._origin and vars(self._origin)):
+            self._origin = located.origin
             self._growing.forget()
-        spans = inputs.standstills(placed.rough, config)
+        spans = inputs.standstills(located.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        view = make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
-                                 placed.rough, t_stop)
+        view = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
+                                 located.rough, t_stop)
         few = missing_samples_reason(view)
         if few:
             raise BadData(few.text)

@@ -63,9 +63,8 @@ class Calibration:
     def _estimates(self) -> dict[str, Estimate]:
         """Return the estimates; the mandatory ones exist even if no leg was fitted."""
         from odocal_ros.output.files import ALWAYS
-        named = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
-        named |= self.result.estimates
-        return named
+        estimates = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
+        return estimates | self.result.estimates
 
     def __str__(self) -> str:
         """Return the result as one screen of text, as ``odocal replay`` prints it."""

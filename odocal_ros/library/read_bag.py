@@ -109,9 +109,9 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                ) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
-    named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
-    chosen = choose_topics(bag.topics, config, named, bool(floor_marks_of(config, bag)))
-    note = local_reference(bag.topics, chosen, named)
+    requested = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
+    chosen = choose_topics(bag.topics, config, requested, bool(floor_marks_of(config, bag)))
+    note = local_reference(bag.topics, chosen, requested)
     if note and listener:
         listener.note(note)
     return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)

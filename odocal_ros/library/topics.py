@@ -8,7 +8,7 @@ import difflib
 import re
 
 from odocal_ros.bagio.read import TopicInfo
-from odocal_ros.data.inputs import INPUTS, OUTSIDE, topic_option
+from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.message_fields import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
@@ -136,7 +136,7 @@ def _optional(slot: str, config: Config, found: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
         return not found and not config.odometer.needs_imu
-    return slot in OUTSIDE and not (
+    return slot in EXTERNAL_SLOTS and not (
         slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
 

@@ -17,7 +17,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from odocal_ros.data.inputs import INPUTS, OUTSIDE
+from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS
 from odocal_ros.data.samples import FixSamples, Reading
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.health import Health
@@ -158,7 +158,8 @@ class Input:
         reader = make_reader(self.slot, msgtype, config)
         self._frame_id = config.imu.frame_id
         # increments need the offered QoS; for optional topics, an idle subscription is not free
-        if not self.publishers and (self.slot in OUTSIDE or self._counts_increments(reader)):
+        if not self.publishers and (self.slot in EXTERNAL_SLOTS
+                                    or self._counts_increments(reader)):
             return
         offered = {p.qos_profile.reliability for p in self.publishers}
         reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}

@@ -33,7 +33,7 @@ from odocal_ros.screening.imu_orientation import (
     MAX_RATE,
     unit_and_axis_reasons,
 )
-from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
@@ -71,22 +71,22 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _unit_options(inputs, config, findings)
-    placed = place(inputs, config)
+    located = locate_fixes(inputs, config)
     still_reasons = [reason for reason in motion_reasons(
-        inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.t_stop,
+        inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
         inputs.least_motion) if reason.code is Code.ODOMETER_STILL]
     if still_reasons:       # scale, speeds, standstills and axes are computed from the counts
         findings += still_reasons
         return options
-    stops, speeds = survey.stops_and_speeds(inputs, placed.rough, config)
-    path_length, chord = path_and_chord(inputs.t_fix, placed.fixes_n, inputs.least_motion)
+    stops, speeds = survey.stops_and_speeds(inputs, located.rough, config)
+    path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.least_motion)
     driven = _travel_between_fixes(inputs)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
-    scale = path_length / driven if long and driven else placed.rough or None
+    scale = path_length / driven if long and driven else located.rough or None
     # speeds with the printed scale
-    scale_ratio = scale / placed.rough if scale and placed.rough else 1.0
+    scale_ratio = scale / located.rough if scale and located.rough else 1.0
     found['drive'] = {
-        'distance': path_length, 'chord': chord, 'fix_sigma': placed.fix_sigma,
+        'distance': path_length, 'chord': chord, 'fix_sigma': located.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': speeds[0] * scale_ratio, 'fastest': speeds[1] * scale_ratio,
         'usable_fixes': len(inputs.t_fix), 'travel': driven}
@@ -94,9 +94,9 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
     found['standstills'] = [[base + a, base + b] for a, b in stops.tolist()]
-    return [*options, *_axis_options(inputs, placed, w_i, f_i, config, found, findings),
+    return [*options, *_axis_options(inputs, located, w_i, f_i, config, found, findings),
             *_sigma_limit(recorder, config),
-            *_describe_legs(bag, recorder, inputs, placed, stops, first, config, found)]
+            *_describe_legs(bag, recorder, inputs, located, stops, first, config, found)]
 
 
 def _travel_between_fixes(inputs: Inputs) -> float:
@@ -136,7 +136,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     return ['gnss.max_sigma=nan'] if kept < all_count / 2 else []
 
 
-def _axis_options(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Config,
+def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, config: Config,
                   found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return settings for odometer sign and IMU orientation; check the gyro."""
     set_already = bool(np.any(config.imu.mounting_rpy))
@@ -145,7 +145,7 @@ def _axis_options(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, conf
     if not set_already and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
-    m = mounting(inputs.t_imu, w_i, f_i, travel, placed.rough or 1.0)
+    m = mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
     if not inputs.has_accelerometer:
         m = replace(m, C_bi=None)      # gravity is assumed
     agrees = m.C_bi is not None and np.allclose(
@@ -156,9 +156,9 @@ def _axis_options(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, conf
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    orientation = estimate_orientation(inputs, placed.rough) \
-        if inputs.has_accelerometer and placed.rough else None
-    ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, orientation,
+    orientation = estimate_orientation(inputs, located.rough) \
+        if inputs.has_accelerometer and located.rough else None
+    ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
                                  config.imu.gyro_scale)
     found['drive']['gyro_over_course'] = ratio
     findings += axis_faults
@@ -168,8 +168,8 @@ def _axis_options(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, conf
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
-def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests: Floats,
-                   first: int, config: Config, found: dict[str, Any]) -> list[str]:
+def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: LocatedFixes,
+                   rests: Floats, first: int, config: Config, found: dict[str, Any]) -> list[str]:
     """Return the legs that replay would use, and better ones for the two-point method."""
     if not len(inputs.t_fix):
         return []
@@ -178,7 +178,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Plac
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         in_leg = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
-        path_length, chord = path_and_chord(inputs.t_fix[in_leg], placed.fixes_n[in_leg],
+        path_length, chord = path_and_chord(inputs.t_fix[in_leg], located.fixes_n[in_leg],
                                             inputs.least_motion)
         return {'start': base + start, 'stop': base + stop, 'distance': path_length,
                 'chord': chord} | more
@@ -192,7 +192,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Plac
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(rests, *ends)
-            for ends in survey.straight_stretches(inputs, placed, config.leg.min_distance)[:5])]
+            for ends in survey.straight_stretches(inputs, located, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
     if marks or config.method != 'two_point' or not all(is_closed(leg) for leg in found['legs']):
         return []

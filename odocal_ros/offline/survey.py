@@ -14,7 +14,7 @@ from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, Odomet
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
 from odocal_ros.screening.fix_screen import has_position, median_origin, usable_fixes
 from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
-from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.config import Config, GnssConfig
 from odocal_ros.settings.nominal import G
@@ -216,27 +216,27 @@ def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floa
             [float(speed.min()), float(speed.max())] if len(t) else [0.0, 0.0])
 
 
-def straight_stretches(inputs: Inputs, placed: Placed,
+def straight_stretches(inputs: Inputs, located: LocatedFixes,
                        shortest: float) -> list[tuple[float, float]]:
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
-    if not placed.rough or len(inputs.t_fix) < 3:
+    if not located.rough or len(inputs.t_fix) < 3:
         return []
     points = 600    # fixes tested for straight sections, evenly selected
     pick = np.unique(np.linspace(0, len(inputs.t_fix) - 1, points).astype(int))
-    t, p = inputs.t_fix[pick], placed.fixes_n[pick, :2]
+    t, p = inputs.t_fix[pick], located.fixes_n[pick, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
     is_long = chord >= shortest
     # the rough scale cuts corners; the straightest sections determine it best
     ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
-    path_length = travel * max(placed.rough, min(best, 1.2 * placed.rough))
+    path_length = travel * max(located.rough, min(best, 1.2 * located.rough))
     # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
     # both end points have errors of sigma: a section within these errors is accepted
-    fit = np.triu((chord >= straight * path_length - placed.fix_sigma)
+    fit = np.triu((chord >= straight * path_length - located.fix_sigma)
                   & (path_length >= shortest)
-                  & (chord <= path_length / straight + 4 * placed.fix_sigma))
+                  & (chord <= path_length / straight + 4 * located.fix_sigma))
     found: list[tuple[float, float]] = []
     while fit.any():
         i, j = np.unravel_index(np.argmax(np.where(fit, path_length, 0)), fit.shape)

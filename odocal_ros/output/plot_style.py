@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures in one style: as SVG elements of a page, or as separate files."""
+"""Style of all figures, thinning of lines, units of axes, and figures as SVG text or files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -180,7 +180,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
 def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
                          config: Config) -> HeadingOrRefusal:
     if source == 'heading_topic':
-        sent, t = inputs.outside['heading']
+        sent, t = inputs.external['heading']
         return _heading_from_orientations(t, sent.q_ni, sent.yaw_variance, np.eye(3), level,
                                           config, config.alignment.heading_offset)
     if source == 'imu_orientation':

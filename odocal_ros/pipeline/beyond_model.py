@@ -18,7 +18,7 @@ from odocal_ros.calib.value_limits import check_limits, speed_unit
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.pipeline.prepared_leg import PreparedLeg
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 SCALES = ('scale_factor', 'scale_ratio')
@@ -50,8 +50,8 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
         details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
-        border=method.border and method.border.loosened({'scale_factor':
-                                                         relative['scale_factor']}),
+        marginal=method.marginal and method.marginal.loosened(
+            {'scale_factor': relative['scale_factor']}),
         reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
                  *sigma_reasons))
 
@@ -102,9 +102,9 @@ def with_truncation(method: MethodResult, prepared: PreparedLeg) -> MethodResult
                             shared=True)
 
 
-def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
+def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     """Return the reasons for coarse steps of speed or counts."""
-    K, size = placed.nominal or placed.rough, half_step(inputs)
+    K, size = located.nominal or located.rough, half_step(inputs)
     count = inputs.travel.quantum * K
     coarse_count_m = 0.2    # m, least size of a coarse count
     if count > coarse_count_m:
@@ -114,7 +114,7 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
-    sent = _speed_text(coarse.step, placed.rough, inputs.scale_unit)
+    sent = _speed_text(coarse.step, located.rough, inputs.scale_unit)
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{sent}; half a step is added in the direction of the last change')]

@@ -29,7 +29,7 @@ from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
 from odocal_ros.screening.imu_orientation import unit_and_axis_reasons, UNUSABLE
-from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.screening.inputs import Inputs, locate_fixes
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, reversing_reasons, sections_slipped_twice
 from odocal_ros.screening.screen import screen_aligned
@@ -179,8 +179,8 @@ def _imu_gaps(leg: Leg, limit_s: float) -> Ints:
 def _carried_sections(leg: Leg, config: Config) -> Ints:
     """Return begin and end of motion without counts, ns: (k, 2)."""
     inputs = screen_leg(leg, config).inputs
-    placed = place(inputs, settings_by_frame(leg.fix, config))
-    spans = ferry_intervals(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
+    located = locate_fixes(inputs, settings_by_frame(leg.fix, config))
+    spans = ferry_intervals(inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma)
     return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
 
 

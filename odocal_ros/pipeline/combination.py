@@ -58,7 +58,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     methods = {name: _combine_method(name, [
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and name in leg.methods], config, before) for name in method_names}
-    on_border = {name for leg in used for name, m in leg.methods.items() if m.border}
+    on_border = {name for leg in used for name, m in leg.methods.items() if m.marginal}
     estimates, estimating_methods = choose(methods, config.method)
     reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
                            before is not None)
@@ -90,9 +90,9 @@ def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Seq
     combined = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
-    if combined is None or combined.border is None or not times:
+    if combined is None or combined.marginal is None or not times:
         return None
-    return CarriedInformation(combined.border, combined.estimates['scale_factor'].unit,
+    return CarriedInformation(combined.marginal, combined.estimates['scale_factor'].unit,
                               before.first_ns if before else min(times), max(times),
                               len(times) + (before.legs if before else 0))
 
@@ -112,13 +112,13 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
                     config: Config, numbers: Sequence[int] | None = None,
                     carried: CarriedInformation | None = None) -> MethodResult:
     """Return the result of a method for several legs, including carried ones if possible."""
-    if carried and all(r.border for r in results):
+    if carried and all(r.marginal for r in results):
         unknown = {parameter: Estimate(None, None, e.unit)
                    for parameter, e in results[0].estimates.items()}
-        results = [MethodResult(name, (), unknown, border=carried.border), *results]
+        results = [MethodResult(name, (), unknown, marginal=carried.marginal), *results]
         numbers = [0, *(numbers or range(1, len(results)))]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
-    if len(results) > 1 and all(r.border for r in results):
+    if len(results) > 1 and all(r.marginal for r in results):
         from odocal_ros.estimator.several import combine_legs
         return combine_legs(results, times_ns, config, numbers)
     ago_ns = max(times_ns) - np.asarray(times_ns)
@@ -154,7 +154,7 @@ def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
                                        for r in relevant_reasons(_additional_reasons(m, leg),
                                                                  m.name, estimates)
                                        if is_single or r.code not in SINGLE_LEG_CODES
-                                       and not (m.border and r.code in COMBINED_CODES))]
+                                       and not (m.marginal and r.code in COMBINED_CODES))]
         if leg in overlapping:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
         elif usable and leg not in usable:

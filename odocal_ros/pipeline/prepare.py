@@ -29,7 +29,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.axles import pair_wheels
 from odocal_ros.screening.imu_faults import forward_turn_reasons
-from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
@@ -47,16 +47,16 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     so far.   alignment : used instead of the leg's own.   holdout : hold the last fifth of the
     distance out of the fit.
     """
-    placed = place(inputs, config)
+    located = locate_fixes(inputs, config)
     release_mapped_memory()
-    refusal_reasons = _missing_drive_reasons(inputs, placed)
+    refusal_reasons = _missing_drive_reasons(inputs, located)
     if refusal_reasons is not None:
         return None, (*reasons, *refusal_reasons)
-    accelerations = (imu_orientation.accelerations(inputs, placed.rough)
+    accelerations = (imu_orientation.accelerations(inputs, located.rough)
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *odometer_span_reasons(inputs.travel, inputs.t_stop))
-    axis_faults = forward_turn_reasons(accelerations) or turning(inputs, placed, orientation,
+    axis_faults = forward_turn_reasons(accelerations) or turning(inputs, located, orientation,
                                                          config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
@@ -64,39 +64,39 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
-    prepared = _dead_reckoned(leg, inputs, config, placed, orientation, reasons, alignment,
+    prepared = _dead_reckoned(leg, inputs, config, located, orientation, reasons, alignment,
                               holdout)
     return prepared, prepared.reasons
 
 
-def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
+def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFixes,
                    orientation: imu_orientation.ImuOrientation | None, reasons: Sequence[Reason],
                    alignment: Alignment | None, holdout: bool) -> PreparedLeg:
-    spans = inputs.standstills(placed.rough, config)
+    spans = inputs.standstills(located.rough, config)
     alignment_reasons: tuple[Reason, ...] = ()
     is_own_alignment = alignment is None
     if alignment is None:
-        alignment, alignment_reasons = align(inputs, spans, placed.rough, placed.fixes_n,
-                                             placed.origin, config)
+        alignment, alignment_reasons = align(inputs, spans, located.rough, located.fixes_n,
+                                             located.origin, config)
     release_mapped_memory()
     gap_reasons = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
-    epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
+    epochs = attitude_of(inputs, located.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     if is_own_alignment:
         alignment = with_observed_walk(alignment, inputs, spans, epochs,
-                                       placed.origin.earth_rate_n)
+                                       located.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
-    wheel_reasons, wheel_slips = _compare_wheels(inputs, config, placed, track, reasons)
-    distance, drive_reasons = check_drive(track, inputs.t_stop, placed.rough, config.leg)
+    wheel_reasons, wheel_slips = _compare_wheels(inputs, config, located, track, reasons)
+    distance, drive_reasons = check_drive(track, inputs.t_stop, located.rough, config.leg)
     # only methods by end points need straight legs
     end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
-        **vars(placed), leg=leg, inputs=inputs, config=config, facing=orientation,
+        **vars(located), leg=leg, inputs=inputs, config=config, imu_orientation=orientation,
         lever_b=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
         alignment=alignment, alignment_reasons=alignment_reasons, epochs=epochs, track=track,
-        wheel_slips=wheel_slips, metres_per_unit=placed.rough, distance=distance,
+        wheel_slips=wheel_slips, metres_per_unit=located.rough, distance=distance,
         t_fit=_time_of_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop,
         holdout=holdout,
-        reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, placed), *wheel_reasons,
+        reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, located), *wheel_reasons,
                  *(r for r in drive_reasons if r not in end_reasons)), end_reasons=end_reasons)
 
 
@@ -108,11 +108,11 @@ def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
         *(r for r in prepared.reasons if r.code not in SCALE_LIMIT_CODES), *drive_reasons))
 
 
-def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
+def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    refusal_reasons = motion_reasons(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
-                                     inputs.t_stop, inputs.least_motion)
-    if refusal_reasons or not placed.rough:
+    refusal_reasons = motion_reasons(inputs.travel, inputs.t_fix, located.fixes_n,
+                                     located.fix_sigma, inputs.t_stop, inputs.least_motion)
+    if refusal_reasons or not located.rough:
         return refusal_reasons or (Reason(
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
             'Drive farther between the marks. If the vehicle did, check the receiver (static '
@@ -124,7 +124,7 @@ def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...]
     return None
 
 
-def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track,
+def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track: Track,
                     reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
     fixed = [axle for axle in pair_wheels(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
@@ -134,7 +134,7 @@ def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track
     odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
     found, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
-        placed.origin.latitude, placed.rough, odometer.track_width, inputs.uncertain_t,
+        located.origin.latitude, located.rough, odometer.track_width, inputs.uncertain_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
     return tuple(chain(*found)), join_axles(wheel_slips, count)
 

@@ -38,7 +38,7 @@ from odocal_ros.nav.strapdown import attitude
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import ImuOrientation
-from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.config import Config
 
 # called with the number of passes, and Stage.change
@@ -90,13 +90,13 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLeg(Placed):
+class PreparedLeg(LocatedFixes):
     """Input of all methods. They do not change it, so their order has no effect."""
 
     leg: Leg                             # raw
     inputs: Inputs                       # screened
     config: Config
-    facing: ImuOrientation | None                # IMU orientation, None if not determined
+    imu_orientation: ImuOrientation | None                # IMU orientation, None if not determined
     lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
     spans: NDArray[np.float64]           # (s, 2) s, standstills
     alignment: Alignment

@@ -87,7 +87,7 @@ class TwoPointRun:
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
-        forward = corrected_forward_axis(self.prepared.facing, f)
+        forward = corrected_forward_axis(self.prepared.imu_orientation, f)
         slips = slip_check(self.prepared, self.track, forward, ends)
         self.slip = slip_reasons(slips, self.config.odometer.time_offset)
         one = self.prepared.wheel_slips      # of one wheel: its share in the mean
@@ -185,7 +185,8 @@ class TwoPointRun:
     def _check_counting_direction(self, chord: Chord) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
-        if backwards and self.prepared.facing is None and not chord.alignment.heading_separable:
+        if (backwards and self.prepared.imu_orientation is None
+                and not chord.alignment.heading_separable):
             self.found.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
                 'mean backwards, or the vehicle reversed during the whole leg'))

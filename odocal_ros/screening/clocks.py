@@ -29,7 +29,7 @@ from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 
@@ -174,7 +174,7 @@ def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
     return np.array(at, np.int64), np.array(moved)
 
 
-def late_clocks(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
+def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, float]]:
     """Yield the clocks that are late relative to the IMU, and by how much, s; < 0: early."""
     t, travel, t_fix = inputs.t_imu, inputs.travel, inputs.t_fix
     if not inputs.has_accelerometer or min(len(t), len(travel.t), len(t_fix)) < 2:
@@ -189,7 +189,7 @@ def late_clocks(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
                       _without_slow_changes(force, SLOW_FORCE))
     if odometer:
         yield 'odometer', odometer
-    place = np.stack([np.interp(edges, t_fix, axis) for axis in placed.fixes_n[:, :2].T], -1)
+    place = np.stack([np.interp(edges, t_fix, axis) for axis in located.fixes_n[:, :2].T], -1)
     fix = _delay(_without_slow_changes(_chords(place), SLOW_SPEED),
                  _without_slow_changes(_chords(travel.at(edges)[:, None]), SLOW_SPEED), odometer)
     if fix:

@@ -47,7 +47,7 @@ class Inputs:
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
     rounding_n: NDArray[np.float64]    # (k, 3) m^2, part of these variances by rounding
-    outside: Mapping[str, UsableRows]      # of the other sensors, by slot
+    external: Mapping[str, UsableRows]     # heading, fix velocity, pressure ..., by slot
     fixes_rejected: int
     scale_unit: str
     has_accelerometer: bool = True     # False: f_b is assumed gravity
@@ -84,8 +84,8 @@ class Inputs:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Fixes in metres, and the approximate scale."""
+class LocatedFixes:
+    """The fixes in the Cartesian frame n, and the approximate scale of the odometer."""
 
     origin: Origin                     # of n
     fixes_n: NDArray[np.float64]       # (k, 3) m, NaN up if a fix has no height
@@ -94,11 +94,11 @@ class Placed:
     rough: float                       # scale by the fixes, K0 if they move too little
 
 
-def place(inputs: Inputs, config: Config) -> Placed:
-    """Return the fix positions of screened inputs and the metres per count."""
+def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
+    """Return the fixes in a frame n at their median position, and the approximate scale."""
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):
-        return Placed(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
+        return LocatedFixes(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
     origin = median_origin(inputs.t_fix, inputs.geodetic)
     if inputs.local:
         latitude = np.deg2rad(config.reference.latitude_deg)
@@ -111,4 +111,4 @@ def place(inputs: Inputs, config: Config) -> Placed:
     sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
     rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
                         inputs.least_motion) or nominal
-    return Placed(origin, fixes_n, sigma, nominal, rough)
+    return LocatedFixes(origin, fixes_n, sigma, nominal, rough)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import by_row, Floats, median, release_mapped_memory
-from odocal_ros.data.inputs import INPUTS, OUTSIDE
+from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -35,7 +35,7 @@ from odocal_ros.screening.glitches import (
     without_invalid_orientations,
 )
 from odocal_ros.screening.imu_faults import alternating_imu_reasons, other_frame_reasons
-from odocal_ros.screening.inputs import Inputs, place, UsableRows
+from odocal_ros.screening.inputs import Inputs, locate_fixes, UsableRows
 from odocal_ros.screening.leg_kind import with_assumed_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
 from odocal_ros.screening.rounded_fixes import rounding_variance
@@ -87,7 +87,7 @@ def screen(leg: Leg, config: Config,
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
     """Return a leg with all stamps on the clock of the IMU, its inputs, and reasons of both."""
     inputs, reasons = screen(leg, config)
-    found, late_by = [], dict(late_clocks(inputs, place(inputs, config)))
+    found, late_by = [], dict(late_clocks(inputs, locate_fixes(inputs, config)))
     for clock, late in late_by.items():
         slots = [slot for slot, one in INPUTS.items() if one.clock == clock]
         by_ns = -round(late * 1e9)
@@ -121,7 +121,7 @@ class Usable:
     wheels: Wheels
     fix: FixSamples
     t_fix: Floats
-    outside: dict[str, UsableRows]
+    external: dict[str, UsableRows]
 
 
 def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> Usable:
@@ -135,17 +135,17 @@ def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -
 
     imu, t_imu = rows('imu')
     t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
-    outside = {slot: rows(slot) for slot in OUTSIDE}
+    external = {slot: rows(slot) for slot in EXTERNAL_SLOTS}
     release_mapped_memory()
     travelled = travel_of_wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]
-    return Usable(imu, t_imu, travelled, *rows('fix'), outside)
+    return Usable(imu, t_imu, travelled, *rows('fix'), external)
 
 
 def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[str, Any]:
     """Return fixes and other sensors as fields of Inputs; add the reasons for unused ones."""
-    fix, outside, velocity = rows.fix, rows.outside, rows.outside['fix_velocity']
+    fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
     found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
@@ -162,9 +162,9 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     ) if config.gnss.use_velocity else ()
     found += contradiction
     if contradiction:
-        outside = outside | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
+        external = external | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
-            'rounding_n': rounding, 'outside': outside,
+            'rounding_n': rounding, 'external': external,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
 
 
@@ -190,14 +190,14 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
     """Return inputs with the counts of starts in reverse made negative; add the reason."""
     back = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
                            (0.0, inputs.t_stop))
-    metres = place(inputs, config).rough or None if len(back) else None
+    metres = locate_fixes(inputs, config).rough or None if len(back) else None
     found += reversing_reasons(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
     return inputs.mirrored(back)
 
 
 def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
-    placed = place(inputs, config)
-    if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
+    located = locate_fixes(inputs, config)
+    if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
     rate = by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
     # the median is the bias: drives have straights, and turns to both sides
@@ -205,10 +205,10 @@ def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) 
     t = inputs.t_imu[::1 + len(inputs.t_imu) // TRACK_ROWS]
     heading = np.exp(1j * integral_at(t, inputs.t_imu, rate))
     x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-    steps = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
+    steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = dead_reckoned_fixes(inputs.t_fix, placed.fixes_n, sigma,
+    lost, why = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
                                     np.interp(inputs.t_fix, t, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],

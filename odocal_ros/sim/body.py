@@ -27,7 +27,7 @@ KNEELING_TIME = 2.0   # s, judgement: of the kneeling or rising of a bus
 def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = None,
           lean: Profile | None = None) -> tuple[Profile, Profile]:
     """
-    Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
+    Return roll and pitch of the body relative to the vehicle by time, rad, fixed-axis angles.
 
     lean : of the road, included in the roll. The component of gravity along a slope or a lean acts
     like an acceleration. Both axles are on the road: the body is parallel to the chord of the
@@ -38,17 +38,18 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
     step = 0.005 if hills.kerbs else 0.02
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
-    here, here_by, _ = hills(s)
-    chord, chord_by = hills.chord(s, wheelbase) if wheelbase else (here, here_by)
-    forward = speed.derivative().mean(t) + G * here
+    # slopes at the rear axle and of the chord of the wheelbase, and derivatives by path length
+    slope, slope_by_path, _ = hills(s)
+    chord, chord_by_path = hills.chord(s, wheelbase) if wheelbase else (slope, slope_by_path)
+    forward = speed.derivative().mean(t) + G * slope     # m/s^2
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung_response(real.body_roll * side_force(speed, yaw_rate, lean, t)
                                       + real.kneeling * kneeling_degree(speed, t), step)
     pitch, pitch_rate = sprung_response(-real.squat * forward, step)
     if lean:
         roll, roll_rate = roll + lean(t), roll_rate + lean.derivative()(t)
-    return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - here),
-                                                pitch_rate - (chord_by - here_by) * v)
+    return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - slope),
+                                                pitch_rate - (chord_by_path - slope_by_path) * v)
 
 
 def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Floats) -> Floats:
@@ -77,7 +78,11 @@ def road_lean(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
 
 
 def sprung_response(push: Floats, step: float) -> tuple[Floats, Floats]:
-    """Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u``, u linear between rows (n,)."""
+    """
+    Return value and rate, (n,) each, of ``y'' + 2 z w y' + w^2 y = w^2 u`` from rest.
+
+    push : (n,) u, the static tilt, rad, linear between rows.   step : s, between rows.
+    """
     w, z = FREQUENCY, DAMPING
     wd = w * np.sqrt(1 - z**2)
     decay, s, c = np.exp(-z * w * step), np.sin(wd * step), np.cos(wd * step)
@@ -110,7 +115,7 @@ def rotation(motion: Motion, t: Floats) -> Floats:
 
 def imu_output(motion: Motion, state: State,
                lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """Return turn rate, rad/s, specific force, m/s^2, in body axes; arm m, body level."""
+    """Return turn rate, rad/s, and specific force, m/s^2, in body axes; lever arm at rest, m."""
     w_v, f_v = inertial_v(state, lever_arm)
     if not motion.tilt:
         return w_v, f_v
@@ -120,11 +125,13 @@ def imu_output(motion: Motion, state: State,
     dr, dp = (rate(t) for rate in rates)
     ddr, ddp = (rate.derivative().mean(t) for rate in rates)
     s, c = np.sin(roll), np.cos(roll)
+    # turn rate of the body relative to the vehicle, in body axes, and its derivative
     w_r = np.stack([dr, dp * c, -dp * s], -1)
     dw_r = np.stack([ddr, ddp * c - dp * dr * s, -ddp * s - dp * dr * c], -1)
     arm_v = R @ arm
     w_rv = np.einsum('nij,nj->ni', R, w_r)
     moved, turning = arm_v - arm, np.cross(w_rv, arm_v)
+    # the arm moved by the tilt: Euler, centrifugal and Coriolis terms
     dw_v = np.gradient(w_v, t, axis=0) if len(t) > 1 else np.zeros_like(w_v)
     f_v = (f_v + np.cross(dw_v, moved) + np.cross(w_v, np.cross(w_v, moved))
            + 2 * np.cross(w_v, turning) + np.cross(np.einsum('nij,nj->ni', R, dw_r), arm_v)

@@ -95,9 +95,9 @@ NO_SCATTER = 1e-9, 1e-9, 1e-9       # of ln K, yaw and pitch between legs
 
 def moved(result, name, by):
     """Return a result whose border has another value of a constant."""
-    border = result.border
+    border = result.marginal
     at = np.arange(len(border.names)) == border.names.index(name)
-    return replace(result, border=replace(border, value=border.value + by * at))
+    return replace(result, marginal=replace(border, value=border.value + by * at))
 
 
 def leg_result(method, number, *codes):

@@ -14,7 +14,7 @@ from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.inputs import place
+from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim import body, motion, sensors
 from odocal_ros.sim.noise import random_walk, stream
@@ -49,10 +49,10 @@ def reason_texts(result):
 def leg_of(leg, config):
     """Return the smoother's view of a leg."""
     inputs, _ = screen(leg, config)
-    placed = place(inputs, config)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
+    located = locate_fixes(inputs, config)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough,
                         config.leg.standstill)
-    return make_smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
+    return make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans, located.rough)
 
 
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):

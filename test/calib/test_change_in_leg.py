@@ -99,7 +99,7 @@ def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
     sigma = np.sqrt(whole.covariance[m, m])
     assert step.sigma == pytest.approx(sigma, rel=2e-3)
     # the other unknowns are at their minimum to the limit of convergence
-    assert step.size == pytest.approx(whole.step_border[m], abs=CONVERGENCE.moves * sigma)
+    assert step.size == pytest.approx(whole.step_border[m], abs=CONVERGENCE.max_step * sigma)
 
 
 def test_a_shortened_last_step_does_not_change_the_steps(fitted):

@@ -54,7 +54,7 @@ def integrals(T, terms=12):
 
 
 def summed(leg, t_points=(), constants=None):
-    imu = ImuSteps.of(leg, 1.0)
+    imu = ImuSteps.from_leg(leg, 1.0)
     K = len(imu.key) - 1
     return imu, *preintegrate(imu, np.tile(BIAS, (K, 1)), np.tile(FORCE_BIAS, (K, 1)),
                               lambda t: SPEED * t, np.array([1.0, 0.0, 0.0]),
@@ -112,7 +112,7 @@ SECOND = 0.62**2 * 10.0 / 12
 
 
 def test_the_angles_of_a_constant_turn_scatter_by_their_closed_form():
-    imu = ImuSteps.of(turning(np.arange(0.0, 5.001, 0.01)), 1.0)
+    imu = ImuSteps.from_leg(turning(np.arange(0.0, 5.001, 0.01)), 1.0)
     turn = RATE + BIAS
     # of an angle that grows evenly over 1 s, of means of steps: 1 / 12 less STEP^2 / 12
     want = np.outer(turn, turn) * (1 - STEP**2) / 12
@@ -128,7 +128,7 @@ def test_coning_at_the_sample_rate_is_in_the_steps():
             [np.cos(spin * t), np.sin(spin * t), 0 * t], -1))
     d = 1e-5
     w_b = (attitude(t - d).inv() * attitude(t + d)).as_rotvec() / (2 * d)
-    imu = ImuSteps.of(samples(t, w_b, np.zeros((len(t), 3))), 1.0)
+    imu = ImuSteps.from_leg(samples(t, w_b, np.zeros((len(t), 3))), 1.0)
     R = np.eye(3)
     for turn in imu.turn:
         R = R @ exp_so3(turn)
@@ -140,28 +140,28 @@ def test_coning_at_the_sample_rate_is_in_the_steps():
 
 def test_steps_are_a_tenth_of_a_second_and_end_at_keyframes_but_in_gaps_and_of_rare_samples():
     t = np.arange(0.0, 4.001, 0.01)
-    imu = ImuSteps.of(turning(t), 1.0)
+    imu = ImuSteps.from_leg(turning(t), 1.0)
     np.testing.assert_allclose(np.diff(imu.t), STEP, atol=1e-9)
     np.testing.assert_allclose(imu.t[imu.key], np.arange(5.0), atol=1e-9)
     np.testing.assert_allclose(imu.longest, 0.01, atol=1e-9)
-    imu = ImuSteps.of(turning(t[(t < 1.33) | (t > 1.78)]), 1.0)
+    imu = ImuSteps.from_leg(turning(t[(t < 1.33) | (t > 1.78)]), 1.0)
     k = int(np.argmax(imu.longest))
     assert imu.longest[k] == pytest.approx(0.46, abs=0.011)
     assert imu.t[k] <= 1.33
     assert imu.t[k + 1] >= 1.78
     assert np.delete(np.diff(imu.t), k).max() < 2 * STEP
     rare = np.arange(0.0, 30.0, 0.25)
-    np.testing.assert_array_equal(ImuSteps.of(turning(rare), 1.0).t, rare)
+    np.testing.assert_array_equal(ImuSteps.from_leg(turning(rare), 1.0).t, rare)
 
 
 def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
     t = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(3)
     leg = samples(t, 0.2 * rng.standard_normal((len(t), 3)), rng.standard_normal((len(t), 3)))
-    whole = ImuSteps.of(leg, 1.0)
+    whole = ImuSteps.from_leg(leg, 1.0)
     monkeypatch.setattr('odocal_ros.estimator.imu.SAMPLES_IN_CACHE', 33)
     monkeypatch.setattr('odocal_ros.estimator.imu.KEYFRAMES_IN_CACHE', 3)
-    parts = ImuSteps.of(leg, 1.0)
+    parts = ImuSteps.from_leg(leg, 1.0)
     for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)
 

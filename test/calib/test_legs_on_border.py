@@ -38,7 +38,7 @@ def legs():
 
 def by_border(one, i):
     """Return value and sigma of ln K, yaw or pitch that the border of a result gives."""
-    found = fit_jointly([one.border], [])
+    found = fit_jointly([one.marginal], [])
     # sizes are of the vehicle's priors, of which a border has none
     of_sizes, = (s.effects[i] for s in one.sources if s.name == 'imperfection_sizes')
     return found.value[i], np.sqrt(
@@ -59,8 +59,8 @@ def test_legs_of_the_smoother_add_up_their_information(legs, monkeypatch):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
     # one size of each imperfection, whichever leg it is of
-    used = np.max([b.used for b in several._share_sizes([r.border for r in results])], axis=0)
-    C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
+    used = np.max([b.used for b in several._share_sizes([r.marginal for r in results])], axis=0)
+    C = np.linalg.inv(sum(r.marginal.information for r in results) + np.diag(1 / used**2))
     sigma = np.hypot(np.sqrt(np.diag(C))[:3], MODEL_FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
     assert whole.estimates[YAW].sigma == pytest.approx(sigma[1], rel=1e-3)
@@ -90,10 +90,10 @@ def test_a_shared_source_is_what_an_error_of_that_belief_does(legs, monkeypatch)
     _, config, results = legs
 
     def combined(name, sigmas):
-        at = results[0].border.names.index(name)
-        moved = [r.border.centre + sigmas * r.border.used[at] * np.eye(len(r.border.names))[at]
-                 for r in results]
-        return combine_legs([replace(r, border=replace(r.border, centre=c)) for r, c in
+        at = results[0].marginal.names.index(name)
+        unit = np.eye(len(results[0].marginal.names))[at]
+        moved = [r.marginal.centre + sigmas * r.marginal.used[at] * unit for r in results]
+        return combine_legs([replace(r, marginal=replace(r.marginal, centre=c)) for r, c in
                              zip(results, moved, strict=True)], [0, 1, 2], config)
     before, after = (combined('gnss_delay', sigmas) for sigmas in (0.0, 1.0))
     (effect,) = [s.effects[:, 0] for s in before.sources if s.name == 'fix_latency']
@@ -171,8 +171,8 @@ def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
 
     def refused(one):
         """Return a result whose yaw is told to 0.8 deg only, as on a drive straight on."""
-        loose = one.border.loosened({YAW: 0.014})
-        return replace(one, border=loose, estimates=one.estimates | {
+        loose = one.marginal.loosened({YAW: 0.014})
+        return replace(one, marginal=loose, estimates=one.estimates | {
             YAW: Estimate(None, None, 'rad')}, reasons=(Reason(Code.YAW_NOT_DETERMINED, 'no'),))
     whole = combine([leg_result(refused(one), i) for i, one in enumerate(results)], config)
     assert whole.estimates[YAW].sigma == pytest.approx(0.014 / np.sqrt(3), rel=0.01)

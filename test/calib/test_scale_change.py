@@ -171,7 +171,7 @@ def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
     config = with_settings(config, {'leg.automatic': False, 'vehicle': 'van'})
     legs = legs_of(results)
     own, imu = imu_of(legs[:2], config, tmp_path)
-    assert {name.split('_')[0] for name in imu.border.names} == {'gyro', 'accelerometer'}
+    assert {name.split('_')[0] for name in imu.marginal.names} == {'gyro', 'accelerometer'}
     # a leg that is in it already does not count twice, an IMU of another vehicle not at all
     assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
         1].estimates[YAW].sigma
@@ -188,5 +188,5 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
     found = combine(legs[2:], config, read_carried(json.loads(json.dumps(
         add_to_carried(legs[:2], config).as_dict()))))
     compare(found, whole, 0.1)
-    evidence = found.carried.border.evidence
+    evidence = found.carried.marginal.evidence
     assert set(evidence) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}

@@ -193,9 +193,9 @@ def test_rows_without_a_possible_value_are_left_out():
     leg = leg.with_rows(fix_velocity=changed(sent, velocity_n=spoil),
                         pressure=replace(pressure, value=pressure.value / 100))     # in hPa
     inputs, found = screen(leg, config)
-    assert len(inputs.outside['fix_velocity'].t) == len(sent.stamp_ns) - 3
+    assert len(inputs.external['fix_velocity'].t) == len(sent.stamp_ns) - 3
     assert any('3 of' in r.text and 'GNSS velocity messages' in r.text for r in found)
-    assert not len(inputs.outside['pressure'].t)
+    assert not len(inputs.external['pressure'].t)
     assert any('air pressure messages hold NaN, Inf or an impossible value' in r.text
                for r in found)
     assert 'pressure' not in leg_of(leg, config).external

@@ -190,7 +190,7 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     for wrong, refused in ((0.19, False), (0.21, True)):
         c = np.zeros(M)
         c[ACCEL.start + 1] = -wrong
-        fit = SimpleNamespace(settled=True, state=SimpleNamespace(constants=c))
+        fit = SimpleNamespace(converged=True, state=SimpleNamespace(constants=c))
         monkeypatch.setattr(smoother, 'best_fit', lambda *_, fit=fit: fit)
         monkeypatch.setattr(smoother, 'make_result', lambda *_: None)
         method = smooth(leg, config)

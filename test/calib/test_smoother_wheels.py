@@ -196,17 +196,17 @@ def leg_of(wheels):
 
 def test_several_legs_are_a_mean_by_variance():
     one, other = pair(delta=2e-3, sigma=1e-5), pair(delta=2.01e-3, sigma=2e-5, width=1.601)
-    left, right = wheel_result.joined([leg_of(one), leg_of({}), leg_of(other)]).values()
+    left, right = wheel_result.combine_wheels([leg_of(one), leg_of({}), leg_of(other)]).values()
     weight = np.array([4.0, 1.0]) / 5
     both = [legs['left'].ratio for legs in (one, other)]
     assert left.ratio == pytest.approx(weight @ both, rel=1e-12)
     assert left.ratio_sigma == pytest.approx(1e-5 / np.sqrt(1.25))
     assert left.y - right.y == pytest.approx(1.6005)
-    assert wheel_result.joined([leg_of({}), leg_of({})]) == {}
+    assert wheel_result.combine_wheels([leg_of({}), leg_of({})]) == {}
 
 
 def test_legs_that_differ_widen_the_sigma():
     legs = [leg_of(pair(delta=delta, sigma=1e-5)) for delta in (1e-3, 2e-3, 3e-3)]
-    left, _ = wheel_result.joined(legs).values()
+    left, _ = wheel_result.combine_wheels(legs).values()
     # 1 permille apart beside 10 ppm: their scatter decides
     assert left.ratio_sigma == pytest.approx(1e-3 / np.sqrt(3), rel=0.01)

@@ -142,8 +142,8 @@ def test_legs_from_text_combine_to_the_same_digits():
     found, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
     assert found == known
     assert found['result']['scale_factor']['method'] == 'smoother'
-    assert again[0].methods['smoother'].border.information.tobytes() == \
-        legs[0].methods['smoother'].border.information.tobytes()
+    assert again[0].methods['smoother'].marginal.information.tobytes() == \
+        legs[0].methods['smoother'].marginal.information.tobytes()
 
 
 @pytest.mark.parametrize(('argv', 'what'), [

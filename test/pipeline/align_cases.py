@@ -17,7 +17,7 @@ from odocal_ros.nav.rotations import (
     transpose,
 )
 from odocal_ros.pipeline.align import align
-from odocal_ros.screening.inputs import place
+from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.motion import attitude
@@ -45,8 +45,8 @@ class Case:
                 leg = kept(leg, slot, leg.rows(slot).stamp_ns >= start_ns)
         self.mark = (start_ns - self.drive.options.start_ns) * 1e-9     # s of the motion
         self.inputs, _ = screen(leg, self.config)
-        placed = place(self.inputs, self.config)
-        self.origin, self.fixes_n = placed.origin, placed.fixes_n
+        located = locate_fixes(self.inputs, self.config)
+        self.origin, self.fixes_n = located.origin, located.fixes_n
         self.scale = self.drive.truth.scale
         self.spans = self.inputs.standstills(self.scale, self.config)
 

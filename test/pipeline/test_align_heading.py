@@ -60,7 +60,7 @@ def heading_rows(yaw, variance, t):
     q = quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
     stamp_ns = np.round(t * 1e9)
     sent = HeadingSamples(stamp_ns, stamp_ns, q, np.full(len(t), variance))
-    return {'outside': {'heading': UsableRows(sent, t)}}
+    return {'external': {'heading': UsableRows(sent, t)}}
 
 
 def yaw_of(alignment):

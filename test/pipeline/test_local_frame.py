@@ -28,7 +28,7 @@ from odocal_ros.output.plots import draw_track
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import inputs as inputs_module
-from odocal_ros.screening.inputs import place
+from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.nominal import grade_of
 from odocal_ros.sim.real import Real
@@ -117,7 +117,7 @@ def test_a_frame_without_north_has_the_vertical_earth_rate_at_most():
 def test_the_leg_is_placed_in_the_frame_as_sent(made, latitude_deg):
     config = settings(made, reference__latitude_deg=latitude_deg)
     inputs, _ = screen(posed(made, latitude_deg), config)
-    there = place(inputs, config)
+    there = locate_fixes(inputs, config)
     assert inputs.local
     assert there.origin.local == rate_without_north(math.radians(latitude_deg))
     sent = made.positions()[:len(there.fixes_n)]
@@ -131,8 +131,8 @@ def test_what_refers_to_north_is_not_used_and_said():
     made = drive(**CAR, heading_sigma=0.001, velocity_sigma=0.05)
     leg, config = posed(made), settings(made, **SMOOTHER)
     inputs, found = screen(leg, config)
-    assert not len(inputs.outside['heading'].t)
-    assert not len(inputs.outside['fix_velocity'].t)
+    assert not len(inputs.external['heading'].t)
+    assert not len(inputs.external['fix_velocity'].t)
     texts = {r.code: r.text for r in found}
     assert Code.VELOCITY_UNUSABLE not in texts
     assert texts[Code.LOCAL_FRAME] == (
@@ -141,7 +141,7 @@ def test_what_refers_to_north_is_not_used_and_said():
     assert Code.LOCAL_FRAME not in {r.code for r in screen(made.leg(), config)[1]}
     # who asks for a heading topic has one in the frame of the positions
     heading_config = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
-    assert len(screen(leg, heading_config)[0].outside['heading'].t)
+    assert len(screen(leg, heading_config)[0].external['heading'].t)
     text = {r.text for r in screen(leg, settings(made, reference__latitude_deg=40.0))[1]
             if r.code is Code.LOCAL_FRAME}
     assert f'up to {15.041 * math.cos(math.radians(40.0)):.1f} deg/h' in text.pop()
@@ -179,7 +179,7 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
     made = drive(**CAR | {'imu_grade': 'tactical'})
     config = settings(made, imu__grade='tactical', imu__gyro_bias=1e-6)
     inputs, _ = screen(posed(made), config)
-    there = place(inputs, config)
+    there = locate_fixes(inputs, config)
     leg = make_smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)),
                             there.rough)
     grade = grade_of(config.imu)

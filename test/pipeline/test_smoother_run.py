@@ -155,7 +155,7 @@ def test_auto_takes_it_and_computes_two_point_beside_it(made):
     assert {(stage.name, stage.done) for stage in passes} == {('smoother', shares[1])}
     # the change that is left falls from a first guess some sigmas off to what may be left
     assert passes[0].change > CONVERGENCE.fitted_below
-    assert passes[-1].change < CONVERGENCE.moves
+    assert passes[-1].change < CONVERGENCE.max_step
     assert set(leg.methods) == {'smoother', 'two_point'}
     assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
 

@@ -139,7 +139,7 @@ def screened(drive, change, **options):
     leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=change)
     inputs, found = screen(leg, settings(drive, None, **options))
     said = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
-    assert len(said) == (not len(inputs.outside['fix_velocity'].t))
+    assert len(said) == (not len(inputs.external['fix_velocity'].t))
     return said
 
 
@@ -156,7 +156,7 @@ def test_gaps_of_the_velocity_are_not_compared(drive):
     some = (t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0)
     inputs, found = screen(kept(leg, 'fix_velocity', some), settings(drive, None))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
-    assert len(inputs.outside['fix_velocity'].t)
+    assert len(inputs.external['fix_velocity'].t)
 
 
 def test_wheel_speeds_units_and_axes_are_found(drive):
@@ -181,4 +181,4 @@ def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
 def test_a_vehicle_that_stands_says_nothing(drive):
     keep = drive.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
     inputs, _ = screen(kept(drive.leg(), 'fix', keep), settings(drive, None))
-    assert len(inputs.outside['fix_velocity'].t)
+    assert len(inputs.external['fix_velocity'].t)

@@ -164,7 +164,7 @@ class VelocityRows(ExternalRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
-        sent, t = inputs.outside[cls.source]
+        sent, t = inputs.external[cls.source]
         # without an accelerometer its change between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
             return None

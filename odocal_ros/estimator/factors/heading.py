@@ -32,12 +32,12 @@ GIVEN_NOISE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Heading(ExternalSamples):
-    """Yaw of the IMU's x axis in n."""
+    """Samples of the yaw of the IMU's x axis in n, at times ``t``."""
 
     yaw: Floats         # (m,) rad
     noise: Floats       # (m,) rad
     sigma: float        # rad, of the error that is constant over the leg
-    source_name: str        # the heading source, as in the settings
+    source_name: str    # the heading source, as in the settings
 
 
 class HeadingRows(ExternalRows):
@@ -55,12 +55,13 @@ class HeadingRows(ExternalRows):
             return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN_NOISE),
                            alignment.heading_sigma, 'fixed')
         if source in ('auto', 'heading_topic'):
-            samples, t = inputs.outside['heading']
-            return _sent(inputs, t, samples.q_ni, samples.yaw_variance, alignment.heading_offset,
-                         config, origin, np.eye(3), 'heading_topic')
+            samples, t = inputs.external['heading']
+            return _from_orientations(inputs, t, samples.q_ni, samples.yaw_variance,
+                                      alignment.heading_offset, config, origin, np.eye(3),
+                                      'heading_topic')
         if source == 'imu_orientation':
-            return _sent(inputs, inputs.t_imu, inputs.q_ni, inputs.yaw_variance, 0.0, config,
-                         origin, transpose(inputs.C_bi), 'imu_orientation')
+            return _from_orientations(inputs, inputs.t_imu, inputs.q_ni, inputs.yaw_variance, 0.0,
+                                      config, origin, transpose(inputs.C_bi), 'imu_orientation')
         return None
 
     @staticmethod
@@ -78,32 +79,40 @@ class HeadingRows(ExternalRows):
         state, points = point.state, point.points['heading']
         k = points.interval
         C = state.C_nb[k]
-        x = (C @ points.R)[:, :, 0]
+        x = (C @ points.R)[:, :, 0]     # x axis of the IMU in n
+        # square of its horizontal part
         level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
-        raw = wrap(samples.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
-        turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
-                          np.ones(len(k))], -1)
+        residual = wrap(samples.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
+        # derivative of the yaw by a rotation vector in n
+        yaw_by_rotation = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
+                                    np.ones(len(k))], -1)
         J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
-        J[:, 0, PHI] = -turns
-        by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
+        J[:, 0, PHI] = -yaw_by_rotation
+        by_gyro = np.einsum('ki,kij->kj', yaw_by_rotation, C @ points.turned)
         J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
         c[:, 0, HEADING] = -1.0
-        return Rows(raw[:, None], J, c, 1 / samples.noise[:, None])
+        return Rows(residual[:, None], J, c, 1 / samples.noise[:, None])
 
     @staticmethod
     def least(samples: Heading) -> dict[str, float]:
         return {'heading': (LEAST.heading / float(np.median(samples.noise)))**2}
 
 
-def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
-          origin: Origin, C_ib: Floats, source_name: str) -> Heading | None:
-    """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
+def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
+                       config: Config, origin: Origin, C_ib: Floats,
+                       source_name: str) -> Heading | None:
+    """
+    Return the heading of published orientations, or None if they are too few or too uncertain.
+
+    q, variance : (m, 4), (m,) rad^2 of the yaw.   offset : rad, added to the yaw.   C_ib : from b
+    to the published frame.
+    """
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):
         return None
-    some = thinned(t)
-    t, q, variance = t[some], q[some], variance[some]
+    kept = thinned(t)
+    t, q, variance = t[kept], q[kept], variance[kept]
     stated = float(np.median(variance))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:

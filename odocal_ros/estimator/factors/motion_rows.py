@@ -95,7 +95,7 @@ class MotionRows(Factor):
     def derivatives(self, rows: slice, units: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
-        gyro = units[:, :, self.of('gyro')]
+        gyro = units[:, :, self.noise_mask('gyro')]
         self.signals.fit_rates(rows, constants, begin[:, :, BG], gyro)
         if self.motion.fitted:
             found = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
@@ -132,23 +132,24 @@ class MotionRows(Factor):
         """Return the standard deviation of each unit noise, (c,), per root second."""
         return np.sqrt([self.levels[INTERVAL[i]] for i in self.noise.component])
 
-    def of(self, *names: str) -> Bools:
+    def noise_mask(self, *names: str) -> Bools:
         """Return a mask of the unit noises of these levels: (c,) bool."""
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         estimates, seen = self._noises(marginals)
         quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
-        return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
-                for name in INTERVAL}
+        masks = {name: self.noise_mask(name) for name in INTERVAL}
+        return {name: (float(quadratic[mask].sum()), float(expected[mask].sum()))
+                for name, mask in masks.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         n, columns = self.n, out.at(INTERVAL)
-        of = np.eye(len(INTERVAL))[self.noise.component]
+        level_selector = np.eye(len(INTERVAL))[self.noise.component]     # (c, levels) 0 or 1
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
             A = self.units(rows)
-            q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ of
+            q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ level_selector
             g = np.swapaxes(self.J[rows], 1, 2) @ q
             out.chain[rows, :, columns] += g[:, :n]
             out.chain[ends, :, columns] += g[:, n:2 * n]
@@ -201,27 +202,27 @@ class MotionRows(Factor):
             given.append(by_rows @ (self.whiten[rows] @ self.noise.given[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:
-            yield NAMES[name], X[:, :, self.of(name)]
+            yield NAMES[name], X[:, :, self.noise_mask(name)]
         if self.noise.given.shape[2]:
             yield SpeedSteps.source, np.concatenate(given)
 
     def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """Return estimates, in sigmas, of noise forward, left, up, and variances: (K, 3) each."""
         estimate, seen = self._noises(marginals)
-        columns = [self.of(*names) for names in ODOMETER_AXES]
+        columns = [self.noise_mask(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
 
     def imu_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """Return norms of the IMU's noises, and variances of the best observed: (K, 4) each."""
         estimate, seen = self._noises(marginals)
-        columns = [self.of(name) for name in IMU]
+        columns = [self.noise_mask(name) for name in IMU]
         return (np.stack([np.linalg.norm(estimate[:, c], axis=1) for c in columns], -1),
                 np.stack([seen[:, c].max(axis=1) for c in columns], -1))
 
     def along_size(self) -> Floats:
         """Return the displacement by a unit of the noise along the path, m: (K,)."""
-        pick = self.of(*ALONG)
+        pick = self.noise_mask(*ALONG)
         return np.concatenate([
             np.linalg.norm(self.noise.columns(rows)[:, D, pick] * self.roots()[pick], axis=1)
             .sum(axis=1) for rows in blocks(len(self.r))])

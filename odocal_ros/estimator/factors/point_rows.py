@@ -208,7 +208,7 @@ class PointRows(Factor):
         n, parts = self.n, []       # columns of J and of J_end in the joint marginals
         own, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
-            cross = np.ascontiguousarray(self.with_parameters(marginals.of(present)))
+            cross = np.ascontiguousarray(self.with_parameters(marginals.covariances(present)))
             X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)

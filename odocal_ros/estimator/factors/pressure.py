@@ -51,7 +51,7 @@ class PressureRows(ExternalRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
-        sent, t = inputs.outside['pressure']
+        sent, t = inputs.external['pressure']
         if not (config.imu.use_pressure and len(t) and inputs.has_accelerometer):
             return None
         cell = np.floor(t * RATE)

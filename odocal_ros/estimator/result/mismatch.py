@@ -121,12 +121,12 @@ def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
 
 def _convergence_texts(fit: Fit) -> tuple[list[str], float]:
     """Return the text about a fit that has not converged, and its last step, sigmas."""
-    if not fit.creeping and fit.settled:
+    if not fit.slowly_converging and fit.converged:
         return [], 0.0
     step = last_step(fit)
     return [f'after {fit.iterations} iterations ' + (
         f'the estimates still changed by {step:.2g} sigma'
-        if step > CONVERGENCE.nearly else 'the noise levels still changed')], step
+        if step > CONVERGENCE.max_final_step else 'the noise levels still changed')], step
 
 
 def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> list[str]:

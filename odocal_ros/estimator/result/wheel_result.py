@@ -137,7 +137,7 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
     return Estimate(width, sigma, 'm'), []
 
 
-def joined(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
+def combine_wheels(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
     """
     Return the wheels of several legs, weighted by their variances; {} if no leg has any.
 
