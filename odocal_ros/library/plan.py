@@ -46,6 +46,7 @@ class Change:
 
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
+    """Return the changes of drive and sensors, each with the sigmas that it leads to."""
     # the same keyframe spacing: a wider one alone makes a sigma larger
     spacing = keyframe_spacing(drive)
     found = []
@@ -97,9 +98,9 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
 def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     """Return the drive up to where it is farthest from the start, None if that is the end."""
     inside = drive.t >= 0
-    place = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
-    k = int(np.argmax(np.abs(place - place[0])))
-    if abs(place[-1] - place[0]) > 0.9 * abs(place[k] - place[0]):
+    position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
+    k = int(np.argmax(np.abs(position - position[0])))
+    if abs(position[-1] - position[0]) > 0.9 * abs(position[k] - position[0]):
         return None
     rest = max((b - a for a, b in drive.standstills(sigmas.config.leg.standstill)
                 if a <= drive.t[inside][k] <= b), default=30.0)

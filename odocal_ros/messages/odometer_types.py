@@ -126,13 +126,13 @@ class OdometerPlan:
         if side:
             key = key_on_side(found, side)
             if not key:
-                self.unclear_reason = found.about
+                self.unclear_reason = found.explanation
                 return
             self.keys = (key,)
         else:
             self.keys = found.keys
         self._set_columns(field)
-        self.form = replace(self.form, sides=found.sides, chosen=found.about)
+        self.form = replace(self.form, sides=found.sides, chosen=found.explanation)
 
     def _complete_unknown_type(self, view: MessageView) -> None:
         """Determine columns and meaning of an unknown type from its first message."""

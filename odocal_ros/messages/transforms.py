@@ -113,7 +113,7 @@ class TransformReader(Reader):
             return (f'no transform {between_frames}: {_quoted(chain.top())} has no parent frame '
                     f'(frames received: {names}); set reference.frames, or record the static '
                     'transforms')
-        if not chain.moves():
+        if not chain.is_moving():
             return (f'all transforms {between_frames} are static; set reference.frames to a robot '
                     'that moves')
         return (f'the transforms {between_frames} have no common time, or the one next to '

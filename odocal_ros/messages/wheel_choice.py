@@ -35,7 +35,7 @@ class Choice:
 
     keys: tuple[str, ...]
     sides: bool
-    about: str            # explanation; '' if there was no choice
+    explanation: str      # text for the user; '' if there was no choice
 
 
 def select_wheels(names: Sequence[str], count: int) -> Choice | str:
@@ -109,9 +109,9 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     for axle_pairs, reason in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
         if len(axle_pairs) == 1:
             all_names = ', '.join(name for pair in pairs for name in pair)
-            about = _selection_text(names, axle_pairs[0], reason)
+            explanation = _selection_text(names, axle_pairs[0], reason)
             return Choice(axle_pairs[0], True,
-                          f'{about}; for all wheels set odometer.wheels to [{all_names}]')
+                          f'{explanation}; for all wheels set odometer.wheels to [{all_names}]')
     single = [name for name in candidates if _axle(places[name][1]) == 'rear']
     return tuple(single) if len(candidates) == 2 and len(single) == 1 else tuple(candidates)
 

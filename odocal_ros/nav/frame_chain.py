@@ -88,10 +88,10 @@ class FrameChain:
         return sorted(parents | set(self._moving) | set(self._static))
 
     def top(self) -> str:
-        """Return the last known frame from the child upwards."""
+        """Return the topmost known frame, reached from the child upwards."""
         return self._walk()[0]
 
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """Return True if one of the transforms has stamps."""
         return any(name in self._moving for name in self._walk()[1])
 
@@ -116,7 +116,7 @@ class FrameChain:
         nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
             top, path = self._walk()
-            if top != self.parent or not self.moves():
+            if top != self.parent or not self.is_moving():
                 return nothing
             self._path = path
             self._moving = {name: e for name, e in self._moving.items() if name in path}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Distributions of drawn vehicles by the class of the IMU; sources in docs/zoo.md."""
+"""Distributions of the errors of random vehicles, by IMU grade; sources in docs/zoo.md."""
 
 from dataclasses import dataclass
 import math

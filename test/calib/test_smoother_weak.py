@@ -84,8 +84,8 @@ def test_fixes_where_the_imu_is_silent_are_none():
     assert re.search(r' (29\.9|30\.0) s of data; the smoother needs', reason.text)
 
 
-def said(method):
-    """Tell whether the result says that a road's noise was assumed."""
+def is_road_noise_assumed(method):
+    """Return True if the result states that the noise of a road was assumed."""
     return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'turns faster than 3 deg/s add up'
                in r.text and 'is assumed' in r.text for r in method.reasons)
 
@@ -108,13 +108,13 @@ def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
     assert stated == pytest.approx(sigma, rel=0.03 + 0.05)
     assert stated > 0.97 * sigma
     if not sway:
-        assert said(method)
+        assert is_road_noise_assumed(method)
 
 
 def test_a_leg_with_turns_tests_it_itself():
     _, config, leg = made(duration=200.0, imu_grade='industrial')
     method = smooth(leg, config)
-    assert not said(method)
+    assert not is_road_noise_assumed(method)
     # wheels that never slide: far below a road's; up and down springs and road do what they do
     noise = method.details['noise']
     assert max(noise['side'], noise['side_turn']) < interval_noise.ORDINARY_ROAD / 10

@@ -45,12 +45,12 @@ def test_wheels_of_real_robots(robot):
     names, pair = REAL[robot]
     found = select_wheels(names, len(names))
     assert (found.keys, found.sides) == (pair, True)
-    assert pair[0] in found.about
+    assert pair[0] in found.explanation
 
 
 def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
     names, _ = REAL['husky']
-    assert select_wheels(names, 4).about.endswith(
+    assert select_wheels(names, 4).explanation.endswith(
         '; for all wheels set odometer.wheels to [front_left_wheel, front_right_wheel, '
         'rear_left_wheel, rear_right_wheel]')
     assert 'and 88 more' in select_wheels([f'j{k}' for k in range(100)], 100)
@@ -70,7 +70,7 @@ def test_two_of_unknown_sides(names):
     found = select_wheels(names, len(names) or 2)
     assert found.keys == tuple(names[:2] or '01')
     assert not found.sides
-    assert 'the mean of' in found.about
+    assert 'the mean of' in found.explanation
 
 
 @pytest.mark.parametrize(('names', 'count'), [
