@@ -64,6 +64,13 @@ def moving_mean(x: Floats) -> Floats:
     return np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
 
 
+def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
+    """Return the squared inclination by a bounce of the body, which no wheel counts: (K,)."""
+    # it changes both, sway the inclination to the body only, a crest the slope only
+    squared = (inclination - moving_mean(inclination)) * (slope - moving_mean(slope))
+    return np.clip(squared, -0.5, 0.5)
+
+
 class Motion:
     """
     The interval equations at one state.
@@ -195,13 +202,9 @@ class Motion:
         of_body, _ = slope(straight)
         displacement_by_state, per_metre = slope(self.displacement_by_state)
         self.slope_gradient = displacement_by_state * per_metre / (1 + displacement_by_state**2)
-        # the wheel does not count a bounce on the springs, which changes the inclination to the
-        # body and that to the horizontal; sway changes the first only, a crest the second
         climbed = self.displacement_by_state[:, 2] * per_metre
-        bounced = np.clip(
-            (displacement_by_state - moving_mean(displacement_by_state))
-            * (climbed - moving_mean(climbed)), -0.5, 0.5)
-        return np.sqrt((1 + of_body**2 + bounced) / (1 + displacement_by_state**2))
+        bounce = squared_bounce(displacement_by_state, climbed)
+        return np.sqrt((1 + of_body**2 + bounce) / (1 + displacement_by_state**2))
 
     def _derivative_by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""
