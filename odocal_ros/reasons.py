@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reason codes: what can be said about a leg or a calibration, how grave it is, what to do."""
+"""Reason codes: findings on a leg or a calibration, their severity and remedy."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

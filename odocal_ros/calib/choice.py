@@ -85,7 +85,7 @@ def choose(methods: Mapping[str, MethodResult],
 def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting: str
                             | tuple[str, ...],
                             stated_codes: Iterable[Code] = ()) -> list[Reason]:
-    """Return METHOD_REJECTED of rejected methods before a usable one; said : by the leg."""
+    """Return METHOD_REJECTED of rejected methods before a usable one, except stated_codes."""
     found = [methods[name] for name in deciding_methods(method_setting) if name in methods]
     sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
     why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))

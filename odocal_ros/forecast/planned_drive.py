@@ -157,11 +157,11 @@ def add_left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     v = drive.speed[k]
     turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2, limit to the side
     turn = max(turn_time, QUARTER * abs(v) / sideways_force)
-    turns_apart = 5.0    # s straight between the two turns
-    whole = 2 * turn + turns_apart
-    t = _time_grid(whole, turn, turn + turns_apart)
+    between_turns = 5.0    # s straight between the two turns
+    whole = 2 * turn + between_turns
+    t = _time_grid(whole, turn, turn + between_turns)
     return insert_section(drive, k, t, np.full_like(t, v), np.interp(
-        t, [0.0, turn, turn + turns_apart, whole], [0.0, QUARTER, QUARTER, 0.0]))
+        t, [0.0, turn, turn + between_turns, whole], [0.0, QUARTER, QUARTER, 0.0]))
 
 
 def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:

@@ -163,11 +163,11 @@ class FixPath:
             meridian, normal = radii(lat)
             step = np.hypot((lat - self._anchor[0]) * meridian,
                             (lon - self._anchor[1]) * normal * np.cos(lat))
-            apart_ns = stamp - self._anchor[2]
+            elapsed_ns = stamp - self._anchor[2]
             noise = 3 * np.sqrt(variance) if variance > 0 else 0.0
-            if step > max(3.0, noise) and apart_ns >= SPEED_SPAN_NS:
+            if step > max(3.0, noise) and elapsed_ns >= SPEED_SPAN_NS:
                 self.total += float(step)
-                self.top = max(self.top, float(step) * 1e9 / apart_ns)
+                self.top = max(self.top, float(step) * 1e9 / elapsed_ns)
                 self._anchor = (lat, lon, stamp)
 
 

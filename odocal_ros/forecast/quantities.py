@@ -102,9 +102,9 @@ def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) ->
         return False, ('the yaw (the only heading is the course over ground, which includes it: '
                        'set alignment.heading_source)')
     source, sigma = SOURCES[alignment.heading_source], math.degrees(alignment.heading_sigma)
-    asked = math.degrees(config.verdict.max_yaw_sigma)
-    if sigma >= asked:
-        return False, (f'the yaw to {asked:.2g} deg ({source} has an uncertainty of {sigma:.2g} '
+    limit = math.degrees(config.verdict.max_yaw_sigma)
+    if sigma >= limit:
+        return False, (f'the yaw to {limit:.2g} deg ({source} has an uncertainty of {sigma:.2g} '
                        'deg)')
     return True, f'the yaw (from {source}, {sigma:.2g} deg)'
 
@@ -136,9 +136,9 @@ def stated_variance(sent: Oriented) -> float:
 
 def with_heading(config: Config, variances: dict[str, float]) -> Config:
     """Return config with the heading source and sigma that the alignment will find."""
-    asked = config.alignment
-    source, sigma = asked.source, max(asked.heading_sigma, EXACT_HEADING)
-    if source == 'fixed' and math.isnan(asked.heading):
+    alignment = config.alignment
+    source, sigma = alignment.source, max(alignment.heading_sigma, EXACT_HEADING)
+    if source == 'fixed' and math.isnan(alignment.heading):
         source = 'course'
     for name, stated in variances.items():
         if source not in ('auto', name):

@@ -76,7 +76,7 @@ def test_a_leg_without_information_changes_nothing(toy):
     nothing = replace(borders[0], information=np.zeros((5, 5)), pull=np.zeros(5))
     a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
     assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
-    # freedom is a sum of some twenty shares since priors are weighted_copy: alike but for rounding
+    # freedom is a sum of some twenty shares weighted by priors: equal but for rounding
     assert (a.freedom, a.chi2) == (pytest.approx(b.freedom, rel=1e-12),
                                    pytest.approx(b.chi2, rel=1e-6))
 

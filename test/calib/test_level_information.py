@@ -25,7 +25,7 @@ NAMES = ('size_squat', 'gyro', 'along', 'side', 'fix', 'slow', 'size_gyro_axis')
 
 
 @pytest.fixture(scope='module')
-def weighted_copy():
+def weighted_equations():
     """Return (function from changed levels to equations and solution, levels), no row a tail."""
     _, config, leg = made(imu_grade='industrial', duration=135.0, fix_sigma=0.5)
     problem = make_problem(leg, config)
@@ -44,8 +44,8 @@ def weighted_copy():
         yield at, fit.levels
 
 
-def test_moves_are_the_differences_of_solutions(weighted_copy):
-    at, levels = weighted_copy
+def test_moves_are_the_differences_of_solutions(weighted_equations):
+    at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
     sigma = np.sqrt(np.diag(solved.covariance))
@@ -56,9 +56,9 @@ def test_moves_are_the_differences_of_solutions(weighted_copy):
                                    rtol=ROUGH, atol=ROUGH * np.abs(moves / sigma).max() + 1e-9)
 
 
-def test_average_information_is_the_curvature_of_the_cost(weighted_copy):
+def test_average_information_is_the_curvature_of_the_cost(weighted_equations):
     """Of a variance s V the least cost C has d2C/d(ln s)2 = 4 A + dC/d(ln s), and 4 A across."""
-    at, levels = weighted_copy
+    at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
     A = information.average
@@ -82,8 +82,8 @@ def test_average_information_is_the_curvature_of_the_cost(weighted_copy):
             across / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), (name, other)
 
 
-def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_copy):
-    at, levels = weighted_copy
+def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_equations):
+    at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
     own = prior_information(levels)

@@ -67,6 +67,7 @@ def moving_mean(x: Floats) -> Floats:
 def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
     """Return the squared inclination by a bounce of the body, which no wheel counts: (K,)."""
     # it changes both, sway the inclination to the body only, a crest the slope only
+    # within limits that keep the root real far from the solution
     squared = (inclination - moving_mean(inclination)) * (slope - moving_mean(slope))
     return np.clip(squared, -0.5, 0.5)
 
@@ -200,11 +201,10 @@ class Motion:
             return np.einsum('ki,ki->k', x, self.up_n) * along / size, along / size
 
         of_body, _ = slope(straight)
-        displacement_by_state, per_metre = slope(self.displacement_by_state)
-        self.slope_gradient = displacement_by_state * per_metre / (1 + displacement_by_state**2)
-        climbed = self.displacement_by_state[:, 2] * per_metre
-        bounce = squared_bounce(displacement_by_state, climbed)
-        return np.sqrt((1 + of_body**2 + bounce) / (1 + displacement_by_state**2))
+        inclination, per_metre = slope(self.displacement_by_state)
+        self.slope_gradient = inclination * per_metre / (1 + inclination**2)
+        bounce = squared_bounce(inclination, self.displacement_by_state[:, 2] * per_metre)
+        return np.sqrt((1 + of_body**2 + bounce) / (1 + inclination**2))
 
     def _derivative_by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""
