@@ -223,9 +223,9 @@ class Code(Enum):
                                    'from accelerations.')
     PARAMETER_NOT_DETERMINED = NOTE, ('No action needed if the configured values were measured. '
                                       'Turns, stops and starts determine more of them.')
-    MODEL_MISMATCH = CAUTION, ('Check slip, lever arms, delays, sky view and the unit of heights. '
-                               'The residuals are larger than the noise model predicts; '
-                               'uncertainties were increased.')
+    MODEL_MISMATCH = CAUTION, ('The printed action depends on the deviation. Likely causes: slip, '
+                               'bad fixes, lever arms, delays, the unit of heights, a wrong '
+                               'external heading, slopes.')
     METHOD_REJECTED = CAUTION, ('Follow the remedy of the reason named. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '

@@ -157,7 +157,7 @@ def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, 
     for one in said:
         assert 'height error of the fixes is ' in one.text
         assert one.text.endswith('(limit 50 m)')
-        assert 'unit of heights' in one.remedy
+        assert one.remedy == 'Check the unit of heights in the fix driver.'
 
 
 def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():

@@ -179,6 +179,9 @@ def test_a_wrong_heading_is_said_and_gives_way():
     method = fitted(drive.leg(), config, alignment__heading=float(drive.truth.heading) + 0.05,
                     alignment__heading_sigma=2e-3)
     assert 'heading (fixed) differs by' in reason_texts(method)[Code.MODEL_MISMATCH]
+    remedy, = (r.remedy for r in method.reasons if r.code is Code.MODEL_MISMATCH)
+    assert 'alignment.heading' in remedy
+    assert 'height' not in remedy
     assert off(method, drive, *BOTH) < 3.3
 
 

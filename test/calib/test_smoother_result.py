@@ -112,11 +112,12 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     assert stated == pytest.approx(total[:2], rel=1e-3)
 
 
-def test_a_limit_that_model_errors_lower_is_explained():
+def test_an_uncertainty_that_model_errors_increase_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
     for uncertainty, text in ((1.0, ''),
-                              (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2: ')):
+                              (2.0, '0.80 deg (multiplied by 2 for model errors); the limit is '
+                               '0.5 deg. ')):
         _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(),
                                         uncertainty)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]

@@ -139,7 +139,10 @@ def refused_planar_result(reasons: Iterable[Reason], unit: str) -> MethodResult:
 def _fit_reasons(fit: Fit) -> list[Reason]:
     """Return the reasons against a fit as a whole."""
     found = [] if fit.converged else [Reason(
-        Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations')]
+        Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations; '
+        'its uncertainties were doubled',
+        'Check odometer.wheels, odometer.drive and the time offsets, and drive left and right '
+        'turns.')]
     if fit.swapped:
         found.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
                             'left and right wheels are swapped'))

@@ -135,16 +135,15 @@ def _scale_reasons(sigma: float) -> list[Reason]:
 def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, yaw: float,
                    changed_angles: Collection[str]) -> list[Reason]:
     """Return the reasons for mounting angles that are not determined, or far from nominal."""
-    reasons, limit_text = [], f'; the limit is {np.rad2deg(limit / factor):.2g} deg'
-    if factor > 1:
-        limit_text += (f' ({np.rad2deg(limit):.2g} deg / {factor:.2g}: model errors increase all '
-                       f'uncertainties {factor:.2g} times)')
+    reasons = []
+    limit_text = (f' (multiplied by {factor:.2g} for model errors)' * (factor > 1)
+                  + f'; the limit is {np.rad2deg(limit):.2g} deg')
     off = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[layout.YAW] > limit / factor:
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (
             'too little acceleration, or too few turns')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
-                              f'{np.rad2deg(sigma[layout.YAW]):.2f} deg{limit_text}. '
+                              f'{np.rad2deg(factor * sigma[layout.YAW]):.2f} deg{limit_text}. '
                               f'Likely cause: {cause}'))
     elif off > REVERSED_YAW:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
@@ -157,7 +156,7 @@ def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, y
     if sigma[layout.PITCH] > limit / factor:
         reasons.append(Reason(
             Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
-            f'{np.rad2deg(sigma[layout.PITCH]):.2f} deg{limit_text}',
+            f'{np.rad2deg(factor * sigma[layout.PITCH]):.2f} deg{limit_text}',
             'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in changed_angles else
             'Drive longer, with stops and starts. Accurate ellipsoidal heights also help.'))
     return reasons

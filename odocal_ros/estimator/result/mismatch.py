@@ -46,6 +46,15 @@ OUTLIER_SHARE_LIMIT = 0.15
 SIDESLIP_LIMIT = 0.2    # m/sqrt(s), judgement: of wheels
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
 UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
+REMEDIES = {
+    'fixes': 'Check the fixes: sky view and antenna, or the localisation.',
+    'slip': 'Drive gently on a firm, dry road, or use a wheel that is not driven.',
+    'sideslip': 'Check odometer.lever_arm. Wheels that slide in turns also look like this: then '
+                'drive wider turns.',
+    'heights': 'Check the unit of heights in the fix driver.',
+    'heading_fixed': "Check alignment.heading: of the IMU's x axis, clockwise from true north.",
+    'heading_sent': 'Check that this heading is an ENU yaw relative to true north. Magnetic '
+                    'headings err by several degrees near steel: then use another source.'}
 
 
 def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
@@ -64,16 +73,14 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
     if noisy and not worse:
-        contradictions.append(f'IMU noise is {excess:.1f} times that of its grade (limit '
-                              f'{WORSE_THAN_GRADE:g}) and may not be white')
-    only_noise = noisy and not worse and len(contradictions) == 1
-    others = _level_texts(problem, fit, level)
-    contradictions += others
+        contradictions[f'IMU noise is {excess:.1f} times that of its grade (limit '
+                       f'{WORSE_THAN_GRADE:g}) and may not be white'] = noise.remedy
+    contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
                                 float(fit.state.constants[HEADING]))
     if contradictions:
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(contradictions),
-                              noise.remedy if only_noise and not others else ''))
+                              ' '.join(contradictions.values())))
     # judgement: the size of a model error is unknown; a fit that has not converged may be off by
     # several times its last step
     return max(1.0, 2.0 * bool(contradictions or noisy), 4.0 * step), reasons
@@ -119,34 +126,37 @@ def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
     return texts
 
 
-def _convergence_texts(fit: Fit) -> tuple[list[str], float]:
-    """Return the text about a fit that has not converged, and its last step, sigmas."""
+def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
+    """Return text -> remedy of a fit that has not converged, and its last step, sigmas."""
     if not fit.slowly_converging and fit.converged:
-        return [], 0.0
+        return {}, 0.0
     step = last_step(fit)
-    return [f'after {fit.iterations} iterations ' + (
+    return {f'after {fit.iterations} iterations ' + (
         f'the estimates still changed by {step:.2g} sigma'
-        if step > CONVERGENCE.max_final_step else 'the noise levels still changed')], step
+        if step > CONVERGENCE.max_final_step else 'the noise levels still changed'):
+        'Check lever arms, time offsets and units, and drive with stops, starts and turns.'}, step
 
 
-def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> list[str]:
-    """Return texts about outliers, slip, sideslip and height errors beyond their limits."""
-    texts = []
-    for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
-                       ('of the time the wheel slips',
-                        fit.variance_factors[:, 0] > SLIP_VARIANCE)):
+def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> dict[str, str]:
+    """Return text -> remedy of outliers, slip, sideslip and height errors beyond limits."""
+    texts = {}
+    for what, mask, remedy in (
+            ('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5,
+             REMEDIES['fixes']),
+            ('of the time the wheel slips', fit.variance_factors[:, 0] > SLIP_VARIANCE,
+             REMEDIES['slip'])):
         share = float(mask.mean())
         if share > OUTLIER_SHARE_LIMIT:
-            texts.append(f'{100 * share:.0f} % {what} (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)')
+            texts[f'{100 * share:.0f} % {what} (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)'] = remedy
     sideslip = max(level['side'], level['side_turn'])
     if sideslip > SIDESLIP_LIMIT:
-        texts.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit '
-                     f'{SIDESLIP_LIMIT:g})')
+        texts[f'sideslip at the odometer is {sideslip:.2f} m/√s (limit '
+              f'{SIDESLIP_LIMIT:g})'] = REMEDIES['sideslip']
     # m, judgement: receivers err by up to 10 m; with heights in cm slopes of 0.5 % make it 80 m
     limit = max(50.0, 4 * problem.height_sigma)
     if level['slow_up'] > limit:
-        texts.append(f'the time-correlated height error of the fixes is {level["slow_up"]:.0f} m '
-                     f'(limit {limit:.0f} m)')
+        texts[f'the time-correlated height error of the fixes is {level["slow_up"]:.0f} m '
+              f'(limit {limit:.0f} m)'] = REMEDIES['heights']
     return texts
 
 
@@ -177,7 +187,9 @@ def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reas
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source_name}) differs by '
                    f'{np.rad2deg(error):+z.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
-                   'the heading estimated on this drive; it was down-weighted')]
+                   'the heading estimated on this drive; it was down-weighted',
+                   REMEDIES['heading_fixed' if heading.source_name == 'fixed' else
+                            'heading_sent'])]
 
 
 def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
