@@ -196,12 +196,12 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
                 'rejected', None)
     compared = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
                 for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
-    is_significant: dict[str, tuple[float, Change, Difference]] = {}
+    significant: dict[str, tuple[float, Change, Difference]] = {}
     for size, change, difference in compared:
-        if difference.is_significant and size > is_significant.get(change.parameter, (0.0,))[0]:
-            is_significant[change.parameter] = size, change, difference
-    if is_significant:
-        return '; '.join(_cause(c, d, stored) for _, c, d in is_significant.values()), True
+        if difference.is_significant and size > significant.get(change.parameter, (0.0,))[0]:
+            significant[change.parameter] = size, change, difference
+    if significant:
+        return '; '.join(_cause(c, d, stored) for _, c, d in significant.values()), True
     if not compared:
         return 'nothing to compare: no sigma is known', None
     size, change, _ = max(compared, key=lambda one: one[0])

@@ -180,12 +180,11 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     gpx_smooth = 4.0
     wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
     slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer
-    return with_marks(grid, _smooth(speed, wide),
-                               _smooth(np.interp(grid, middle, yaw), wide),
-                               _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)),
-                                       slopes * wide),
-                               latitude=float(start[0]), longitude=float(start[1]),
-                               height=float(start[2]))
+    latitude, longitude, height = start.tolist()
+    return with_marks(
+        grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
+        _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), slopes * wide),
+        latitude=latitude, longitude=longitude, height=height)
 
 
 def _smooth(x: Floats, wide: int) -> Floats:

@@ -77,7 +77,7 @@ class DrivePattern(SettledNode):
             executor.spin_once(timeout_sec=PERIOD_S)
 
     def destroy_node(self) -> None:
-        if getattr(self, '_route', ()) or getattr(self, '_zeros', 0):
+        if getattr(self, '_route', ()) or getattr(self, '_stop_commands_left', 0):
             self._halt('the node ends')
             for _ in range(FINAL_STOP_COMMANDS if self.context.ok() else 0):
                 self._send(0.0, 0.0)

@@ -128,8 +128,8 @@ class Recording:
     """
     Samples so far, in order of arrival.
 
-    ``remember(input, raws, sent_ns)`` is called with every decoded batch of raw messages, in order
-    of arrival, for the journal.
+    ``store_messages(input, raws, sent_ns)`` is called with every decoded batch of raw messages, in
+    order of arrival, for the journal.
     """
 
     def __init__(self, node: Node, config: Config,
@@ -250,16 +250,16 @@ class Recording:
 
     def rates_hz(self) -> dict[str, float]:
         now_ns = time.monotonic_ns()
-        return {slot: source.health.rate_hz(now_ns) for slot,
-                source in self.inputs.by_slot.items()}
+        return {slot: source.health.rate_hz(now_ns)
+                for slot, source in self.inputs.by_slot.items()}
 
     def received(self) -> bool:
         return any(source.health.received_ns for source in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
         """Return the time from the last IMU message to the newest of all, s; 0 without an IMU."""
-        received_ns = {slot: source.health.received_ns for slot,
-                       source in self.inputs.by_slot.items()}
+        received_ns = {slot: source.health.received_ns
+                       for slot, source in self.inputs.by_slot.items()}
         silent_ns = max(received_ns.values()) - received_ns['imu']
         return 0.0 if self.inputs.without_imu else max(0, silent_ns) * 1e-9
 

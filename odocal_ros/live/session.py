@@ -194,11 +194,11 @@ class Session:
         if self.is_busy:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
                           'before ~/reset')
-        note_undone, self.legs = self.legs, []
+        dropped, self.legs = self.legs, []
         self.calibration, self.state, self.trouble = None, State.IDLE, ''
         self.restored, self.lost = None, ''
         self.carried = self.unused = None
-        return note_undone
+        return dropped
 
     def note_undone(self, leg: KeptLeg) -> None:
         self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns

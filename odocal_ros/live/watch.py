@@ -97,9 +97,9 @@ def _values(status: dict[str, str]) -> str:
     prefix = 'estimate_' if state in ('recording', 'computing') else ''
     keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),
             ('yaw', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad', degrees(1), ' deg'))
-    texts = [f'{label} {with_sigma(bars, number(status, prefix + sigma) or None, factor)}{unit}'
-             for label, value, sigma, factor, unit in keys
-             if (bars := number(status, prefix + value))]
+    texts = [f'{label} {with_sigma(value, number(status, prefix + sigma) or None, factor)}{unit}'
+             for label, key, sigma, factor, unit in keys
+             if (value := number(status, prefix + key))]
     provisional = 'provisional: ' if state == 'computing' and texts else ''
     return provisional + ('   '.join(texts) or 'no value yet')
 

@@ -73,10 +73,9 @@ class UnusedLeg:
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
-            kept: list[tuple[LegResult, ...]], config: Config, carried: CarriedInformation
-            | None = None,
-            is_automatic: bool = False, progress: Callable[[Stage], None] | None = None,
-            ) -> Computed | UnusedLeg:
+            kept: list[tuple[LegResult, ...]], config: Config,
+            carried: CarriedInformation | None = None, is_automatic: bool = False,
+            progress: Callable[[Stage], None] | None = None) -> Computed | UnusedLeg:
     """Return a leg's result, its combination with the kept legs, and the paths to publish."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
@@ -238,6 +237,6 @@ class Computing:
         """Answer callers whose waiting time is over; the job continues."""
         now = time.monotonic()
         expired = [future for future, until in self._waiting if until <= now]
-        self._waiting = [result for result in self._waiting if result[1] > now]
+        self._waiting = [(future, until) for future, until in self._waiting if until > now]
         for future in expired:
             future.set_result((True, text()))

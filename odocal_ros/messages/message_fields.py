@@ -224,9 +224,8 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
 _ORIENTATION = (vector_column('orientation', 'xyzw'), array_column('orientation_covariance', 0),
                 array_column('orientation_covariance', 8))
 SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
-    ('imu',
-     IMU): ((*_ORIENTATION, vector_column('angular_velocity'),
-             vector_column('linear_acceleration'),
+    ('imu', IMU): ((*_ORIENTATION, vector_column('angular_velocity'),
+                    vector_column('linear_acceleration'),
                     array_column('linear_acceleration_covariance', 0)), _imu),
     ('heading', IMU): (_ORIENTATION, _heading),
     ('fix', FIX): ((fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),

@@ -8,12 +8,16 @@ import math
 import signal
 import threading
 import time
+from types import SimpleNamespace
 from unittest.mock import patch
 
 from bench import Client, given, NodeProcess, wait_for
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 import pytest
 from std_msgs.msg import Bool
+
+from odocal_ros.live.drive_pattern import DrivePattern, FINAL_STOP_COMMANDS
+from odocal_ros.live.process import SettledNode
 
 BOX = (-1.0, -1.0, 2.0, 1.0)
 SETTINGS = {'speed': 1.0, 'rectangle': f'[{", ".join(map(str, BOX))}]', 'pattern': 'straight',
@@ -160,6 +164,17 @@ def test_a_node_that_ends_stops_the_robot(number):
         assert 'stopped: the node ends' in node.text
         wait_for(lambda: robot.commands[-3:] == [(0.0, 0.0)] * 3, 'zeros')
         assert 'Traceback' not in node.text
+
+
+@pytest.mark.parametrize(('commands_left', 'zeros'), [(3, 1 + FINAL_STOP_COMMANDS), (0, 0)])
+def test_a_node_that_ends_while_it_stops_repeats_zeros(monkeypatch, commands_left, zeros):
+    node, sent = object.__new__(DrivePattern), []
+    node._context = SimpleNamespace(ok=lambda: True)
+    node._route, node._stop_commands_left = (), commands_left
+    node._send = lambda *command: sent.append(command)
+    monkeypatch.setattr(SettledNode, 'destroy_node', lambda self: None, raising=False)
+    node.destroy_node()
+    assert sent == [(0.0, 0.0)] * zeros
 
 
 def test_another_publisher_of_commands_is_refused():
