@@ -125,8 +125,8 @@ class Code(Enum):
                                 'receiver.')
     FIXES_NOISIER_THAN_SAID = NOTE, ('Check the receiver and its sky view. Uncertainties were '
                                      'increased to match the residuals.')
-    FIX_OUTLIERS = NOTE, ('Check the antenna and its sky view. The comparison of track and fixes '
-                          'includes these fixes.')
+    FIX_OUTLIERS = NOTE, ('Check the antenna and its sky view, or the localisation. The '
+                          'comparison of track and fixes includes these fixes.')
     VELOCITY_UNUSABLE = NOTE, ('Publish east, north, up in m/s on fix_velocity, or set '
                                'gnss.use_velocity to false. The leg is estimated without it.')
     # the drive
@@ -156,7 +156,8 @@ class Code(Enum):
                               'odometer. Then drive again, or use the section before or after '
                               'this time (--leg). The value is a mean of both sections.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
-                            'static hold): unfiltered fixes contain more information.')
+                            'static hold) or the localisation: unfiltered fixes contain more '
+                            'information.')
     FIXES_FOLLOW_ODOMETER = CAUTION, ('Use positions that do not contain the wheel odometry. '
                                       'Receiver: the topic before fusion, or dead reckoning '
                                       'switched off. SLAM, AMCL, robot_localization: a source '

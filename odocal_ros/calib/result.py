@@ -169,6 +169,16 @@ class Calibration:
         return verdict_of(self.reasons)
 
 
+def has_local_positions(legs: Iterable[LegResult]) -> bool:
+    """Return True if the fixes of a leg are in a local frame: of SLAM, motion capture, ..."""
+    return any(reason.code is Code.LOCAL_FRAME for leg in legs for reason in leg.reasons)
+
+
+def name_antenna(words: str, local: bool) -> str:
+    """Return words about the antenna; with positions in a local frame it is a tracked point."""
+    return words.replace('antenna', 'tracked point') if local else words
+
+
 def raise_on_overflow() -> np.errstate:
     """Return a context in which overflow raises FloatingPointError instead of a warning."""
     return np.errstate(over='raise', divide='raise', invalid='raise')

@@ -41,13 +41,13 @@ DELAY_REMEDY = ('A delay changed between the legs, not the vehicle. Check the cl
 
 
 def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
-                 numbers: Sequence[int] | None = None) -> MethodResult:
+                 numbers: Sequence[int] | None = None, local: bool = False) -> MethodResult:
     """
     Return the result of one fit of all legs of one vehicle, the scale as in the last leg.
 
     results : those with a border, at least one.   times_ns : when each leg was driven.   config :
     limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, 1, 2, ... by
-    default; 0: legs of an earlier result.
+    default; 0: legs of an earlier result.   local : positions in a local frame.
 
     A value that no leg determines alone may be determined by all. If the legs disagree, the sigma
     includes their scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently
@@ -86,7 +86,8 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if undetermined:
-        refusals.append(not_observable_reason(f'these {len(legs)} drives', undetermined))
+        refusals.append(not_observable_reason(f'these {len(legs)} drives', undetermined,
+                                              local))
     sources = _error_sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None

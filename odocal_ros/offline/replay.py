@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='time series files, separated by commas or repeatable: trajectory.tum, states.csv, '
         'residuals.parquet, track.kml, scale_by_speed.png, debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
+    parser.set_defaults(brief=False)
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
@@ -154,6 +155,7 @@ def _terminal_size(stream: Any) -> tuple[int, int | None]:
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
     from odocal_ros.output.stored import objection_to_folder, stored_in
+    from odocal_ros.output.summary import sentence
     screen = _Screen(args)
     existing = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
@@ -173,7 +175,9 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
         if args.json:
             print_json(calibration.to_dict())
         elif not args.quiet:
-            _show_files(calibration.result, output, written, results.report * (not report_error))
+            _show_files(output, written, results.report * (not report_error))
+            if not args.brief:
+                print_text(sentence(calibration.result))      # again, since it scrolled away
         return _exit_code(calibration.result, calibration.config, args)
 
 
@@ -201,7 +205,7 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
     styled = (sys.stdout.isatty() and 'NO_COLOR' not in os.environ
               and os.environ.get('TERM') != 'dumb')
     try:
-        print_text(screen(calibration, styled, columns, rows and rows - 9))
+        print_text(screen(calibration, styled, columns, rows and rows - 9, args.brief))
         if args.holdout:
             print_text('\ntrack against fixes: last fifth of each leg, excluded from the fit')
         sys.stdout.flush()
@@ -210,13 +214,10 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
     return None
 
 
-def _show_files(calibration: 'Combined', output: Path, written: list[Path],
-                report: list[Path]) -> None:
-    from odocal_ros.output.summary import sentence
+def _show_files(output: Path, written: list[Path], report: list[Path]) -> None:
     columns, rows = _terminal_size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'
     print_text('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
                             break_on_hyphens=False) if rows else text))
     for path in report:
         print_text(f'report:  {path}')
-    print_text(sentence(calibration))      # again, since it scrolled away

@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     print_text('\n'.join(_overview(found, choices, options, args.settings)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
+    parser.set_defaults(brief=True)
     code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
     _open_report(output / 'report.html', args.no_browser)
     from odocal_ros.safe_io.text_formats import for_shell

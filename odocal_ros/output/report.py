@@ -10,7 +10,13 @@ from importlib.resources import files
 from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates, REASON_ESTIMATES
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.calib.result import (
+    Calibration,
+    Estimate,
+    has_local_positions,
+    LegResult,
+    MethodResult,
+)
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.plot_style import apply_style, Drawing
 from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
@@ -86,7 +92,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
         'why': _main_reason(calibration.reasons), 'rotation': rotation_text(calibration),
         'reasons': grouped(calibration.reasons), 'check': check_table(legs),
-        'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
+        'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods, legs),
         'inputs': content['inputs'],
         'settings': tables.changed_settings(config),
         'versions': tables.versions(content['software']),
@@ -123,8 +129,10 @@ def _readable_date(created: str) -> str:
         return created
 
 
-def _budgets(methods: dict[str, MethodResult]) -> list[tuple[str, dict[str, Any]]]:
-    found = [(tables.label(name), tables.budget_table(m)) for name, m in methods.items()]
+def _budgets(methods: dict[str, MethodResult],
+             legs: tuple[LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
+    local = has_local_positions(legs)
+    found = [(tables.label(name), tables.budget_table(m, local)) for name, m in methods.items()]
     return [(name, table) for name, table in found if table]
 
 
@@ -167,7 +175,7 @@ def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> 
                       ('IMU samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
-            'budgets': _budgets(methods) if several else [],
+            'budgets': _budgets(methods, (leg,)) if several else [],
             'check': check_table((leg,)),
             'reasons': grouped(leg.reasons) if several else [],
             'left_out': rows, 'findings': findings,

@@ -35,10 +35,11 @@ OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOP
            Code.REVERSING_UNSIGNED}
 
 
-def label(name: str) -> str:
+def label(name: str, local: bool = False) -> str:
+    """Return an estimate, method or error source in words; local : positions in a local frame."""
     if name in result.wheel_factors([name]):
         return f'scale factor, {name.removeprefix(result.FACTOR)} wheel'
-    return LABELS.get(name, name.replace('_', ' '))
+    return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
 def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
@@ -62,16 +63,16 @@ def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
 
 def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
-    rows = []
+    rows, local = [], result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
         estimate = known(calibration.estimates, name)
         if estimate.value is None:
             continue
         first, other, relative = in_units(name, estimate)
         largest, share = tables.largest_source(calibration.methods.get(estimate.method), name)
-        rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
-                     'method': label(estimate.method),
-                     'largest': f'{label(largest)} ({100 * share:.0f} %)' if largest else ''})
+        cause = f'{label(largest, local)} ({100 * share:.0f} %)' if largest else ''
+        rows.append({'name': label(name, local), 'value': first, 'other': other,
+                     'relative': relative, 'method': label(estimate.method), 'largest': cause})
     return rows
 
 
@@ -93,12 +94,13 @@ def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
 def undetermined(calibration: result.Calibration) -> list[str]:
     """Return the values that were not determined, axes of one quantity together."""
     axes: dict[str, list[str]] = {}
+    local = result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
         # without a nominal scale nothing is missing
         if known(calibration.estimates, name).value is None and name != 'scale_ratio':
             whole, _, axis = name.rpartition('_')
             one = axis in ('x', 'y', 'z')
-            axes.setdefault(label(whole if one else name), []).extend([axis] * one)
+            axes.setdefault(label(whole if one else name, local), []).extend([axis] * one)
     return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
@@ -119,17 +121,18 @@ def method_table(methods: dict[str, result.MethodResult],
         for method in methods.values():
             first, other, _ = in_units(name, known(method.estimates, name))
             cells.append(('-', '') if name not in method.estimates else (first, other))
-        rows.append((label(name), cells))
+        rows.append((label(name, result.has_local_positions(legs)), cells))
     return {'heads': [label(m) for m in methods],
             'verdicts': [tables.shown_verdict(m, legs) for m in methods.values()], 'rows': rows,
             'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
 
 
-def budget_table(method: result.MethodResult) -> dict[str, Any] | None:
+def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | None:
     """
     Return a method's error budget: heads, rows of (source, shared, cells), small sources.
 
     A cell is (sigma as text, share of the variance) or None below half a per cent.
+    local : positions in a local frame.
     """
     table = method.details.get('budget') or {}
     table = {s: row for s, row in table.items() if isinstance(row, dict)}
@@ -143,11 +146,11 @@ def budget_table(method: result.MethodResult) -> dict[str, Any] | None:
     for source, row in table.items():
         shares = [_number(row, n)**2 / w if w else 0.0 for n, w in zip(names, wholes, strict=True)]
         if max(shares, default=0.0) < worth_a_row:
-            small.append(label(source))
+            small.append(label(source, local))
             continue
         cells = [None if part < worth_a_row else (two_digits(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
-        rows.append((label(source), bool(row.get('shared')), cells))
+        rows.append((label(source, local), bool(row.get('shared')), cells))
     totals = [two_digits(math.sqrt(w) * f) for w, f in zip(wholes, factors, strict=True)]
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
 

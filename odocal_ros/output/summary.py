@@ -36,24 +36,28 @@ PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of 
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
+# what is shown: small errors, notes, budget
+SHORTER = ((True, True, True), (False, True, True), (False, False, True), (False, False, False))
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
            Verdict.REJECTED: 'do not use these values'}
 
 
 def screen(calibration: result.Calibration, styled: bool = False, width: int = WIDTH,
-           rows: int | None = None) -> str:
+           rows: int | None = None, brief: bool = False) -> str:
     """
-    Return the complete summary of a calibration as plain text.
+    Return the summary of a calibration as plain text.
 
     calibration : of all legs.   styled : the verdict in bold and in colour, for a terminal.
     width : columns; below 98 redundant or less useful parts are omitted.   rows : lines of the
     screen. If they are too few, small errors, notes and the whole budget are omitted, in this
-    order; verdict, values and actions are not.
+    order; verdict, values and actions are not.   brief : omit these, and tables of legs and
+    methods that repeat the values.
     """
-    for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
-                                 (False, False, False)):
+    for small, notes, budget in SHORTER[-1:] if brief else SHORTER:
         parts = [_head(calibration, styled), _values(calibration, width),
-                 _leg_table(calibration.legs, width), _method_table(calibration),
+                 [] if brief and len(calibration.legs) == 1 else _leg_table(calibration.legs,
+                                                                            width),
+                 [] if brief else tables.method_lines(calibration),
                  tables.search_lines(calibration.legs),
                  tables.track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
@@ -108,7 +112,7 @@ def driven(legs: tuple[result.LegResult, ...]) -> str:
 
 
 def _values(calibration: result.Calibration, width: int) -> list[str]:
-    estimates = calibration.estimates
+    estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in COUNTS:
@@ -134,7 +138,8 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= WIDTH else '')
             lines.append(_line(tables.source_label(name), text))
-    lines += [_arm(estimates, name, word, width) for name, word in ARMS.items()]
+    lines += [_arm(estimates, name, result.name_antenna(word, local), width)
+              for name, word in ARMS.items()]
     lines.append(_gyro_scale(calibration))
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
@@ -219,7 +224,8 @@ def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
         source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
-            found.append(f'{word}: {tables.source_label(source)} ({100 * part:.0f} %)')
+            label = tables.source_label(source, result.has_local_positions(calibration.legs))
+            found.append(f'{word}: {label} ({100 * part:.0f} %)')
     # lines are broken between the values only
     lines = textwrap.wrap('; '.join(found).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
     return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
@@ -256,27 +262,6 @@ def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     return columns(rows) + lines_of_bags(legs, width) if legs else []
 
 
-def _method_table(calibration: result.Calibration) -> list[str]:
-    """Return the table of methods, empty for a single one."""
-    methods = calibration.methods
-    if len(methods) < 2:
-        return []
-    rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
-    for name, method in methods.items():
-        scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
-        rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
-                     *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
-                       for a in angles),
-                     tables.shown_verdict(method, calibration.legs) + _refused(method)))
-    return columns(rows)
-
-
-def _refused(method: result.MethodResult) -> str:
-    """Return the first code for which a method is rejected, '' if it is not."""
-    codes = [r.code.name for r in method.reasons if r.code.severity is Verdict.REJECTED]
-    return f': {codes[0]}' if codes else ''
-
-
 def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
     estimates = leg_estimates(leg)
     scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
@@ -297,4 +282,4 @@ def _budget(calibration: result.Calibration, width: int, small: bool) -> list[st
     hidden = {name for name in estimates if known(estimates, name).value is None}
     shown = 0.01    # share of a variance from which a source is worth a line
     return tables.budget_lines(method.details.get('budget'), scale.value, shown, hidden, width,
-                               small)
+                               small, result.has_local_positions(calibration.legs))

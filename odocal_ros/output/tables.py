@@ -16,11 +16,20 @@ from odocal_ros.calib.result import (
     Estimate,
     LegResult,
     MethodResult,
+    name_antenna,
     PerDistance,
     TrackCheck,
     wheel_factors,
 )
-from odocal_ros.output.value_text import iso, known, length, table_row, two_digits
+from odocal_ros.output.value_text import (
+    columns,
+    iso,
+    known,
+    length,
+    table_row,
+    two_digits,
+    with_sigma,
+)
 from odocal_ros.pipeline.combination import overlapping_legs
 from odocal_ros.reasons import Verdict, verdict_of
 from odocal_ros.safe_io.text_formats import for_table
@@ -31,7 +40,8 @@ SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
 ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
-          'fix_latency': 'fix delay', 'gnss_delay': 'fix delay'}
+          'fix_latency': 'fix delay', 'gnss_delay': 'fix delay',
+          'receiver_smoothing': 'fix smoothing'}
 HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
 WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
 SIDES = 'before', 'after'
@@ -127,6 +137,28 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
 
 
+def method_lines(calibration: Calibration) -> list[str]:
+    """Return the lines of a table of methods, none for a single one."""
+    methods = calibration.methods
+    if len(methods) < 2:
+        return []
+    rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
+    for name, method in methods.items():
+        scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
+        rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
+                     *('-' if a.value is None else
+                       with_sigma(a.value, a.sigma, math.degrees(1.0), signed=True)
+                       for a in angles),
+                     shown_verdict(method, calibration.legs) + _refused(method)))
+    return columns(rows)
+
+
+def _refused(method: MethodResult) -> str:
+    """Return the first code for which a method is rejected, '' if it is not."""
+    codes = [r.code.name for r in method.reasons if r.code.severity is Verdict.REJECTED]
+    return f': {codes[0]}' if codes else ''
+
+
 def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
     """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
     twice = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
@@ -143,20 +175,22 @@ def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
     return (largest, parts[largest] / whole) if whole else ('', 0.0)
 
 
-def source_label(name: str) -> str:
-    return LABELS.get(name, name.replace('_', ' '))
+def source_label(name: str, local: bool = False) -> str:
+    """Return an error source or estimate in words; local : positions in a local frame."""
+    return name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
 def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: float,
                  hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
-                 small_too: bool = True) -> list[str]:
+                 small_too: bool = True, local: bool = False) -> list[str]:
     """
     Return the lines of a budget, none without one.
 
     table : source to one-sigma share of each parameter, as in calibration.json.   scale : scale
     factor of the scale column.   shown : share of the variance below which a source is only
     named.   hidden : parameters that are not determined: their column stays empty.
-    width : columns of the screen.   small_too : name the small ones.
+    width : columns of the screen.   small_too : name the small ones.   local : positions in a
+    local frame.
     """
     if not table:
         return []
@@ -169,12 +203,12 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
         shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
                   for p, whole in zip(PARAMETERS, wholes, strict=True)]
         if max(shares) < shown:
-            small.append(source_label(name))
+            small.append(source_label(name, local))
             continue
         cells = ['-' if share < shown else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
-        lines.append(table_row([source_label(name), *cells], WIDTHS)
+        lines.append(table_row([source_label(name, local), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))
     if not (small and small_too):
         return lines

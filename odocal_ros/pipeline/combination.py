@@ -13,7 +13,13 @@ import numpy as np
 from odocal_ros.calib.choice import choose, leg_estimates, relevant_reasons
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.marginal_information import CarriedInformation
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.calib.result import (
+    Calibration,
+    Estimate,
+    has_local_positions,
+    LegResult,
+    MethodResult,
+)
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix, wrap
@@ -57,7 +63,8 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
     methods = {name: _combine_method(name, [
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
-        if leg in used and name in leg.methods], config, before) for name in method_names}
+        if leg in used and name in leg.methods], config, before, has_local_positions(used))
+        for name in method_names}
     on_border = {name for leg in used for name, m in leg.methods.items() if m.marginal}
     estimates, estimating_methods = choose(methods, config.method)
     reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
@@ -110,7 +117,8 @@ def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
 
 def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequence[int],
                     config: Config, numbers: Sequence[int] | None = None,
-                    carried: CarriedInformation | None = None) -> MethodResult:
+                    carried: CarriedInformation | None = None,
+                    local: bool = False) -> MethodResult:
     """Return the result of a method for several legs, including carried ones if possible."""
     if carried and all(r.marginal for r in results):
         unknown = {parameter: Estimate(None, None, e.unit)
@@ -120,19 +128,19 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
     if len(results) > 1 and all(r.marginal for r in results):
         from odocal_ros.estimator.several import combine_legs
-        return combine_legs(results, times_ns, config, numbers)
+        return combine_legs(results, times_ns, config, numbers, local)
     ago_ns = max(times_ns) - np.asarray(times_ns)
     walked = config.verdict.scale_drift_per_day**2 * ago_ns / DAY_NS
     return combine_method(name, results, walked)
 
 
 def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
-                    carried: CarriedInformation | None) -> MethodResult:
+                    carried: CarriedInformation | None, local: bool) -> MethodResult:
     """Return a method's combination of the legs without rejection; of all if all have one."""
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,
-                               carried if usable else None)
+                               carried if usable else None, local)
     if usable or len(results) == 1:
         return combined
     rejections = dict.fromkeys(r for one in results for r in one.reasons

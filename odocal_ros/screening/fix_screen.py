@@ -225,7 +225,7 @@ def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
     listed = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
                        for begin, end, jump in spans[:SPANS_LISTED])
     more = f' and {len(spans) - SPANS_LISTED} more' * (len(spans) > SPANS_LISTED)
-    return found, (Reason(Code.FIXES_DEAD_RECKONED, 'the receiver dead-reckoned at '
+    return found, (Reason(Code.FIXES_DEAD_RECKONED, 'fixes were dead-reckoned at '
                           f'{listed}{more}: {int(found.sum())} of {len(t_fix)} fixes not used'),)
 
 

@@ -60,6 +60,7 @@ def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys)
     assert abs(scale['value'] - 0.0213) < 3 * scale['sigma'] < 3e-4 * 0.0213
     reasons = {r['code']: r for r in written['legs'][0]['reasons']}
     assert {'LOCAL_FRAME', 'COVARIANCE_UNKNOWN'} <= set(reasons)
+    assert 'antenna' not in printed.out
     for part in ('text', 'remedy'):
         assert 'reference.default_sigma' in reasons['COVARIANCE_UNKNOWN'][part]
 

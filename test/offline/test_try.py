@@ -71,6 +71,7 @@ def test_the_likeliest_topic_is_taken_and_the_command_gives_the_same(bag, tmp_pa
     assert 'odometer: /odometer, because it has the usual name; other candidates: /wheel/ticks ' \
         '(--odometer-topic)' in ' '.join(out.split())
     assert '  IMU: /imu/data\n  fix: /fix\n' in out
+    assert 'error budget' not in out
     command = out.rpartition('next time:\n')[2].strip()
     assert re.match(r'odocal replay bag --odometer-topic /odometer .*--force$', command)
     first = content_of(tmp_path / 'odocal_bag')

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
+from odocal_ros.output.report_tables import value_rows
 from odocal_ros.output.summary import screen, sentence
-from odocal_ros.output.tables import budget_lines, overall
+from odocal_ros.output.tables import budget_lines, overall, source_label
 from odocal_ros.output.value_text import (
     beyond_one,
     join_same_reasons,
@@ -195,6 +196,32 @@ def test_a_low_terminal_leaves_the_lesser_things_to_the_report(good):
     assert 'notes, see the report: TOPIC_GAP' in fits[30]
     assert 'error budget' not in fits[30]
     assert 'Drive gently' in fits[30], 'what to do is never left out'
+
+
+def test_a_brief_screen_repeats_nothing_and_names_the_notes_only(good):
+    full, brief = screen(whole(good)), screen(whole(good), brief=True)
+    assert len(brief.splitlines()) < len(full.splitlines()) - 15
+    for part in ('error budget', 'under 1 %', 'method  ', 'leg  start', 'TOPIC_GAP: a gap'):
+        assert part in full
+        assert part not in brief
+    for part in ('0.0500000 ± 0.0000012 m/pulse', 'Drive gently', 'notes, see the report: TOPIC'):
+        assert part in brief
+    several = replace(whole(good), legs=good.legs * 2)
+    assert 'leg  start' in screen(several, brief=True)
+
+
+def test_positions_in_a_local_frame_have_no_antenna(good):
+    arms = {f'antenna_lever_arm_{axis}': Estimate(0.5, 0.01, 'm', 'two_point') for axis in 'xyz'}
+    seen = replace(whole(good), estimates=good.estimates | arms)
+    note = (Reason(Code.LOCAL_FRAME, 'north is unknown'),)
+    local = replace(seen, legs=tuple(replace(leg, reasons=leg.reasons + note)
+                                     for leg in good.legs))
+    assert '  antenna at x, y, z  +0.50' in screen(seen)
+    assert '  tracked point at x, y, z +0.50' in screen(local)
+    assert 'antenna' not in screen(local)
+    assert [row['name'] for row in value_rows(local)[-3:]] == [
+        f'tracked point lever arm {axis}' for axis in 'xyz']
+    assert source_label('antenna_lever_arm') == 'antenna lever arm'
 
 
 def test_what_many_legs_say_in_other_figures_is_one_reason(good):

@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.mounting import FAR_YAW
-from odocal_ros.calib.result import Estimate, MethodResult, unknown_values
+from odocal_ros.calib.result import Estimate, MethodResult, name_antenna, unknown_values
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.fit import Fit
@@ -101,11 +101,15 @@ def configured_constants(leg: SmootherLeg) -> Floats:
     return value
 
 
-def not_observable_reason(drives: str, names: list[str]) -> Reason:
-    """Return the reason that constants keep their configured values; names: of estimates."""
+def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:
+    """
+    Return the reason that constants keep their configured values.
+
+    names : of estimates.   local : positions in a local frame.
+    """
     heights = all(name.endswith('_z') for name in names)
     return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
-                  f'{join_names(names)}; the configured values are used',
+                  f'{name_antenna(join_names(names), local)}; the configured values are used',
                   'Measure these heights and set them: turns, stops and starts hardly determine '
                   'them.' if heights else '')
 

@@ -88,7 +88,8 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     estimates |= of_wheels | gyro_bias
     ratio = {layout.CONSTANTS[i]: float(posterior.ratio[i])
              for i in (*OPTIONAL, *SCALES)} | bias_ratio
-    reasons += [*refusals, *wheel_reasons, *_without_estimate(fit, sigma, ratio, estimates)]
+    reasons += [*refusals, *wheel_reasons,
+                *_without_estimate(problem, fit, sigma, ratio, estimates)]
     reasons += assumed_noise_reasons(problem, fit.levels)
     reasons += check_limits(estimates, leg.nominal_scale, config)
     sources, border = _budget(leg, fit, marginals, posterior)
@@ -153,13 +154,14 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
             if ratio[name] < INFORMED_SHARE}, ratio
 
 
-def _without_estimate(fit: Fit, sigma: Floats, ratio: Mapping[str, float],
+def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[str, float],
                       estimates: Mapping[str, Estimate]) -> list[Reason]:
     """Return the reason for constants without an estimate that LEVER_ARM_OFF does not name."""
     named = {layout.CONSTANTS[i] for i in remarks.deviating_lever_arms(fit.state.constants, sigma)}
     names = [name for name in ratio if name in estimates and estimates[name].value is None
              and name not in named]
-    return [not_observable_reason('this drive', names)] if names else []
+    return [not_observable_reason('this drive', names, bool(problem.leg.origin.local))] \
+        if names else []
 
 
 def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,

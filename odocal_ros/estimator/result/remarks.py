@@ -236,9 +236,9 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     least_size = 0.1     # s: the age of a fix at 10 Hz is up to this
     if abs(square) <= max(REMARK_SIGMAS * sigma, least_size**2):
         return ()
-    what, time = ('averages its fixes', np.sqrt(square)) if square > 0 else (
-        'filters position and velocity', np.sqrt(-square / 2))
-    return (Reason(Code.FIXES_SMOOTHED, f'the receiver {what} with a time constant of about '
+    what, time = ('fixes are averaged', np.sqrt(square)) if square > 0 else (
+        'positions and velocities of the fixes are filtered', np.sqrt(-square / 2))
+    return (Reason(Code.FIXES_SMOOTHED, f'{what} with a time constant of about '
                    f'{time:.2f} s; accounted for'),)
 
 
