@@ -1,11 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Base class of the files of a bag: topics, messages and their number."""
+"""Base class of the files of a bag: topics, messages as CDR, and their number."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+import heapq
+from itertools import chain
+from operator import itemgetter
 import os
 from pathlib import Path
 from typing import Any
@@ -14,9 +17,11 @@ import numpy as np
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import RawMessages
-from odocal_ros.safe_io.limits import LATEST_NS
+from odocal_ros.safe_io.limits import Allowance, LATEST_NS, LimitReached
 
 PREALLOCATED_BYTES = 2**23      # judgement: bytes
+BATCH_MESSAGES = 20_000         # judgement
+ZSTD = b'\x28\xb5\x2f\xfd'      # format: first bytes of compressed data
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
 
 
@@ -69,20 +74,61 @@ class BagFile:
     """
     A file of a bag: its channels by number, their counts, first and last time.
 
+    ``path`` is the file that is read, ``recorded_path`` that of the user, which may be compressed.
     ``damage`` describes the damage found so far, empty if none; complete only after reading.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.damage = path, ''
+    def __init__(self, path: Path, allowance: Allowance) -> None:
+        self.path = self.recorded_path = path
+        self.damage = ''
+        self._allowance = allowance
         self.start_ns, self.end_ns, self.count = 2**63 - 1, 0, 0
         self._channels: dict[int, Channel] = {}
 
+    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch]:
+        """Yield the messages of some topics (name -> type), many at a time, decompressed."""
+        batches = self._fast_batches(topics)
+        first = next(batches, {}) if batches else {}
+        if batches and not any(raws[0][:4] == ZSTD for _, raws in first.values()):
+            yield from chain([first] * bool(first), batches)
+            return
+        del batches
+        stream = self._decompressed(self.messages(topics))
+        while batch := next_batch(stream):
+            yield batch
+
+    def stream(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
+        """Yield the same one by one in order of time, for merging; slower."""
+        channels = {c.topic: c for c in self.channels}
+        for batch in self.batches(topics):
+            lists = ([(time_ns, i, channels[topic], raw) for i, (time_ns, raw) in enumerate(
+                zip(times.tolist(), raws, strict=True))] for topic, (times, raws) in batch.items())
+            for time_ns, _, channel, raw in heapq.merge(*lists, key=itemgetter(0)):
+                yield channel, time_ns, raw
+
+    def _decompressed(self, stream: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
+        """Yield messages; if each is compressed separately, decompressed, b'' if that fails."""
+        first = next(stream, None)
+        if first is None:
+            return
+        stream = chain([first], stream)
+        if first[2][:4] != ZSTD:      # CDR starts with a zero byte
+            yield from stream
+        for channel, time_ns, raw in stream:
+            try:
+                raw = self._allowance.unpack('zstd', raw)
+            except (LimitReached, MemoryError):
+                raise
+            except Exception:   # a damaged message: readers count b'' as unreadable
+                raw = b''
+            yield channel, time_ns, raw
+
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
-        """Yield the messages of some topics (name -> type): channel, time and bytes."""
+        """Yield the messages as stored: Channel (or connection of rosbags), time ns and bytes."""
         raise NotImplementedError
 
-    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the same in batches by topic; None if only single messages are available."""
+    def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
+        """Return the messages as stored, in batches; None if the format has no fast reader."""
         return None
 
     def close(self) -> None:
@@ -115,6 +161,27 @@ class BagFile:
 
 def is_valid_time(time_ns: int) -> bool:
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS
+
+
+def next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
+    """Return the next messages of a stream as of ``BagFile.messages``, by topic; {} at the end."""
+    # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
+    # tuples takes as long as the reading itself)
+    found: dict[str, tuple[list[int], list[bytes]]] = {}
+    messages, size = BATCH_MESSAGES, 2**24      # bytes of them
+    for channel, time_ns, raw in stream:
+        try:
+            times, raws = found[channel.topic]
+        except KeyError:
+            times, raws = found[channel.topic] = [], []
+        times.append(time_ns)
+        raws.append(raw)
+        messages -= 1
+        size -= len(raw)
+        if messages <= 0 or size <= 0:
+            break
+    return {topic: (np.array(times, np.int64), RawMessages.of(raws))
+            for topic, (times, raws) in found.items()}
 
 
 def group_overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:

@@ -35,8 +35,7 @@ class McapFile(BagFile):
     """
 
     def __init__(self, path: Path, allowance: Allowance) -> None:
-        super().__init__(path)
-        self._allowance = allowance
+        super().__init__(path, allowance)
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._chunks: list[mcap.ChunkIndex] = []
         self._counted_damage = ''         # known damage when messages were counted
@@ -102,7 +101,7 @@ class McapFile(BagFile):
             yield channels[key], time_ns, raw
         self._recount()
 
-    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
+    def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
         """Return the messages in batches; None if the index is missing or of other chunks."""
         channels = self._channels_of(topics)
         chunks = [chunk for chunk in self._chunks

@@ -13,15 +13,16 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from odocal_ros.bagio.any_bag_file import AnyBagFile, next_batch
-from odocal_ros.bagio.bag_file import Batch, group_overlapping
-from odocal_ros.bagio.rosbags_readers import Types
+from odocal_ros.bagio.bag_file import BagFile, Batch, group_overlapping, next_batch
+from odocal_ros.bagio.mcap_file import McapFile
+from odocal_ros.bagio.rosbags_readers import Rosbag1File, Types
 from odocal_ros.bagio.sources import file_names, find_source, Source, unpack
+from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.safe_io.limits import is_file
+from odocal_ros.safe_io.limits import Allowance, Damaged, is_file
 
 LEAST_LOSS = 0.5   # s, judgement: shorter losses are not reported
 
@@ -41,7 +42,7 @@ class Bag:
     messages for the user: sentences, and reasons if they concern a result.
     """
 
-    def __init__(self, source: Source, parts: list[AnyBagFile], types: Types) -> None:
+    def __init__(self, source: Source, parts: list[BagFile], types: Types) -> None:
         self.name, self.files = source.name, source.files
         self._source, self._types = source, types
         self._parts = sorted((p for p in parts if p.count), key=lambda p: p.start_ns)
@@ -77,9 +78,9 @@ class Bag:
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
-            span = metadata.file_spans.get(part.path.name) or (
+            span = metadata.file_spans.get(part.recorded_path.name) or (
                 metadata.whole if len(self._parts) == 1 else None)
-            note = f'{part.path.name} is damaged ({part.damage})'
+            note = f'{part.recorded_path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
                 found.append(f'{note}, but all {span.count} messages were read')
                 continue
@@ -177,7 +178,7 @@ class Bag:
             yield from _merged(group, types)
 
 
-def _merged(parts: list[AnyBagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
+def _merged(parts: list[BagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
     """Yield the batches of files that overlap in time, merged; those of one file unchanged."""
     if len(parts) == 1:
         yield from parts[0].batches(topics)
@@ -210,11 +211,12 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
         raise BadBag(f'{path}: its serialization format is {foreign!r}, only cdr is supported; '
                      'convert the bag with ros2 bag convert')
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
-    parts, lost = [], []
+    parts: list[BagFile] = []
+    lost = []
     total = sum(path.stat().st_size for path in source.files if is_file(path))
     for path in source.files:
         try:
-            part = AnyBagFile(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
+            part = _open_file(path, folder, total, types)
         except BadBag as error:
             lost.append(error)
             continue
@@ -232,7 +234,21 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
     return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
 
 
-def _check_has_messages(path: Path | str, source: Source, parts: list[AnyBagFile]) -> None:
+def _open_file(path: Path, folder: Path, total: int, types: Types) -> BagFile:
+    """Return an open file of a bag of ``total`` bytes, unpacked into ``folder`` if needed."""
+    file, kind = unpack(path, folder, total)
+    allowance = Allowance(path, total)
+    try:
+        part: BagFile = (McapFile(file, allowance) if kind == '.mcap' else
+                         SqliteFile(file, allowance) if kind == '.db3' else
+                         Rosbag1File(file, allowance, types.cdr_from_ros1))
+    except (Damaged, ValueError) as error:
+        raise BadBag(f'{path}: cannot be read ({error})') from None
+    part.recorded_path = path
+    return part
+
+
+def _check_has_messages(path: Path | str, source: Source, parts: list[BagFile]) -> None:
     if any(part.count for part in parts):
         return
     damage = ' or '.join({part.damage for part in parts if part.damage})

@@ -187,15 +187,15 @@ def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> 
 
 class Rosbag1File(BagFile):
     """
-    A file of ROS 1.
+    A file of ROS 1; ``convert``: function of a message and its connection that returns CDR.
 
     rosbags allocates the sizes that the file states for index and chunks. Here the bytes read for
     the index are counted, and its decompressors are replaced by limited ones.
     """
 
     def __init__(self, path: Path, allowance: Allowance, convert: Callable[..., Any]) -> None:
-        super().__init__(path)
-        self._convert, self._allowance = convert, allowance
+        super().__init__(path, allowance)
+        self._convert = convert
         try:
             self._reader = self._opened(path)
         except (PermissionError, MemoryError, BadBag):

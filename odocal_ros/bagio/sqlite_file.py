@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from odocal_ros.bagio.bag_file import BagFile, Channel, FileBytes, FORMATS, is_valid_time
 from odocal_ros.errors import BadBag
-from odocal_ros.safe_io.limits import Damaged, factor, MESSAGE
+from odocal_ros.safe_io.limits import Allowance, Damaged, factor, MESSAGE
 
 LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
 # format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
@@ -154,8 +154,8 @@ class SqliteFile(BagFile):
     of the file limits the steps that sqlite takes for a query.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, allowance: Allowance) -> None:
+        super().__init__(path, allowance)
         self._opened = path.stat()
         self._size = self._opened.st_size
         self._leaf_pages: LeafPages | None = None

@@ -18,6 +18,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag, BadData
 from odocal_ros.reasons import Code
+from odocal_ros.safe_io.limits import Allowance
 
 pytestmark = pytest.mark.core
 
@@ -181,7 +182,7 @@ def test_a_checksum_finds_what_nothing_else_shows(copied):
 
 def test_a_database_that_is_being_written_is_refused(tmp_path):
     path = file_of(ros_bags.write(tmp_path / 'bag', ros_bags.drive(2.0), 'sqlite3'))
-    file = SqliteFile(path)
+    file = SqliteFile(path, Allowance(path, 1))
     rows = file.messages({'/imu/data': 'sensor_msgs/msg/Imu'})
     next(rows)
     with sqlite3.connect(path) as db:

@@ -17,7 +17,7 @@ import ros_bags
 from ros_bags import T0
 import ros_messages as make
 
-from odocal_ros.bagio import any_bag_file
+from odocal_ros.bagio import bag_file
 from odocal_ros.bagio.read import bag_sha256, open_bag
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadBag, BadData, BadUsage
@@ -101,7 +101,7 @@ def test_split_files_in_number_order(tmp_path, expected, storage):
 
 
 def test_files_that_overlap_are_merged_by_time(tmp_path, expected, monkeypatch):
-    monkeypatch.setattr(any_bag_file, 'BLOCK', 64)    # so that a topic crosses many batches
+    monkeypatch.setattr(bag_file, 'BATCH_MESSAGES', 64)    # so that a topic crosses many batches
     rows = ros_bags.drive()
     folder = tmp_path / 'both'
     folder.mkdir()

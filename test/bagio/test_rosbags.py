@@ -19,7 +19,6 @@ from rosbags.rosbag1 import reader
 from rosbags.rosbag2 import storage_mcap
 
 from odocal_ros.bagio import rosbags_readers, write
-from odocal_ros.bagio.any_bag_file import AnyBagFile
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.errors import BadBag
@@ -68,12 +67,12 @@ def test_a_rosbag1_whose_index_runs_in_circles(tmp_path, monkeypatch):
     data[at:at + 4] = (1000).to_bytes(4, 'little')
     path.write_bytes(data)
     with pytest.raises(BadBag, match='contains a cycle'):
-        AnyBagFile(path, path, '.bag', len(data), print)
+        rosbags_readers.Rosbag1File(path, Allowance(path, len(data)), print)
 
 
 def test_a_rosbag1_that_unpacks_to_more_than_it_may(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
-    part = AnyBagFile(path, path, '.bag', 2**40, lambda raw, _: raw)
+    part = rosbags_readers.Rosbag1File(path, Allowance(path, 2**40), lambda raw, _: raw)
     part._allowance.most = 1000
     with pytest.raises(LimitReached):
         list(part.batches({'/imu/data': 'sensor_msgs/msg/Imu'}))
