@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The converters of a CANedge session and of the Husky, on recordings made back from bags."""
+"""The converters of a CANedge session and of the Husky, on recordings made from bags."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from tools.canedge_bag import HEIGHT, IMU, POSITION, REPLY, SIGNALS, SPEED
 IMU_ROWS = 20_000          # of 286 219, for time
 START = 1_627_305_219_000_000_000
 TOPICS = {'/imu/data': '/imu/data', '/odom': '/husky_velocity_controller/odom', '/fix': '/gps/fix'}
-PLACE = 'latitude', 'longitude', 'altitude'
+POSITION_FIELDS = 'latitude', 'longitude', 'altitude'
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 
 
@@ -32,7 +32,7 @@ def frame(number, **signals):
     return np.atleast_1d(bits).astype('<u8').view(np.uint8).reshape(-1, 8)
 
 
-def together(parts):
+def merged_frames(parts):
     """Return stamps, identifiers and bytes of frames in their order."""
     stamp, ids, data = (np.concatenate(column) for column in zip(*(
         (stamp, np.full(len(stamp), number), data) for number, stamp, data in parts), strict=True))
@@ -53,7 +53,7 @@ def session():
     whole = START + np.arange(4) * 10**9
     other = reply([1, 2])
     other[:, 2] = 0x0C
-    return together([
+    return merged_frames([
         (IMU, whole, frame(IMU, fx=[9.5, 9.625, 0, 0], fy=[-0.625, 0, 0, 0], fz=[1.0, 0, 0, 0],
                            wx=[6.75, 0, 0, 0], wy=[0, -0.25, 0, 0], wz=[0.25, 0, 0, 0])),
         (REPLY, whole + 5, reply([0, 36, 36, 72])), (REPLY, whole[:2] + 7, other),
@@ -73,7 +73,7 @@ def test_signals_are_those_of_the_layout(session):
     np.testing.assert_allclose(twist['twist.linear.x'], [0, 10, 10, 20])
     np.testing.assert_array_equal(pulses['data'], [0, 50, 150, 300])     # 5, 10 and 15 m
     np.testing.assert_allclose(speed['twist.linear.x'], [0.015, 10.0, 10.001, 20.0])
-    np.testing.assert_allclose([fix[name] for name in PLACE],
+    np.testing.assert_allclose([fix[name] for name in POSITION_FIELDS],
                                [(55.87, -33.0), (9.86, -71.0), (80.0, 80.0)])
     np.testing.assert_allclose(fix['position_covariance'][:, [0, 4, 8]],
                                [[0.5, 0.5, 9], [24.5, 24.5, 9]])
@@ -81,15 +81,15 @@ def test_signals_are_those_of_the_layout(session):
 
 def test_the_recorded_drive_comes_back(data_dir):
     """The bag of the recording as frames, and these as a bag: the same messages."""
-    kept, said = {}, {}
+    stored, messages = {}, {}
     with AnyReader([data_dir / 'canedge_car_165' / 'bag']) as bag:
         for link, stamp, raw in bag.messages():
-            if link.topic == '/imu/data' and len(kept.get(link.topic, ())) == IMU_ROWS:
+            if link.topic == '/imu/data' and len(stored.get(link.topic, ())) == IMU_ROWS:
                 continue
-            kept.setdefault(link.topic, []).append((stamp, bytes(raw)))
-            said.setdefault(link.topic, []).append(bag.deserialize(raw, link.msgtype))
-    stamp = {topic: np.array([s for s, _ in rows]) for topic, rows in kept.items()}
-    imu, fix, speed = (said[topic] for topic in ('/imu/data', '/fix', '/fix_speed'))
+            stored.setdefault(link.topic, []).append((stamp, bytes(raw)))
+            messages.setdefault(link.topic, []).append(bag.deserialize(raw, link.msgtype))
+    stamp = {topic: np.array([s for s, _ in rows]) for topic, rows in stored.items()}
+    imu, fix, speed = (messages[topic] for topic in ('/imu/data', '/fix', '/fix_speed'))
     turn, force = (np.array([[getattr(getattr(m, field), axis) for axis in 'xyz'] for m in imu])
                    for field in ('angular_velocity', 'linear_acceleration'))
     variance = np.array([m.position_covariance[[0, 8]] for m in fix])
@@ -98,33 +98,34 @@ def test_the_recorded_drive_comes_back(data_dir):
             IMU, **{f'w{a}': np.rad2deg(turn[:, n]) for n, a in enumerate('xyz')},
             **{f'f{a}': force[:, n] for n, a in enumerate('xyz')})),
         (REPLY, stamp['/vehicle/twist'], reply(
-            np.round([m.twist.linear.x * 3.6 for m in said['/vehicle/twist']]))),
+            np.round([m.twist.linear.x * 3.6 for m in messages['/vehicle/twist']]))),
         (SPEED, stamp['/fix_speed'], frame(SPEED, speed=[m.twist.linear.x for m in speed])),
         (HEIGHT, stamp['/fix'], frame(
             HEIGHT, height=[m.altitude for m in fix], accuracy=np.sqrt(variance[:, 1]))),
         (POSITION, stamp['/fix'], frame(
             POSITION, valid=[1] * len(fix), latitude=[m.latitude for m in fix],
             longitude=[m.longitude for m in fix], accuracy=np.sqrt(2 * variance[:, 0])))]
-    for topic in canedge_bag.topics(*together(parts)):
+    for topic in canedge_bag.topics(*merged_frames(parts)):
         found = topic.pack(slice(None))
         np.testing.assert_array_equal(topic.time_ns, stamp[topic.name])
-        wanted = np.frombuffer(bytearray().join(raw for _, raw in kept[topic.name]),
-                               found.dtype)
-        for name in PLACE if topic.name == '/fix' else ():     # degrees were radians between
-            np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=1e-12)
-            wanted[name] = found[name]
-        assert found.tobytes() == wanted.tobytes(), topic.name
+        expected = np.frombuffer(bytearray().join(raw for _, raw in stored[topic.name]),
+                                 found.dtype)
+        # degrees were radians between
+        for name in POSITION_FIELDS if topic.name == '/fix' else ():
+            np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-12)
+            expected[name] = found[name]
+        assert found.tobytes() == expected.tobytes(), topic.name
 
 
 def as_ros1(message, kind):
-    made = {}
+    values = {}
     for field in dataclasses.fields(ROS1.types[kind]):
         if not field.init or field.name == '__msgtype__':
             continue
         value = 0 if field.name == 'seq' else getattr(message, field.name)
         inner = getattr(value, '__msgtype__', None)
-        made[field.name] = as_ros1(value, inner) if inner in ROS1.types else value
-    return ROS1.types[kind](**made)
+        values[field.name] = as_ros1(value, inner) if inner in ROS1.types else value
+    return ROS1.types[kind](**values)
 
 
 @pytest.fixture(scope='module')
@@ -146,32 +147,33 @@ def recording(data_dir, tmp_path_factory):
 def test_the_recording_of_the_husky_comes_back(recording, tmp_path):
     path, source = recording
     assert husky_bag.main([str(path), '--out', str(tmp_path)]) == 0
-    with AnyReader([source]) as bag, AnyReader([tmp_path / 'bag']) as made:
-        for topic in made.topics:
-            wanted, found = ([(arrival, one.deserialize(raw, link.msgtype)) for link, arrival, raw
-                              in one.messages([c for c in one.connections if c.topic == topic])]
-                             for one in (bag, made))
-            assert [arrival for arrival, _ in found] == [arrival for arrival, _ in wanted], topic
-            for (_, a), (_, b) in zip(found, wanted, strict=True):
+    with AnyReader([source]) as bag, AnyReader([tmp_path / 'bag']) as converted:
+        for topic in converted.topics:
+            expected, found = (
+                [(arrival, reader.deserialize(raw, link.msgtype)) for link, arrival, raw
+                 in reader.messages([c for c in reader.connections if c.topic == topic])]
+                for reader in (bag, converted))
+            assert [arrival for arrival, _ in found] == [arrival for arrival, _ in expected], topic
+            for (_, a), (_, b) in zip(found, expected, strict=True):
                 same(topic, a, b)
 
 
-def same(topic, found, wanted):
+def same(topic, found, expected):
     """Compare what a calibration uses of two messages."""
     if topic == '/odometer/pulses_derived':
-        assert abs(found.data - wanted.data) <= 1          # a rounding
+        assert abs(found.data - expected.data) <= 1          # a rounding
     elif topic == '/vehicle/twist':
-        assert found.twist.linear.x == wanted.twist.linear.x
+        assert found.twist.linear.x == expected.twist.linear.x
     elif topic == '/fix':
         np.testing.assert_allclose(
             [found.latitude, found.longitude, found.altitude],
-            [wanted.latitude, wanted.longitude, wanted.altitude], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(found.position_covariance, wanted.position_covariance)
-        assert found.status.status == wanted.status.status
+            [expected.latitude, expected.longitude, expected.altitude], rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(found.position_covariance, expected.position_covariance)
+        assert found.status.status == expected.status.status
     else:
         for field in ('angular_velocity', 'linear_acceleration'):
             np.testing.assert_array_equal(*(husky_bag.vectors([one], field)
-                                            for one in (found, wanted)))
+                                            for one in (found, expected)))
 
 
 def test_a_file_that_is_not_the_recording_is_refused(tmp_path, capsys):

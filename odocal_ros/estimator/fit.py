@@ -139,27 +139,28 @@ class _Progress:
         self.fitted = self.was_fitted = fitted      # in the next pass, in the last
         self.frozen, self.fewest, self.converged = frozen, fewest, False
         # of scale and mounting: sigmas, their relative change, the larger of it and the last step
-        self.sigma, self.change, self.last = np.ones(factor.PARAMETER_COUNT), np.inf, np.inf
-        self.move, self.taken = np.inf, np.zeros(layout.M)     # largest step in sigmas, all steps
+        self.sigma, self.change = np.ones(factor.PARAMETER_COUNT), np.inf
+        self.largest_change = self.largest_step = np.inf      # steps in sigmas
+        self.previous_step = np.zeros(layout.M)
 
-    def take(self, count: int, solved: Solved) -> None:
+    def update(self, count: int, solved: Solved) -> None:
         """Take the steps and sigmas of a pass."""
         sigma = np.sqrt(np.diag(solved.covariance))
         step = np.abs(solved.step_border / sigma)
-        self.move = float((step * np.where(sigma < FLAT_SIGMAS, STEP_WEIGHTS, 0.0)).max())
+        self.largest_step = float((step * np.where(sigma < FLAT_SIGMAS, STEP_WEIGHTS, 0.0)).max())
         before, self.sigma, last_change = self.sigma, sigma[:factor.PARAMETER_COUNT], self.change
         self.change = np.abs(np.log(self.sigma / before)).max()
-        self.last = max(step[:factor.PARAMETER_COUNT].max(), self.change)
+        self.largest_change = max(step[:factor.PARAMETER_COUNT].max(), self.change)
         steady = count > self.fewest and last_change < CONVERGENCE.max_last_sigma_change \
             and self.change < min(CONVERGENCE.max_sigma_change, last_change)
-        self.converged = bool(self.fitted and self.move < CONVERGENCE.max_step
+        self.converged = bool(self.fitted and self.largest_step < CONVERGENCE.max_step
                               and (self.frozen or steady))
         first_fitted, self.was_fitted = self.fitted and not self.was_fitted, self.fitted
-        self.fitted = first_fitted or self.move < (
+        self.fitted = first_fitted or self.largest_step < (
             CONVERGENCE.measured_above if self.fitted else CONVERGENCE.fitted_below)
         # the first step by the fitted signal may take back all of the one before
         fits_next = self.fitted and not self.was_fitted
-        self.taken = np.zeros(layout.M) if fits_next else solved.step_border
+        self.previous_step = np.zeros(layout.M) if fits_next else solved.step_border
 
 
 def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40, *,
@@ -186,12 +187,12 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     while True:
         count += 1
         weighted = Equations(problem, state, priors, variance_factors, progress.fitted).at(levels)
-        solved = damp_step(weighted.solved(), progress.taken)
-        progress.take(count, solved)
+        solved = damp_step(weighted.solved(), progress.previous_step)
+        progress.update(count, solved)
         state = state.moved(solved.step, solved.step_border)
         weighted.apply_step(solved)
         if trace is not None:
-            trace(count, state, levels, weighted, solved, progress.move)
+            trace(count, state, levels, weighted, solved, progress.largest_step)
         if progress.converged or count >= max_iterations:
             break
         if count == sample_size_pass:
@@ -207,8 +208,8 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
                 priors = relax_priors(first, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # the largest memory of a long leg
-    converged = progress.converged or bool(progress.last < CONVERGENCE.max_final_step)
-    slowly_converging = not converged and bool(progress.last < CONVERGENCE.max_slow_step)
+    converged = progress.converged or bool(progress.largest_change < CONVERGENCE.max_final_step)
+    slowly_converging = not converged and bool(progress.largest_change < CONVERGENCE.max_slow_step)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, variance_factors, converged or slowly_converging,
@@ -216,15 +217,15 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
                find_constant_steps(weighted, solved))
 
 
-def damp_step(solved: Solved, taken: Floats) -> Solved:
+def damp_step(solved: Solved, previous_step: Floats) -> Solved:
     """
     Return the step, shortened if it reverses the previous step, docs/method.md (S27a).
 
     Gauss-Newton omits residuals times second derivatives. They can be as large as the information
     on a constant; full steps then oscillate.
     """
-    before = float(taken @ solved.reduced @ taken)
-    along = float(taken @ solved.reduced @ solved.step_border)
+    before = float(previous_step @ solved.reduced @ previous_step)
+    along = float(previous_step @ solved.reduced @ solved.step_border)
     back = along / before if before > 0 else 0.0
     by = 1 / (1 - back) if back < TURNS_BACK else 1.0
     return replace(solved, step=by * solved.step, step_border=by * solved.step_border, taken=by)

@@ -230,15 +230,15 @@ class Plan:
         """Return the sigma that will be stated, relative or rad; None: not determined."""
         return self.estimates[parameter].sigma
 
-    def by(self, parameter: str) -> str:
+    def method_of(self, parameter: str) -> str:
         """Return the method that will give a parameter, empty: none."""
         estimate = self.estimates[parameter]
         return estimate.method if estimate.value is not None else ''
 
     @property
-    def giving(self) -> tuple[str, ...]:
+    def methods_used(self) -> tuple[str, ...]:
         """Return the methods that will give any parameter of interest."""
-        names = (self.by(p) for p in self.two_point.method.parameters)
+        names = (self.method_of(p) for p in self.two_point.method.parameters)
         return tuple(dict.fromkeys(name for name in names if name))
 
     @property
@@ -268,7 +268,7 @@ class Plan:
             if name == 'smoother':
                 own = tuple(r for r in self.reasons_of(name) if r in own
                             or r.code.name.endswith('_NOT_DETERMINED'))
-            elif name not in self.giving:
+            elif name not in self.methods_used:
                 own = tuple(r for r in own if r.code.severity is Verdict.REJECTED)
             reasons += [r for r in own if r not in reasons]
         return tuple(reasons)

@@ -111,18 +111,18 @@ class Calibration:
         return ax
 
     def save(self, folder: Path | str, force: bool = False,
-             tell: Callable[[str], None] = lambda note: None) -> list[Path]:
+             warn: Callable[[str], None] = lambda note: None) -> list[Path]:
         """
         Write all result files; return their paths, calibration.json first.
 
-        ``tell`` receives a sentence if the report cannot be drawn.
+        ``warn`` receives a sentence if the report cannot be drawn.
 
         Raises BadUsage: a calibration.json exists and ``force`` is not set, or the folder is not
         writable.
         """
         from odocal_ros.output.files import write_results
         return write_results(self.result, self.config, Path(folder), list(self.inputs),
-                             self.created, force=force, tell=tell)
+                             self.created, force=force, warn=warn)
 
     def export(self, *files: Path | str) -> list[Path]:
         """

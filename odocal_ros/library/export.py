@@ -92,7 +92,7 @@ def kml(columns: Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
-        raise BadUsage(f'export: track.kml: {export_pictures.LOCAL}')
+        raise BadUsage(f'export: track.kml: {export_pictures.NOT_ON_A_MAP}')
     root = ElementTree.Element(f'{{{KML}}}kml')
     document = ElementTree.SubElement(root, f'{{{KML}}}Document')
     for leg in np.unique(columns['leg']).tolist():

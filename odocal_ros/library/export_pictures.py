@@ -18,9 +18,10 @@ from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RE
 from odocal_ros.output.program_files import features
 
 POINTS = 400     # judgement: of a line or of the fixes, for a small file
-LOCAL = ('the positions are in a local frame, which has no place on a map; use trajectory.csv or '
-         'trajectory.tum')
-FIT = {'factor': 'm_per_unit', 'offset': 'm_per_s', 'lag': 's'}
+NOT_ON_A_MAP = ('the positions are in a local frame, which has no place on a map; use '
+                'trajectory.csv or trajectory.tum')
+# estimates of SpeedScale and their units in the names of columns
+FIT_UNITS = {'factor': 'm_per_unit', 'offset': 'm_per_s', 'lag': 's'}
 
 
 def draw_map(result: Calibration, path: Path) -> None:
@@ -32,7 +33,7 @@ def draw_map(result: Calibration, path: Path) -> None:
     shapes = [feature for number, leg in enumerate(result.legs, 1)
               for feature in features(number, leg, POINTS)]
     if not shapes:
-        raise BadUsage(f'export: {path}: {LOCAL}')
+        raise BadUsage(f'export: {path}: {NOT_ON_A_MAP}')
     with apply_style():
         save_figure(map_figure(shapes), path)
 
@@ -42,12 +43,12 @@ def map_figure(shapes: list[dict[str, Any]]) -> Any:
     figure = new_figure(6.0, 4.8)
     ax = figure.add_subplot(facecolor='#eef1ea')
     for shape in shapes:
-        _draw(ax, shape)
+        _draw_feature(ax, shape)
     _add_map_scale(ax)
     return figure
 
 
-def _draw(ax: Any, shape: dict[str, Any]) -> None:
+def _draw_feature(ax: Any, shape: dict[str, Any]) -> None:
     """Draw one feature; each kind is labelled once."""
     kind, geometry = shape['properties']['kind'], shape['geometry']
     style: dict[str, Any] = {
@@ -87,11 +88,11 @@ def _add_map_scale(ax: Any) -> None:
 
 
 def _legs_with_speed_scale(result: Calibration) -> list[tuple[int, SpeedScale]]:
-    found = [(number, leg.evidence.by_speed) for number, leg in enumerate(result.legs, 1)
-             if leg.evidence is not None and len(leg.evidence.by_speed.bins)]
-    if not found:
+    legs = [(number, leg.evidence.by_speed) for number, leg in enumerate(result.legs, 1)
+            if leg.evidence is not None and len(leg.evidence.by_speed.bins)]
+    if not legs:
         raise BadUsage('no leg has enough sections in motion for a scale against speed')
-    return found
+    return legs
 
 
 def scale_by_speed(result: Calibration) -> Series:
@@ -104,13 +105,13 @@ def scale_by_speed(result: Calibration) -> Series:
     Raises BadUsage: no leg has enough sections.
     """
     parts = []
-    for number, one in _legs_with_speed_scale(result):
-        n = len(one.bins)
+    for number, speed_scale in _legs_with_speed_scale(result):
+        n = len(speed_scale.bins)
         columns = {'leg': np.full(n, number)} | dict(zip(
-            ('speed_m_per_s', 'ratio', 'ratio_sigma'), one.bins.T[:3], strict=True))
-        columns['sections'] = one.bins[:, 3].astype(int)
-        for name, unit in FIT.items():
-            value, sigma = getattr(one, name) or (np.nan, np.nan)
+            ('speed_m_per_s', 'ratio', 'ratio_sigma'), speed_scale.bins.T[:3], strict=True))
+        columns['sections'] = speed_scale.bins[:, 3].astype(int)
+        for name, unit in FIT_UNITS.items():
+            value, sigma = getattr(speed_scale, name) or (np.nan, np.nan)
             columns |= {f'{name}_{unit}': np.full(n, value),
                         f'{name}_sigma_{unit}': np.full(n, sigma)}
         parts.append(columns)
@@ -121,12 +122,12 @@ def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
     from odocal_ros.output.scale_plots import draw_by_speed, fit_text
     most = 8     # legs in one picture, the newest
-    found = _legs_with_speed_scale(result)[-most:]
-    figure = new_figure(7.0, 3.2 * len(found))
-    for ax, (number, one) in zip(figure.subplots(len(found), 1, squeeze=False)[:, 0], found,
-                                 strict=True):
-        draw_by_speed(ax, one)
-        title = [f'Scale against speed, leg {number}', *wrap(fit_text(one), 90)]
+    legs = _legs_with_speed_scale(result)[-most:]
+    figure = new_figure(7.0, 3.2 * len(legs))
+    axes = figure.subplots(len(legs), 1, squeeze=False)[:, 0]
+    for ax, (number, speed_scale) in zip(axes, legs, strict=True):
+        draw_by_speed(ax, speed_scale)
+        title = [f'Scale against speed, leg {number}', *wrap(fit_text(speed_scale), 90)]
         ax.set_title('\n'.join(title), fontsize=8)
         ax.legend(frameon=False, fontsize=8)
     save_figure(figure, path)

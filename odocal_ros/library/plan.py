@@ -113,21 +113,21 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
     if before.sigma(SCALE) is None:
         return []
     other = {'two_point': predict(drive.turn_around(), sigmas).method}
-    left: dict[str, float | None] = {}
+    sigmas_of_both: dict[str, float | None] = {}
     for parameter in (SCALE, YAW):
-        left[parameter] = None
-        name = before.by(parameter)
+        sigmas_of_both[parameter] = None
+        name = before.method_of(parameter)
         if not name:
             continue
-        one = before.methods[name]
+        first = before.methods[name]
         # the smoother works in body axes: the direction of the drive does not matter
-        both = combine_results(name, [_whole(one), _whole(other.get(name, one))],
-                               (0, round(drive.duration * 1e9)), sigmas.config)
-        left[parameter] = both.estimates[parameter].sigma
-    return [Change('a second leg in the other direction', left)]
+        legs = [_with_dummy_values(leg) for leg in (first, other.get(name, first))]
+        both = combine_results(name, legs, (0, round(drive.duration * 1e9)), sigmas.config)
+        sigmas_of_both[parameter] = both.estimates[parameter].sigma
+    return [Change('a second leg in the other direction', sigmas_of_both)]
 
 
-def _whole(method: MethodResult) -> MethodResult:
+def _with_dummy_values(method: MethodResult) -> MethodResult:
     """Return the method with dummy values of undetermined parameters, so that legs combine."""
     known = {name: e if e.value is not None else Estimate(0.0, 0.0, e.unit)
              for name, e in method.estimates.items()}
@@ -149,7 +149,7 @@ class Planned(Plan):
     sigmas: Sigmas
 
     @cached_property
-    def helps(self) -> list[Change]:
+    def improvements(self) -> list[Change]:
         """Return the computed improvements; this takes some seconds."""
         return changes(self.drive, self.sigmas, self)
 
@@ -165,7 +165,7 @@ class Planned(Plan):
                        'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time,
                        'pulse': sigmas.quantum, 'sway': sigmas.sway, 'slip_walk': sigmas.slip},
             'verdict': self.verdict.value, 'reasons': [r.as_dict() for r in self.reasons],
-            'estimates': {name: {'sigma': self.sigma(name), 'method': self.by(name) or None}
+            'estimates': {name: {'sigma': self.sigma(name), 'method': self.method_of(name) or None}
                           for name in PARAMETERS},
             'methods': {name: {
                 'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
@@ -173,7 +173,7 @@ class Planned(Plan):
                 'reasons': [r.as_dict() for r in self.reasons_of(name)],
                 'budget': method.details.get('budget', {})}
                 for name, method in self.methods.items()},
-            'changes': [{'text': c.text, **c.sigmas} for c in self.helps]}
+            'changes': [{'text': c.text, **c.sigmas} for c in self.improvements]}
 
 
 def plan(*, distance: float | None = None, speed: float | None = None,

@@ -15,7 +15,7 @@ from odocal_ros.messages.message_fields import FIX, IMU, LOCAL_TYPES, TRANSFORMS
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.settings.config import Config, OdometerConfig
 
-NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
+SYSTEM_TOPICS = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # to a vehicle, not measured
 # poses that a person sets: Nav2 and RViz
 GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
@@ -32,7 +32,8 @@ NO_MESSAGES_REMEDY = 'Check the driver and the QoS of the recorder, then record 
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
 REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
-FIRST = ('odometer_right', 'odometer', 'heading')     # chosen first; others take the rest
+# slots in the order of choice; the others are chosen from the remaining topics
+CHOSEN_FIRST = ('odometer_right', 'odometer', 'heading')
 
 Topics = dict[str, TopicInfo]
 
@@ -48,7 +49,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
     fit. All such inputs are named at once, with the option that selects each.
     """
-    chosen = {slot: topic_named(topics, slot, topic) for slot, topic in overrides.items()}
+    chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
     if marked and 'fix' in chosen:
         raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
@@ -60,7 +61,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
         found = candidates(topics, slot, config, chosen)
         if len(found) == 1:
             chosen[slot] = found[0]
-        elif not _optional(slot, config, found):
+        elif not _is_optional(slot, config, found):
             errors.append(_open_slot_text(topics, slot, found, config, chosen))
     if errors:
         raise BadUsage('; '.join(errors) + (
@@ -74,8 +75,8 @@ def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
     surveyed = config.reference.start and config.reference.end or (
         config.reference.marks or marked)
     slots = [slot for slot in config.inputs if not (slot == 'fix' and surveyed)]
-    return (*(slot for slot in FIRST if slot in slots),
-            *(slot for slot in slots if slot not in FIRST))
+    return (*(slot for slot in CHOSEN_FIRST if slot in slots),
+            *(slot for slot in slots if slot not in CHOSEN_FIRST))
 
 
 def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]) -> list[str]:
@@ -83,29 +84,29 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     types = _types(slot, config)
     taken = set(chosen.values())
     found = [t.name for t in topics.values()
-             if t.count and t.msgtype in types and t.name not in NEVER and t.name not in taken
-             and '/calibrator/' not in t.name]
+             if t.count and t.msgtype in types and t.name not in taken
+             and t.name not in SYSTEM_TOPICS and '/calibrator/' not in t.name]
     if slot in ('odometer', 'odometer_right'):
-        found = [name for name in found if not _has(name, COMMANDS)]
+        found = [name for name in found if not _contains(name, COMMANDS)]
         found = without_estimates(found)
         if config.odometer.own_topics:
             found = [name for name in found if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
-            return [name for name in found if _last(name) == 'heading']
+            return [name for name in found if _base_name(name) == 'heading']
         # the only one is the IMU's
         alone = len(found) == 1 and 'imu' not in chosen
         found = [name for name in found if 'heading' in name] or ([] if alone else found)
     elif slot == 'imu':
-        found = _unless_all(found, ('heading',))
+        found = _preferably_without(found, ('heading',))
     elif slot == 'fix':
         found = [name for name in found if topics[name].msgtype == FIX] or [
-            name for name in found if not _has(name, (*COMMANDS, *GOALS))]
-        found = _unless_all(found, ('filtered', 'fused'))
+            name for name in found if not _contains(name, (*COMMANDS, *GOALS))]
+        found = _preferably_without(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
-        found = [name for name in found if _of_receiver(name)]
+        found = [name for name in found if _is_of_receiver(name)]
         # by the name of the node's input
-        found = [name for name in found if _last(name) == slot] or found
+        found = [name for name in found if _base_name(name) == slot] or found
     return found
 
 
@@ -132,7 +133,7 @@ def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str,
             f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
 
 
-def _optional(slot: str, config: Config, found: list[str]) -> bool:
+def _is_optional(slot: str, config: Config, found: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
         return not found and not config.odometer.needs_imu
@@ -140,10 +141,11 @@ def _optional(slot: str, config: Config, found: list[str]) -> bool:
         slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
 
-def _of_receiver(name: str) -> bool:
+def _is_of_receiver(name: str) -> bool:
     """Return True if the name of a topic has a receiver word and no word of another source."""
     return (any(word.startswith(GNSS) for word in re.split('[/_]', name.lower()))
-            and not _has(name, (*COMMANDS, 'filtered', 'fused', 'ekf', 'odom', 'wheel', 'speed')))
+            and not _contains(name, (*COMMANDS, 'filtered', 'fused', 'ekf', 'odom', 'wheel',
+                                     'speed')))
 
 
 def _types(slot: str, config: Config) -> Iterable[str]:
@@ -152,8 +154,8 @@ def _types(slot: str, config: Config) -> Iterable[str]:
     return tuple(map(full_type, types_of(slot, config.odometer))) or ODOMETERS
 
 
-def topic_named(topics: Topics, slot: str, topic: str) -> str:
-    """Return the topic that a user named, with or without its leading slash."""
+def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
+    """Return the name in the bag of a topic that the user named; raise BadUsage if unusable."""
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
         similar = difflib.get_close_matches(topic, topics, 1)
@@ -213,19 +215,21 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
 
 def _described(topics: Topics, names: Iterable[str]) -> str:
     """Return the topics that have messages, with their types, as text."""
-    return ', '.join(f'{name} ({topics[name].msgtype})' for name in names
-                     if topics[name].count and name not in NEVER) or 'no topic with messages'
+    shown = [name for name in names if topics[name].count and name not in SYSTEM_TOPICS]
+    return ', '.join(f'{name} ({topics[name].msgtype})' for name in shown) or (
+        'no topic with messages')
 
 
-def _last(name: str) -> str:
-    """Return the last part of a topic's name, which distinguishes wheels."""
+def _base_name(name: str) -> str:
+    """Return the last part of a topic's name."""
     return name.rstrip('/').rpartition('/')[2]
 
 
-def _has(name: str, words: Iterable[str]) -> bool:
+def _contains(name: str, words: Iterable[str]) -> bool:
+    """Return True if the name of a topic contains one of some words."""
     return any(word in name.lower() for word in words)
 
 
-def _unless_all(found: list[str], words: Iterable[str]) -> list[str]:
+def _preferably_without(found: list[str], words: Iterable[str]) -> list[str]:
     """Return the topics without such a word in their name; all, if none are left."""
-    return [name for name in found if not _has(name, words)] or found
+    return [name for name in found if not _contains(name, words)] or found

@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.library.topics import COMMANDS, GNSS, NEVER, without_estimates
+from odocal_ros.library.topics import COMMANDS, GNSS, SYSTEM_TOPICS, without_estimates
 from odocal_ros.messages.decode import Deserialize
 from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
@@ -208,7 +208,7 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
 def _may_be_odometer(info: TopicInfo) -> bool:
     """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
-    return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in NEVER
+    return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in SYSTEM_TOPICS
             and package not in STANDARD and '/calibrator/' not in info.name
             and not any(word.startswith((*RECEIVER, *COMMANDS))
                         for word in re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())))

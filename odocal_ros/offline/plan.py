@@ -13,7 +13,7 @@ from odocal_ros.offline.cli import print_json, print_text
 from odocal_ros.offline.replay import settings_from_arguments
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading')
-NOISE = {'white': 0.0, 'correlated': 60.0}
+FIX_CORRELATION_TIMES = {'white': 0.0, 'correlated': 60.0}      # s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--heading-sigma-deg', type=float, metavar='DEG', help='uncertainty of the heading')
     add('--fix-sigma', type=float, metavar='M', help='horizontal error of a fix, each axis '
         '(default 1.5)')
-    add('--fix-noise', choices=tuple(NOISE), help='fix errors: correlated (60 s, typical of '
-        'receivers) or white (default correlated)')
+    add('--fix-noise', choices=tuple(FIX_CORRELATION_TIMES), help='fix errors: correlated (60 s, '
+        'typical of receivers) or white (default correlated)')
     add('--fix-rate', type=float, metavar='HZ', help='fix rate, Hz (default 5)')
     add('--rtk', action='store_true', help='fixes of 0.02 m')
     add('--pulse', type=float, metavar='M', help='metres per pulse, for the quantisation '
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         'scenario', 'duration', 'gpx', 'bag', 'distance', 'speed', 'standstill', 'turns',
         'acceleration')}
     topics = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
-    planned = plan(**drive, topics=topics, config=_config(args), **_figures(args))
+    planned = plan(**drive, topics=topics, config=_config(args), **_sigma_options(args))
     if args.json:
         print_json(planned.to_dict())
     else:
@@ -110,11 +110,12 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
     if args.heading_source:
         settings['alignment.heading_source'] = args.heading_source
     if args.fix_noise:
-        settings['gnss.correlation_time'] = NOISE[args.fix_noise]
+        settings['gnss.correlation_time'] = FIX_CORRELATION_TIMES[args.fix_noise]
     return settings
 
 
-def _figures(args: argparse.Namespace) -> dict[str, Any]:
+def _sigma_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the requested fields of ``forecast.predict.Sigmas``."""
     from odocal_ros.library.plan import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')

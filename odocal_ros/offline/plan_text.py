@@ -18,7 +18,7 @@ WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 def screen(planned: Planned) -> str:
     return '\n'.join([*_head(planned), '', *_methods(planned), '', *_budgets(planned),
-                      *_helps(planned), *_reasons(planned)])
+                      *_improvements(planned), *_reasons(planned)])
 
 
 def indoor_screen(runs: list[PlannedRun]) -> str:
@@ -84,7 +84,7 @@ def _result(before: Plan) -> str:
     """Return the line that names the method of each value."""
     by: dict[str | None, list[str]] = {}
     for parameter in PARAMETERS:
-        by.setdefault(before.by(parameter), []).append(WORDS[parameter])
+        by.setdefault(before.method_of(parameter), []).append(WORDS[parameter])
     return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all values"} '
                      f'{"from " + method if method else "unknown"}'
                      for method, names in by.items())
@@ -104,7 +104,7 @@ def _budgets(before: Plan) -> list[str]:
     """Return the main error sources of each method that will provide a value."""
     out = []
     shown = 0.01    # share of the variance from which a source has its row
-    for name in before.giving:
+    for name in before.methods_used:
         method = before.methods[name]
         hidden = [p for p in PARAMETERS if method.estimates[p].sigma is None]
         lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
@@ -114,10 +114,10 @@ def _budgets(before: Plan) -> list[str]:
     return out
 
 
-def _helps(before: Planned) -> list[str]:
+def _improvements(before: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(before.helps, before, parameter), WORDS[parameter]
+        best, word = ranked(before.improvements, before, parameter), WORDS[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
         lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '

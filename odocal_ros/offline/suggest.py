@@ -3,12 +3,12 @@
 
 """Most likely topics of the inputs of a bag, and the replay command with these topics."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import candidates, choose_topics, required_slots, topic_named
+from odocal_ros.library.topics import candidates, choose_topics, required_slots, resolve_topic
 from odocal_ros.messages.message_fields import FIX
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.config import Config, with_settings
@@ -21,22 +21,24 @@ OTHER_DEVICE_WORDS = ('zed', 'camera', 'lidar', 'livox', 'ouster')
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
-                   still: Collection[str] = ()) -> tuple[dict[str, str], Config]:
+                   not_following: Collection[str] = ()) -> tuple[dict[str, str], Config]:
     """
     Return slot -> most likely topic, and the settings that this mapping needs.
 
-    still : odometer topics that do not grow with the path of the fixes, while another does.
+    not_following : odometer topics that do not grow with the path of the fixes, while another
+    does.
     """
-    chosen = {slot: topic_named(topics, slot, topic) for slot, topic in overrides.items()}
+    chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
             pair := _left_right_pair(topics, [
-                t for t in candidates(topics, 'odometer', config, chosen) if t not in still])):
+                t for t in candidates(topics, 'odometer', config, chosen)
+                if t not in not_following])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         chosen['odometer'], chosen['odometer_right'] = pair
     for slot in required_slots(config):
         found = [] if slot in chosen else candidates(topics, slot, config, chosen)
         if found:
-            chosen[slot] = min(found, key=lambda name: _rank(slot, topics[name], still))
+            chosen[slot] = _sorted_topics(topics, slot, found, not_following)[0]
     return chosen, config
 
 
@@ -48,40 +50,42 @@ def _left_right_pair(topics: dict[str, TopicInfo], unused: list[str]) -> tuple[s
     return pairs[0] if len(pairs) == 1 else None
 
 
-def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str, ...]:
-    """Return a sort key: moving topics, counters, usual names, more messages first."""
+def _sort_keys(slot: str, info: TopicInfo, not_following: Collection[str]) -> dict[str, int | str]:
+    """Return sort keys of a topic by the reason that each stands for; the smallest is best."""
     usual_name = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
-    kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
-    name = info.name.lower()
-    name_score = int('rtk' in name if slot == 'fix'
-                     else not any(w in name for w in OTHER_DEVICE_WORDS))
+    name, kind = info.name.lower(), 0
+    fits = int('rtk' in name if slot == 'fix'
+               else not any(w in name for w in OTHER_DEVICE_WORDS))
     if 'odometer' in slot:
-        name_score = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
-    return (info.name in still, kinds[0] if 'odometer' in slot else 0,
-            not info.name.endswith(usual_name), -name_score, -info.count, info.name)
+        fits = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
+        kind = next(i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype)
+    return {'it grows with the distance between the fixes': info.name in not_following,
+            'counts are preferred to joint angles, and angles to speeds': kind,
+            'it has the usual name': not info.name.endswith(usual_name), 'its name fits': -fits,
+            'it has the most messages': -info.count, 'it is the first by name': info.name}
 
 
-# reasons for a topic, by the first element of the ranks that differs
-RANK_REASONS = ('it grows with the distance between the fixes',
-                'counts are preferred to joint angles, and angles to speeds',
-                'it has the usual name', 'its name fits', 'it has the most messages',
-                'it is the first by name')
+def _sorted_topics(topics: dict[str, TopicInfo], slot: str, names: Iterable[str],
+                  not_following: Collection[str]) -> list[str]:
+    """Return topics that fit a slot, the most likely first."""
+    return sorted(names, key=lambda name: tuple(
+        _sort_keys(slot, topics[name], not_following).values()))
 
 
 def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
-                     mapping: dict[str, str], still: Collection[str]) -> list[str]:
+                     mapping: dict[str, str], not_following: Collection[str]) -> list[str]:
     """Return the other candidates for a slot, the most likely first."""
     used_topics = {s: t for s, t in mapping.items() if s != slot}
-    return sorted(set(candidates(topics, slot, config, used_topics)) - {mapping[slot]},
-                  key=lambda name: _rank(slot, topics[name], still))
+    others = set(candidates(topics, slot, config, used_topics)) - {mapping[slot]}
+    return _sorted_topics(topics, slot, others, not_following)
 
 
 def reason_for_choice(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
-                      still: Collection[str]) -> str:
+                      not_following: Collection[str]) -> str:
     """Return the reason for suggesting ``topic`` for a slot instead of ``other``."""
-    pairs = zip(_rank(slot, topics[topic], still), _rank(slot, topics[other], still), strict=True)
-    return next(reason for reason, (own_rank, other_rank) in zip(RANK_REASONS, pairs, strict=True)
-                if own_rank != other_rank)
+    own_keys, other_keys = (_sort_keys(slot, topics[name], not_following)
+                            for name in (topic, other))
+    return next(reason for reason, key in own_keys.items() if key != other_keys[reason])
 
 
 def replay_refusal(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:

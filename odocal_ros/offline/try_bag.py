@@ -116,13 +116,14 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
     """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.library.topics import candidates
     from odocal_ros.offline.suggest import likely_mapping, other_candidates, reason_for_choice
-    mapping, still = inspected['mapping'], inspected['still']
-    _, config = likely_mapping(bag.topics, config, topics, still)
+    mapping, not_following = inspected['mapping'], inspected['still']
+    _, config = likely_mapping(bag.topics, config, topics, not_following)
     found = []
     for slot in mapping.keys() - topics.keys():
-        remaining = other_candidates(bag.topics, slot, config, mapping, still)
+        remaining = other_candidates(bag.topics, slot, config, mapping, not_following)
         if remaining and mapping[slot] in candidates(bag.topics, slot, config, {}):
-            reason = reason_for_choice(bag.topics, slot, mapping[slot], remaining[0], still)
+            reason = reason_for_choice(bag.topics, slot, mapping[slot], remaining[0],
+                                       not_following)
             found.append(_Choice(slot, mapping[slot], remaining, reason))
     return sorted(found, key=lambda choice: list(INPUTS).index(choice.slot))
 

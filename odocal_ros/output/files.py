@@ -118,11 +118,11 @@ def plain(value: Any) -> Any:
 
 def write_results(calibration: Calibration, config: Config, directory: Path,
                   inputs: list[dict[str, Any]], created: str, force: bool = False,
-                  tell: Callable[[str], None] = lambda note: None) -> list[Path]:
+                  warn: Callable[[str], None] = lambda note: None) -> list[Path]:
     """
     Write the result files and return their paths, calibration.json first, the report last.
 
-    ``tell`` receives a sentence if the report cannot be drawn.
+    ``warn`` receives a sentence if the report cannot be drawn.
 
     Raises BadUsage: a calibration.json exists and no ``force``, or the folder is not writable.
     Raises KeyboardInterrupt: its text names the written results, if any.
@@ -131,7 +131,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
     with results.name_results_when_interrupted():
         written = results.write(force)
         if cause := results.draw():
-            tell(f'{results.report[0]}: could not be drawn: {cause}')
+            warn(f'{results.report[0]}: could not be drawn: {cause}')
     return written + results.report
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags that are cut off or damaged anywhere: what is sound is read, and the loss is said."""
+"""Bags that are cut off or damaged anywhere: undamaged data is read, and the loss is reported."""
 
 import shutil
 import sqlite3

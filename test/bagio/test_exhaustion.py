@@ -21,7 +21,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
 from odocal_ros.safe_io.limits import RAISE, zstd_module
 
-MOST = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
+MEMORY_LIMIT = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
 
 
 def record(op, body):
@@ -65,19 +65,19 @@ def database(folder, *lines, rows=None, types=None):
     return path
 
 
-def peak(path):
-    """Open a bag and read a topic; return the most memory it took and what was said."""
+def peak_memory_and_error(path):
+    """Open a bag and read a topic; return its peak memory, bytes, and the error, '' if none."""
     tracemalloc.start()
-    said = ''
+    error_text = ''
     try:
         with open_bag(path) as bag:
             for _ in bag.messages(next(iter(bag.topics))):
                 pass
     except (BadBag, BadData) as error:
-        said = str(error)
-    _, most = tracemalloc.get_traced_memory()
+        error_text = str(error)
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    return most, said
+    return peak, error_text
 
 
 @pytest.fixture(scope='module')
@@ -95,19 +95,19 @@ def test_a_stream_that_unpacks_to_2_gib(tmp_path, bomb, kind):
                               types={'/imu': 'sensor_msgs/msg/Imu'})
     else:
         mcap(path, bomb, 2**31, index=kind == 'chunk')
-    most, said = peak(path)
-    assert most < MOST
-    assert 'unpacked, it exceeds the limit of' in said
-    assert f'set {RAISE}=10' in said
+    peak, error_text = peak_memory_and_error(path)
+    assert peak < MEMORY_LIMIT
+    assert 'unpacked, it exceeds the limit of' in error_text
+    assert f'set {RAISE}=10' in error_text
 
 
 def test_the_limit_can_be_raised(tmp_path, monkeypatch):
     path = tmp_path / 'bag.mcap'
     packed = zeros(100)
     mcap(path, packed, 100 * 2**20)
-    assert peak(path)[1]
+    assert peak_memory_and_error(path)[1]
     monkeypatch.setenv(RAISE, '10')
-    assert 'exceeds the limit of' not in peak(path)[1]
+    assert 'exceeds the limit of' not in peak_memory_and_error(path)[1]
 
 
 def test_an_index_that_names_a_chunk_many_times(tmp_path):
@@ -130,7 +130,8 @@ def test_an_index_that_names_a_chunk_many_times(tmp_path):
 @pytest.mark.parametrize('table', ['messages', 'topics', 'message_definitions'])
 def test_a_schema_that_makes_rows_of_its_own(tmp_path, table, sql):
     lines = [f'ALTER TABLE {table} RENAME TO before', *(line.format(t=table) for line in sql)]
-    assert peak(database(tmp_path, *((line,) for line in lines)))[0] < MOST
+    path = database(tmp_path, *((line,) for line in lines))
+    assert peak_memory_and_error(path)[0] < MEMORY_LIMIT
 
 
 def test_pages_that_lead_back_to_themselves(tmp_path):
@@ -147,7 +148,7 @@ def test_pages_that_lead_back_to_themselves(tmp_path):
             loops += 1
     assert loops > 10
     file.write_bytes(data)
-    assert peak(path)[0] < MOST
+    assert peak_memory_and_error(path)[0] < MEMORY_LIMIT
 
 
 DEFINITIONS = {
@@ -166,13 +167,13 @@ DEFINITIONS = {
 @pytest.mark.parametrize('kind', DEFINITIONS)
 def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
     monkeypatch.setattr('odocal_ros.bagio.rosbags_readers.SECONDS', 3)
-    most, said = peak(database(
+    peak, error_text = peak_memory_and_error(database(
         tmp_path, ("UPDATE topics SET type = 'a/msg/B'",),
         ("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
          'encoded_message_definition = ?', *DEFINITIONS[kind]),
         rows=[('/x', T0, b'\0\1\0\0' + bytes(40))], types={'/x': 'std_msgs/msg/String'}))
-    assert most < MOST
-    assert 'exceeds the limit of' in said or 'cannot be parsed' in said
+    assert peak < MEMORY_LIMIT
+    assert 'exceeds the limit of' in error_text or 'cannot be parsed' in error_text
 
 
 def test_annotations_cost_nothing():
@@ -198,17 +199,17 @@ def test_what_is_no_file(tmp_path):
 
 def test_a_decompressor_is_looked_for_once_and_not_for_each_message(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(1.0), 'mcap', 'message')
-    asked = []
+    searched = []
 
     class Finder:
         @staticmethod
         def find_spec(name, *_):
-            asked.append(name)
+            searched.append(name)
     zstd_module.cache_clear()
     monkeypatch.setattr(sys, 'meta_path', [Finder, *sys.meta_path])
     with open_bag(path) as bag:
         assert len(list(bag.messages('/imu/data'))) == 100
-    assert len([name for name in asked if name.startswith('compression')]) <= 2
+    assert len([name for name in searched if name.startswith('compression')]) <= 2
 
 
 @pytest.mark.parametrize('kind', ['chunk', 'file'])
@@ -220,9 +221,9 @@ def test_empty_frames_cost_no_more_than_their_number(tmp_path, kind):
     else:
         mcap(path, frames, 100)
     before = time.process_time()
-    _, said = peak(path)
+    _, error_text = peak_memory_and_error(path)
     assert time.process_time() - before < 2.0
-    assert 'frames; if the file is valid' in said
+    assert 'frames; if the file is valid' in error_text
 
 
 def metadata(folder, change):
@@ -240,11 +241,11 @@ def test_links_in_each_other_are_not_written_out(tmp_path):
     path = metadata(tmp_path, lambda text: text.replace('serialization_format: cdr',
                                                         f'serialization_format: {odd}', 1))
     assert 'k7' in (path / 'metadata.yaml').read_text()
-    assert peak(path)[0] < MOST
+    assert peak_memory_and_error(path)[0] < MEMORY_LIMIT
     merges = ['a0: &m0 {x: 1}'] + [
         f'a{k}: &m{k} {{<<: [{", ".join([f"*m{k - 1}"] * 8)}]}}' for k in range(1, 9)]
     path = metadata(tmp_path / 'merged', lambda text: '\n'.join([*merges, text]))
-    assert peak(path)[0] < MOST
+    assert peak_memory_and_error(path)[0] < MEMORY_LIMIT
 
 
 @pytest.mark.parametrize(('text', 'what'), [
@@ -276,4 +277,4 @@ def test_a_file_of_many_names_is_read_once(tmp_path, link):
 
 def test_one_message_of_a_database_is_bounded(tmp_path):
     line = 'UPDATE messages SET data = zeroblob(200000000) WHERE rowid = 3'
-    assert peak(database(tmp_path, (line,)))[0] < 2**27
+    assert peak_memory_and_error(database(tmp_path, (line,)))[0] < 2**27

@@ -47,8 +47,8 @@ def test_bags_of_rosbag2(data_dir, name, files, messages, topics):
             assert bag.topics[topic].count == len(times) == count
             assert times == sorted(times)
             assert all(bag.start_ns <= time <= bag.end_ns for time in times)
-        said = 'metadata.yaml is missing; read 3 files' in str(bag.notes)
-        assert said == ('split3' in name)
+        is_noted = 'metadata.yaml is missing; read 3 files' in str(bag.notes)
+        assert is_noted == ('split3' in name)
 
 
 @pytest.mark.parametrize(('name', 'says'), [
@@ -146,7 +146,7 @@ def test_foreign_types_come_with_the_bag(tmp_path):
             bag.read({'/ticks': reader}, recorder.feed)
             assert recorder.rows('odometer').value.tolist() == [0, 10, 20, 30, 40]
             assert recorder.rows('odometer').stamp_ns.tolist() == [T0 + i for i in range(5)]
-    # without the definition nothing can be done, and it is said
+    # without the definition nothing can be read, and an error states this
     with closing(sqlite3.connect(tmp_path / 'sqlite3' / 'sqlite3.db3')) as db, db:
         db.execute('DELETE FROM message_definitions')
     with open_bag(tmp_path / 'sqlite3') as bag, pytest.raises(

@@ -205,7 +205,7 @@ def test_a_bag_that_hangs_and_one_that_is_none_stop_nobody(fleet, client, tmp_pa
     assert rows[url].reason == 'exceeded the time limit --task-timeout (6 s)'
     assert 'no.mcap' in rows[bags[1].bag].reason
     assert {row.status for bag, row in rows.items() if bag in {b.bag for b in good}} == {DONE}
-    # what failed is kept, and tried once more when asked
+    # what failed is kept, and tried once more on request
     assert computed(client, jobs[1:]) == (0, [DONE] * 3 + [FAILED])
     assert computed(client, jobs[1:2], again=True) == (1, [FAILED])
 

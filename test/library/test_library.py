@@ -115,8 +115,8 @@ def test_residuals_of_the_track_are_those_of_the_check(calibration):
 def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
     """Of each second as many; nothing is left over but noise, of which the fit takes a part."""
     found, seconds = calibration.residuals(), len(calibration.states()['t_s']) - 1
-    said = calibration.result.legs[0].methods['smoother'].details['residuals']
-    for sensor, unit, rows in (('fix', 'm', said['fixes']), ('odometer', 'm', seconds),
+    residuals = calibration.result.legs[0].methods['smoother'].details['residuals']
+    for sensor, unit, rows in (('fix', 'm', residuals['fixes']), ('odometer', 'm', seconds),
                                ('gyro', 'rad/s', seconds), ('accelerometer', 'm/s^2', seconds)):
         components = sorted(set(found['component'][found['sensor'] == sensor]))
         assert len(components) == 3, sensor
@@ -141,9 +141,10 @@ def test_fixes_that_end_in_the_middle_of_a_bag_are_stated(tmp_path):
     simulate('town', tmp_path / 'half', duration=200.0, imu_rate=50.0, odometer_rate=20.0,
              outages=((100.0, 300.0),))
     half = {'path': tmp_path / 'half', 'config': {'method': 'two_point'}}
-    (said,) = (r.text for r in calibrate_bag(**half).reasons if 'before the last topic' in r.text)
-    assert said.startswith('fix ends')
-    # a leg that somebody asked for is as it was asked for
+    texts = [reason.text for reason in calibrate_bag(**half).reasons]
+    (text,) = (text for text in texts if 'before the last topic' in text)
+    assert text.startswith('fix ends')
+    # a requested leg is as requested
     assert not [r for r in calibrate_bag(**half, legs='0:90').reasons
                 if 'before the last topic' in r.text]
 

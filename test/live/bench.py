@@ -172,7 +172,7 @@ class Client:
         return answer_of(self.ask(name))
 
     def result(self, stopping):
-        """Return the answer with the result, asked for again while it is provisional."""
+        """Return the answer with the result, called again while it is provisional."""
         answer = answer_of(stopping)
         while answer.message.startswith('provisional'):     # the fit takes long on a busy machine
             answer = self.call('stop_leg')

@@ -71,7 +71,7 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
     return SimpleNamespace(
         moment_s=moment_s, told_s=told_s, files=files, marks=marks, start_ns=start_ns, code=code,
         text=stderr, results=[result] if result else [], legs=result['legs'] if result else [],
-        # wall time that is lost, and by how much the journal is shorter than the status said
+        # wall time that is lost, and by how much the journal is shorter than the status states
         lost_s=(end_ns - newest_ns) * 1e-9, short_s=told_s - kept_s)
 
 
@@ -93,7 +93,7 @@ def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
 def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
                     **settings) -> SimpleNamespace:
     """
-    Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage).
+    Kill a node ``moment_s`` after a call of ~/stop_leg, or ~/save after that (stage).
 
     Returns calibration.json of each whole result, folders with half of one, whether latest points
     at a whole one or is not there, and code, calibration.json and words of the journal's replay.

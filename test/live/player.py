@@ -91,7 +91,7 @@ def light(first_s: float = 60.0, last_s: float = 120.0) -> tuple[dict[str, str],
 
 
 class Player:
-    """Publishes; ``play`` returns when the last message asked for is out."""
+    """Publishes; ``play`` returns when the last requested message is sent."""
 
     def __init__(self, node, types: dict[str, str], names: dict[str, str] | None = None) -> None:
         names = TOPICS | (names or {})

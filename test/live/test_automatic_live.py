@@ -49,7 +49,7 @@ def drive():
 
 @pytest.fixture(scope='module')
 def seen(drive, tmp_path_factory):
-    """Run the node twice, and keep what it said."""
+    """Run the node twice, and keep its messages."""
     found = SimpleNamespace(folder=tmp_path_factory.mktemp('results'))
     settings = SETTINGS | RELIABLE | {'output.directory': found.folder}
     for run, driven in ((_first, (drive.types, drive.sent)), (_a_day_later, drive.later)):
@@ -156,7 +156,7 @@ def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
     assert seen.carried['legs'] == 3
     latest = json.loads((seen.folder / 'latest' / 'calibration.json').read_text())
     assert latest['carried'] == seen.carried
-    assert 'SCALE_CHANGED' not in seen.later['reasons']       # it was said the day before
+    assert 'SCALE_CHANGED' not in seen.later['reasons']       # it was reported the day before
     assert near(seen.later, drive.scale * (1 + CHANGE))
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs with a gap, a jump of time or two IMUs on a topic: said at once, and what is left of it."""
+"""Legs with a gap, a jump of time or two IMUs on a topic: reports at once, and the results."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,7 +24,7 @@ WORDS = "carries several IMUs (frame_id 'imu_link' and 'rmu_link'): set imu.fram
 
 @pytest.fixture(scope='module')
 def gap(tmp_path_factory):
-    """Drive a leg in which the IMU falls silent, and keep what the node said."""
+    """Drive a leg in which the IMU falls silent, and keep its messages."""
     drive = simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
         fix_noise='rtk', imu_grade='industrial'))
@@ -32,7 +32,7 @@ def gap(tmp_path_factory):
     first_ns = sent[0].stamp_ns
     sent = [one for one in sent if one.slot != 'imu'
             or not GAP[0] <= (one.stamp_ns - first_ns) * 1e-9 < GAP[1]]
-    # the status comes seldom by itself: what is said at once is seen to be
+    # the status is rare otherwise: what is reported at once is visible as such
     settings = {'output.directory': tmp_path_factory.mktemp('results'), 'publish.rate': 0.2}
     with playing_to((types, sent), settings) as leg:
         client = leg.client
@@ -75,7 +75,7 @@ def test_its_parts_make_the_result_also_of_a_replay(gap):
     assert 'LEG_CUT' in {r['code'] for r in gap.live['reasons']}
     assert gap.undone.message == 'leg 1 is undone; no leg is left'
     marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in ends_of(gap.status)]
-    # undone since: it must be asked for by its marks
+    # undone since: it must be requested by its marks
     _, offline, _ = replayed(gap.journal, '--leg', ':'.join(marks), *NUMBERS)
     same_result(gap.live, offline)
 
@@ -109,7 +109,7 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(play
         times = stamps_of(folder, '/imu/data')
         assert times == sorted(times)           # nothing of the time after the jump
         code, result, _ = replayed(folder)
-        assert (code, result) == (2, None)      # it was cancelled: not without being asked
+        assert (code, result) == (2, None)      # it was cancelled: not without a request
         code, result, stderr = replayed(folder, option, mark)
         assert code == 0, stderr
         one, = result['legs']

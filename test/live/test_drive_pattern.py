@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node drive_pattern over DDS, with a robot that does as told: it drives, and it stops."""
+"""The node drive_pattern over DDS, with a robot that follows commands: it drives, and it stops."""
 
 import contextlib
 import math

@@ -68,7 +68,7 @@ def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):
     start_ns, stop_ns = ends_of(session.status)
     stamps = stamps_of(session.journal, '/front/imu')
     assert set(np.diff(stamps)) == {20_000_000}
-    assert start_ns - stamps[0] >= 20_000_000_000     # the pre-roll asked for
+    assert start_ns - stamps[0] >= 20_000_000_000     # the configured pre-roll
     assert stamps[-1] > stop_ns
 
 
@@ -118,7 +118,7 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(play_to):
     leg = play_to(stamped(0), {'leg.min_distance': 3.0}, 1)
     wait_for(leg.player.matched, 'subscriptions')
     # stamped by now, as of a real vehicle: counts are stamped by their sender's clock, and clocks
-    # half a second apart start no leg. It drives on while services are asked, however long they
+    # half a second apart start no leg. It drives on while services are called, however long they
     # take
     begin_ns, (_, leg.sent) = by_now(lambda begin_ns: stamped(
         begin_ns - int(made.imu.stamp_ns[0]) - 70_000_000_000))

@@ -26,7 +26,7 @@ RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end 
 
 @pytest.fixture(scope='module')
 def session(tmp_path_factory):
-    """Drive two legs through one node and keep everything it said; the tests then look."""
+    """Drive two legs through one node and keep all its messages, for the tests."""
     drive, folder = straight(heading=HEADING), tmp_path_factory.mktemp('results')
     settings = SETTINGS | {'alignment.heading': drive.truth.heading}
     driven = messages_of(drive)
@@ -125,7 +125,7 @@ def test_the_parameters_are_the_result_that_was_saved(session, written):
 
 
 def test_odocal_replay_finds_the_mark_and_agrees_in_every_digit(session, written, tmp_path):
-    """Of a bag with what the node heard and said in the first leg, as a recorder would write."""
+    """Return a bag with the inputs and outputs of the node in the first leg, as of a recorder."""
     names = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
     status, last_ns = '/calibrator/status', session.sent[-1].stamp_ns
     rows = [(names[one.slot], one.stamp_ns + 1_000_000, one.raw)
@@ -202,7 +202,7 @@ def test_while_it_records_the_running_estimate_is_told(session):
         'estimate_scale_factor', 'estimate_scale_factor_sigma', 'predicted_scale_sigma_ppm',
         'metres_to_go_scale'))
     assert within({'value': value, 'sigma': sigma}, session.drive.truth.scale)
-    assert scale_ppm == pytest.approx(1e6 * sigma / value, abs=5.1e-3)     # two decimals are told
+    assert scale_ppm == pytest.approx(1e6 * sigma / value, abs=5.1e-3)     # two decimals are shown
     assert (metres == 0.0) == (scale_ppm <= 1000)
     assert float(status['predicted_yaw_sigma_deg']) > 0.0
     assert 0.0 <= float(status['estimate_age_s']) <= 55.0            # the leg is no longer

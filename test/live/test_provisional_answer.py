@@ -32,20 +32,20 @@ def wait():
         time.sleep(0.01)
 def held(*args):
     *samples, tell = args
-    def told(stage):
+    def report(stage):
         tell(stage)
         if stage.passes == 3:
             wait()
     if args[3]:      # the legs kept
         wait()
-    return compute(*samples, told)
+    return compute(*samples, report)
 worker.compute = held
 """
 
 
 @pytest.fixture(scope='module')
 def seen(tmp_path_factory):
-    """Drive two legs, the second too short for a running estimate; keep what the node said."""
+    """Drive two legs, the second too short for a running estimate; keep all messages."""
     folder = tmp_path_factory.mktemp('out')
     gate = folder / 'go on'
     drive = simulate(SimOptions(scenario='town', duration=160.0, imu_rate=50.0, odometer='speed',

@@ -112,7 +112,7 @@ def test_an_odometry_is_the_reference_where_the_name_is_remapped(start, connect)
 
 @pytest.fixture(scope='module', params=[True, False], ids=['imu', 'no imu'])
 def marked(request, tmp_path_factory):
-    """Drive a square, with a mark at each point; keep what the node said."""
+    """Drive a square, with a mark at each point; keep its messages."""
     drive = simulate(SimOptions(scenario='square', odometer='angle', imu_rate=50.0,
                                 imu=request.param))
     wheels = dict(zip(('left', 'right'), drive.wheels, strict=True))

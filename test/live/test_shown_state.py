@@ -105,7 +105,7 @@ def test_the_bars_are_shares_of_what_is_asked():
                              'required_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
         'path': 0.75, 'standstill': 0.6, 'scale': 0.25, 'yaw': 0.0}
-    # after a leg it is the result that is held against what is asked
+    # after a leg it is the result that is compared with the limits
     done = {'state': 'calibrated', 'required_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
             'scale_factor_sigma': '0.00004', 'required_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}

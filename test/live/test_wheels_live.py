@@ -124,7 +124,7 @@ def test_an_imu_is_required_if_it_is_published(start, connect):
 
 @pytest.fixture(scope='module')
 def session(tmp_path_factory):
-    """Drive a leg with two wheels, and keep what the node said meanwhile."""
+    """Drive a leg with two wheels, and keep the messages of the node."""
     drive = simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, fix_noise='rtk',
         imu_grade='tactical', odometer='angle', two_wheels=True, heading=0.7, seed=4))

@@ -125,7 +125,7 @@ class Wire:
         seen.calls += 1
 
     def _look(self, seen) -> None:
-        """See that the node lives and has said nothing wrong."""
+        """See that the node lives and has reported nothing wrong."""
         client, node, seen_before = self._client, self._drive.node, len(self._client.statuses)
         wait_for(lambda: len(client.statuses) > seen_before, 'a status')
         if node.process.poll() is not None:

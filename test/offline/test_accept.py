@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal replay --accept; a calibration beside its truth: exit codes, who wins, what is said."""
+"""odocal replay --accept; a calibration beside its truth: exit codes, precedence, texts."""
 
 import json
 

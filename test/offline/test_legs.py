@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of a recording: as asked on the command line, as marked, from standstills."""
+"""Legs of a recording: as requested on the command line, as marked, from standstills."""
 
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace

@@ -188,7 +188,7 @@ def test_the_methods_asked_for_are_planned(method, shown, by):
     drive = planned_drives.from_figures(15.0, 500.0, 10.0, 0, 1.0)
     plan = plan_methods(drive, Sigmas(config=config))
     assert list(plan.methods) == shown
-    assert {plan.by(name) for name in NAMES[:2]} == {by}
+    assert {plan.method_of(name) for name in NAMES[:2]} == {by}
 
 
 @pytest.mark.core

@@ -90,7 +90,7 @@ def test_perfect_sensors_go_by_the_best_grade(tmp_path):
     assert 'alignment' not in groups
 
 
-@pytest.mark.parametrize(('asked', 'topics', 'command'), [
+@pytest.mark.parametrize(('options', 'topics', 'command'), [
     ([], {'/imu/data', '/odometer', '/fix'}, ''),
     (['--odometer', 'speed'], {'/imu/data', '/odometer', '/fix'}, ''),
     (['--odometer', 'angle'], {'/imu/data', '/joint_states', '/fix'}, ''),
@@ -98,9 +98,9 @@ def test_perfect_sensors_go_by_the_best_grade(tmp_path):
      '--odometer-topic /odometer/left --odometer-right-topic /odometer/right'),
     (['--heading-sigma-deg', '0.2'], {'/imu/data', '/odometer', '/fix', '/heading'},
      '--imu-topic /imu/data --heading-topic /heading')])
-def test_replay_is_told_the_topics_it_cannot_guess(tmp_path, capsys, asked, topics, command):
+def test_replay_gets_the_topics_it_cannot_choose(tmp_path, capsys, options, topics, command):
     from rosbags.highlevel import AnyReader
-    assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 0
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', *options) == 0
     assert command in capsys.readouterr().out
     with AnyReader([tmp_path / 'drive']) as reader:
         assert {c.topic for c in reader.connections} == topics

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Topics by message type: one candidate is taken, several or none are told with the remedy."""
+"""Topics by message type: one candidate is taken, several or none are an error with the remedy."""
 
 import pytest
 

@@ -36,7 +36,7 @@ def bag(tmp_path, monkeypatch):
 
 @pytest.fixture
 def replay_calls(monkeypatch):
-    """Return what the replay is asked; it only writes an empty report."""
+    """Return the options of the replay; it only writes an empty report."""
     found = []
 
     def run(args):

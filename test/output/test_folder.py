@@ -142,10 +142,10 @@ def test_of_several_at_once_without_force_exactly_one_succeeds(tmp_path, force):
         for one in writers:
             one.start()
         ready.set()
-        said = sorted(out.get(timeout=30) for _ in writers)
+        outcomes = sorted(out.get(timeout=30) for _ in writers)
         for one in writers:
             one.join()
-        assert said == (['written'] * 6 if force else ['refused'] * 5 + ['written'])
+        assert outcomes == (['written'] * 6 if force else ['refused'] * 5 + ['written'])
         now = held(place)
         tag = int(now[MAIN].split()[0])
         assert now == texts(tag, 'main.json', f'{"ab"[tag % 2]}.txt')

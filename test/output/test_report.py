@@ -167,7 +167,7 @@ def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error)
 
     monkeypatch.setattr(report, 'report_html', fail)
     reported = []
-    write_results(good, Config(), tmp_path, INPUTS, CREATED, tell=reported.append)
+    write_results(good, Config(), tmp_path, INPUTS, CREATED, warn=reported.append)
     assert (tmp_path / 'calibration.json').exists()
     assert len(reported) == 1
     assert 'report.html: could not be drawn' in reported[0]

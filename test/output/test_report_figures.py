@@ -84,9 +84,9 @@ def test_a_panel_without_data_is_not_drawn():
         assert 'accelerometer bias' in _biases(np.arange(5.0), biases, 'leg1')[2]
 
 
-def shown(page, folder, *asked):
+def shown(page, folder, *options):
     done = subprocess.run(
-        [CHROMIUM, *FLAGS, f'--user-data-dir={folder / "profile"}', *asked, page.as_uri()],
+        [CHROMIUM, *FLAGS, f'--user-data-dir={folder / "profile"}', *options, page.as_uri()],
         capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -97,7 +97,7 @@ def shown(page, folder, *asked):
 def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
     page = tmp_path / 'report.html'
     html, _, _ = page_of(three_methods(good))
-    # what only a browser knows: the layout, told in the title
+    # what only a browser knows: the layout, given in the title
     probe = ('<script>addEventListener("load", () => { document.title = JSON.stringify({'
              'wide: document.documentElement.scrollWidth, view: innerWidth,'
              'figures: [...document.querySelectorAll("figure svg")].map(s => '

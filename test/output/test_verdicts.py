@@ -83,9 +83,10 @@ def test_one_bag_is_not_named_and_long_names_keep_the_width(good):
 
 def test_what_several_legs_share_is_said_once():
     slip, dead = Code.WHEEL_SLIP, Code.WHEEL_DEAD
-    said = ((slip, 'leg 1: it spun'), (slip, 'leg 3: it spun'), (slip, 'leg 2: it slid'),
-            (slip, 'it spun'), (dead, 'leg 2: it spun'), (slip, 'leg 4: it spun'))
-    assert [(r.code, r.text) for r in join_same_reasons(tuple(Reason(*one) for one in said))] == [
+    reasons = (Reason(slip, 'leg 1: it spun'), Reason(slip, 'leg 3: it spun'),
+               Reason(slip, 'leg 2: it slid'), Reason(slip, 'it spun'),
+               Reason(dead, 'leg 2: it spun'), Reason(slip, 'leg 4: it spun'))
+    assert [(r.code, r.text) for r in join_same_reasons(reasons)] == [
         (slip, 'legs 1, 3 and 4: it spun'), (slip, 'leg 2: it slid'), (slip, 'it spun'),
         (dead, 'leg 2: it spun')]
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""When a calibration must not quietly take the place of another."""
+"""When a calibration must not silently replace another."""
 
 from dataclasses import replace
 
@@ -15,8 +15,8 @@ from odocal_ros.settings.config import Config
 
 
 @pytest.fixture
-def why(tmp_path):
-    """Return a function: why a calibration is worse than another, both by way of their files."""
+def stored_objection(tmp_path):
+    """Return a function: the objection to replacing a calibration by another, both as files."""
     def run(old, new):
         for name, one in (('old', old), ('new', new)):
             write_results(one, Config(), tmp_path / name, [], CREATED, force=True)
@@ -26,7 +26,7 @@ def why(tmp_path):
     return run
 
 
-def later(calibration, **estimates):
+def next_drive(calibration, **estimates):
     """Return a calibration of another drive, with other values."""
     legs = tuple(replace(leg, start_ns=leg.start_ns + 10**13, stop_ns=leg.stop_ns + 10**13)
                  for leg in calibration.legs)
@@ -34,55 +34,58 @@ def later(calibration, **estimates):
 
 
 def test_a_rejected_one_is_worse_than_a_good_one_and_anything_may_replace_it(
-        why, good, rejected, nothing):
-    assert why(good, later(rejected)).startswith('the new result is rejected (')
-    assert 'GYRO_SIGN' in why(good, later(rejected))
-    assert why(good, rejected)        # of the same drive too
-    assert why(rejected, good) == why(rejected, nothing) == why(nothing, rejected) == ''
+        stored_objection, good, rejected, nothing):
+    assert stored_objection(good, next_drive(rejected)).startswith('the new result is rejected (')
+    assert 'GYRO_SIGN' in stored_objection(good, next_drive(rejected))
+    assert stored_objection(good, rejected)        # of the same drive too
+    for old, new in ((rejected, good), (rejected, nothing), (nothing, rejected)):
+        assert stored_objection(old, new) == ''
 
 
 @pytest.mark.parametrize(('factor', 'worse'), [(0.5, False), (1.9, False), (2.1, True)])
 @pytest.mark.parametrize('name', ['scale_factor', 'yaw_mounting_angle'])
-def test_a_sigma_twice_as_large_is_worse(why, good, name, factor, worse):
+def test_a_sigma_twice_as_large_is_worse(stored_objection, good, name, factor, worse):
     old = good.estimates[name]
-    said = why(good, later(good, **{name: replace(old, sigma=old.sigma * factor)}))
-    assert bool(said) == worse
-    assert not worse or f'{name.replace("_", " ")} is 2.1 times larger' in said
+    new = next_drive(good, **{name: replace(old, sigma=old.sigma * factor)})
+    text = stored_objection(good, new)
+    assert bool(text) == worse
+    assert not worse or f'{name.replace("_", " ")} is 2.1 times larger' in text
 
 
-def test_scales_of_two_vehicles_are_compared_by_their_relative_sigma(why, good):
+def test_scales_of_two_vehicles_are_compared_by_their_relative_sigma(stored_objection, good):
     old = good.estimates['scale_factor']
-    assert why(good, later(good, scale_factor=replace(
+    assert stored_objection(good, next_drive(good, scale_factor=replace(
         old, value=10 * old.value, sigma=6 * old.sigma))) == ''
-    assert '6.0 times larger' in why(good, later(good, scale_factor=replace(
+    assert '6.0 times larger' in stored_objection(good, next_drive(good, scale_factor=replace(
         old, value=old.value / 10, sigma=0.6 * old.sigma)))
 
 
-def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(why, good):
-    lost = later(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
-    assert why(good, lost) == ('the new result has no yaw mounting angle, the old one has '
-                               '-1.0000 ± 0.0029 deg')
-    assert why(lost, later(later(good))) == ''
-    assert why(good, later(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
+def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(stored_objection, good):
+    lost = next_drive(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
+    assert stored_objection(good, lost) == (
+        'the new result has no yaw mounting angle, the old one has -1.0000 ± 0.0029 deg')
+    assert stored_objection(lost, next_drive(next_drive(good))) == ''
+    assert stored_objection(good, next_drive(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
 
 
-def test_more_legs_know_better_even_with_a_larger_sigma(why, good):
-    wider = later(good, scale_factor=Estimate(0.05, 1e-4, 'm/pulse'))
+def test_more_legs_know_better_even_with_a_larger_sigma(stored_objection, good):
+    wider = next_drive(good, scale_factor=Estimate(0.05, 1e-4, 'm/pulse'))
     both = replace(wider, legs=(*good.legs, *wider.legs))
-    assert why(good, both) == ''
-    assert why(good, wider) != ''
-    assert why(good, replace(wider, legs=good.legs)) != ''      # the same legs, other settings
+    assert stored_objection(good, both) == ''
+    assert stored_objection(good, wider) != ''
+    # the same legs, other settings
+    assert stored_objection(good, replace(wider, legs=good.legs)) != ''
 
 
-def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):
-    why(good, good)
+def test_what_cannot_be_read_is_no_loss(stored_objection, good, tmp_path):
+    stored_objection(good, good)
     (tmp_path / 'old' / 'calibration.json').write_text('{}')
     assert stored_in(tmp_path / 'old') is stored_in(tmp_path / 'gone') is None
     assert objection_to_folder(None, tmp_path / 'new') == ''
     assert objection_to_folder(stored_in(tmp_path / 'new'), tmp_path / 'gone') == ''
 
 
-def test_a_result_of_the_method_wheels_is_read_and_replaced(why, good):
+def test_a_result_of_the_method_wheels_is_read_and_replaced(stored_objection, good):
     """Older versions have such a method and estimate; it holds the result's own factors."""
     wheels = {'scale_factor_left': Estimate(0.0499, 1e-6, 'm/pulse', 'wheels'),
               'heading_error': Estimate(0.01, 1e-3, 'rad', 'wheels')}
@@ -90,5 +93,5 @@ def test_a_result_of_the_method_wheels_is_read_and_replaced(why, good):
     old = replace(good, estimates=good.estimates | wheels, methods=good.methods | {
         'wheels': replace(base, name='wheels', estimates=base.estimates | wheels)})
     left = replace(wheels['scale_factor_left'], method='smoother')
-    assert why(old, later(good, scale_factor_left=left)) == ''
-    assert 'no scale factor left' in why(old, later(good))
+    assert stored_objection(old, next_drive(good, scale_factor_left=left)) == ''
+    assert 'no scale factor left' in stored_objection(old, next_drive(good))

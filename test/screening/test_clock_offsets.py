@@ -27,25 +27,26 @@ def alone(made):
     return calibrate(made.leg(), settings(made, method='smoother'))
 
 
-def late(leg, slot, by, arrivals):
-    rows, by_ns = leg.rows(slot), round(by * 1e9)
-    moved = replace(rows, stamp_ns=rows.stamp_ns + by_ns,
-                    received_ns=rows.received_ns + by_ns * arrivals)
+def with_clock_error(leg, slot, offset_s, arrivals):
+    rows, offset_ns = leg.rows(slot), round(offset_s * 1e9)
+    moved = replace(rows, stamp_ns=rows.stamp_ns + offset_ns,
+                    received_ns=rows.received_ns + offset_ns * arrivals)
     return leg.with_rows(**{slot: moved})
 
 
-@pytest.mark.parametrize(('slot', 'by', 'arrivals'), [
+@pytest.mark.parametrize(('slot', 'offset_s', 'arrivals'), [
     ('odometer', 5.0, True), ('odometer', -3.3, False), ('fix', 20.0, True), ('fix', -2.6, False),
     ('imu', 2.0, True)])
-def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, by, arrivals):
-    result = calibrate(late(made.leg(), slot, by, arrivals), settings(made, method='smoother'))
-    said = [r.text for r in result.reasons if r.code is Code.DELAY_SEEN]
-    direction = 'late' if (by > 0) != (slot == 'imu') else 'early'
-    assert {text.split(' stamps')[0] for text in said} == LABELS[slot]
-    for text in said:
-        about, _, way = text.split('about ')[1].split()[:3]
-        assert way == direction
-        assert float(about) == pytest.approx(abs(by), abs=OFFSET_CELL / 2)
+def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, offset_s, arrivals):
+    leg = with_clock_error(made.leg(), slot, offset_s, arrivals)
+    result = calibrate(leg, settings(made, method='smoother'))
+    texts = [r.text for r in result.reasons if r.code is Code.DELAY_SEEN]
+    direction = 'late' if (offset_s > 0) != (slot == 'imu') else 'early'
+    assert {text.split(' stamps')[0] for text in texts} == LABELS[slot]
+    for text in texts:
+        found_s, _, found_direction = text.split('about ')[1].split()[:3]
+        assert found_direction == direction
+        assert float(found_s) == pytest.approx(abs(offset_s), abs=OFFSET_CELL / 2)
     assert Code.CLOCKS_DIFFER not in everything_said(result)
     for name in ('scale_factor', 'yaw_mounting_angle'):
         one, other = (x.methods['smoother'].estimates[name] for x in (result, alone))
@@ -74,8 +75,8 @@ def test_nothing_is_aligned_without_accelerations():
     assert clocks._delay(steady, steady) == 0.0
 
 
-@pytest.mark.parametrize('by', [-7.3, 0.0, 3.37, 60.0])
-def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
+@pytest.mark.parametrize('offset_s', [-7.3, 0.0, 3.37, 60.0])
+def test_an_offset_is_found_to_a_fraction_of_a_cell(offset_s):
     """Of a signal that a straight line between cells holds; noise of its size is independent."""
     rng = np.random.default_rng(2)
     t = OFFSET_CELL * np.arange(1600)
@@ -85,8 +86,8 @@ def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
         return np.exp(-((t[:, None] - bumps) / 1.5)**2 / 2).sum(axis=1, keepdims=True)
 
     x = signal(t) - signal(t).mean()
-    y = signal(t - by) - signal(t - by).mean() + 0.3 * rng.normal(size=(len(t), 1))
-    assert clocks._delay(y, x) == pytest.approx(by, abs=OFFSET_CELL / 4)
+    y = signal(t - offset_s) - signal(t - offset_s).mean() + 0.3 * rng.normal(size=(len(t), 1))
+    assert clocks._delay(y, x) == pytest.approx(offset_s, abs=OFFSET_CELL / 4)
 
 
 def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
@@ -94,7 +95,7 @@ def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
     rng = np.random.default_rng(3)
     t = OFFSET_CELL * np.arange(1200)
     bumps = rng.uniform(t[0], t[-1], 20)
-    x, y = (np.exp(-((t[:, None] - bumps - by) / 6)**2 / 2).sum(axis=1, keepdims=True)
-            for by in (0.0, 1.4))
+    x, y = (np.exp(-((t[:, None] - bumps - offset_s) / 6)**2 / 2).sum(axis=1, keepdims=True)
+            for offset_s in (0.0, 1.4))
     x, y = x - x.mean(), y - y.mean() + 0.4 * x.std() * rng.normal(size=x.shape)
     assert clocks._delay(y, x) == 0.0
