@@ -16,7 +16,7 @@ from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.library import export_pictures
 from odocal_ros.library.calibration import TABLES
 from odocal_ros.library.series import (
@@ -201,7 +201,7 @@ def check_names(files: Iterable[Path | str]) -> None:
         if Path(file).suffix == '.rrd' and not _is_importable('rerun'):
             raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: {RERUN}')
         if Path(file).name not in KNOWN:
-            raise BadUsage(f'export: {file}: unknown; available: {", ".join(KNOWN)}')
+            raise BadUsage(f'export: {file}: {unknown_name(Path(file).name, KNOWN)}')
 
 
 def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.forecast.planned_indoor import (
     MOTION_STEP,
     pattern_motion,
@@ -79,7 +79,7 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     for flag, value, names in (('--indoor', run, ('all', *PATTERNS)), ('--drive', drive, DRIVES),
                                ('--reference', reference, KINDS)):
         if value not in names:
-            raise BadUsage(f'{flag} {value}: required: one of {", ".join(names)}')
+            raise BadUsage(f'{flag} {value}: {unknown_name(value, names)}')
     if not track_width > 0 or not slip > 0:
         raise BadUsage('--track-width and --slip-walk: required: numbers above 0')
     settings = config_of(config)

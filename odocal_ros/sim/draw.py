@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
@@ -42,7 +42,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     names = list(EFFECTS) if effects is None else list(effects)
     for name in names:
         if name not in EFFECTS | RARE:
-            raise BadUsage(f'--effect {name}: required: one of {", ".join(EFFECTS | RARE)}')
+            raise BadUsage(f'--effect {name}: {unknown_name(name, EFFECTS | RARE)}')
     if set(ODOMETER_EFFECTS) <= set(effects or ()):
         raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer; '
                        'select one of them')

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, FEWEST_OMNI, MECANUM, OMNI
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim.real import NONE3, Real, Vector
@@ -248,4 +248,4 @@ def _check_number(name: str, value: float) -> None:
 
 def _choice(flag: str, name: str, names: Collection[str]) -> None:
     if name not in names:
-        raise BadUsage(f'{flag} {name}: required: one of {", ".join(names)}')
+        raise BadUsage(f'{flag} {name}: {unknown_name(name, names)}')

@@ -94,6 +94,7 @@ def test_what_is_given_is_what_effects_go_by():
 @pytest.mark.parametrize(('change', 'told'), [
     ({'effects': ODOMETER_EFFECTS}, 'a vehicle has one odometer'),
     ({'effects': ('rust',)}, '--effect rust: required: one of triads'),
+    ({'effects': ('coarse_sped',)}, '--effect coarse_sped: did you mean coarse_speed'),
     ({'grade': 'navigation'}, 'required: one of consumer')])
 def test_what_cannot_be_drawn_is_said(change, told):
     with pytest.raises(BadUsage, match=told):

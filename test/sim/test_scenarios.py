@@ -115,6 +115,7 @@ def test_every_choice_is_filled_in():
 
 @pytest.mark.parametrize(('change', 'told'), [
     ({'scenario': 'moon'}, '--scenario moon: required: one of paper, straight'),
+    ({'scenario': 'twon'}, '--scenario twon: did you mean town'),
     ({'imu_grade': 'best'}, '--imu-grade best: required: one of consumer'),
     ({'fix_noise': 'pink'}, '--fix-noise pink: required: one of white'),
     ({'odometer': 'radar'}, '--odometer radar: required: one of counts'),
