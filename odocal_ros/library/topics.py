@@ -11,7 +11,14 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
-from odocal_ros.messages.message_fields import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
+from odocal_ros.messages.message_fields import (
+    FIX,
+    GEODETIC,
+    IMU,
+    LOCAL_TYPES,
+    TRANSFORMS,
+    types_of,
+)
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.settings.config import Config, OdometerConfig
 
@@ -31,7 +38,7 @@ GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 NO_MESSAGES_REMEDY = 'Check the driver and the QoS of the recorder, then record again.'
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
-REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
+REFERENCES = (*GEODETIC, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
 # slots in the order of choice; the others are chosen from the remaining topics
 CHOSEN_FIRST = ('odometer_right', 'odometer', 'heading')
 
@@ -100,7 +107,8 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'imu':
         found = _preferably_without(found, ('heading',))
     elif slot == 'fix':
-        found = [name for name in found if topics[name].msgtype == FIX] or [
+        fixes = [name for name in found if topics[name].msgtype in GEODETIC]
+        found = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
             name for name in found if not _contains(name, (*COMMANDS, *GOALS))]
         found = _preferably_without(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
@@ -127,7 +135,7 @@ def _check_reference(chosen: dict[str, str]) -> None:
 def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str, str]) -> str:
     """Return the note that poses are the reference if the user did not name them, or ''."""
     fix = chosen.get('fix', '')
-    if not fix or 'fix' in overrides or topics[fix].msgtype == FIX:
+    if not fix or 'fix' in overrides or topics[fix].msgtype in GEODETIC:
         return ''
     return (f'no NavSatFix with messages in the bag; position reference: {fix} '
             f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
@@ -181,7 +189,7 @@ def topics_without_messages(types: Mapping[str, tuple[str, int]], slot: str) -> 
 def _fits_slot(msgtype: str, slot: str) -> bool:
     """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
-        return full_type(msgtype) not in (IMU, FIX)
+        return full_type(msgtype) not in (IMU, *GEODETIC)
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 

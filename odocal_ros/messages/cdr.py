@@ -40,6 +40,19 @@ def _pose(prefix: str) -> tuple[str, ...]:
 
 
 HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
+# format: of gps_msgs; the status has its own header and lists of satellites
+_GPS_FIX = (
+    *HEADER, 'int32 status.header.stamp.sec', 'uint32 status.header.stamp.nanosec',
+    'string status.header.frame_id', 'uint16 status.satellites_used',
+    'int32[] status.satellite_used_prn', 'uint16 status.satellites_visible',
+    *(f'int32[] status.satellite_visible_{name}' for name in ('prn', 'z', 'azimuth', 'snr')),
+    'int16 status.status', 'uint16 status.motion_source', 'uint16 status.orientation_source',
+    'uint16 status.position_source', 'float64 latitude', 'float64 longitude', 'float64 altitude',
+    *(f'float64 {name}' for name in (
+        'track', 'speed', 'climb', 'pitch', 'roll', 'dip', 'time', 'gdop', 'pdop', 'hdop', 'vdop',
+        'tdop', 'err', 'err_horz', 'err_vert', 'err_track', 'err_speed', 'err_climb', 'err_time',
+        'err_pitch', 'err_roll', 'err_dip')),
+    'float64[9] position_covariance', 'uint8 position_covariance_type')
 FRAME_AT = 16       # format: offset of the text of HEADER in CDR
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
@@ -54,6 +67,8 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
         *HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
         'float64 longitude', 'float64 altitude', 'float64[9] position_covariance',
         'uint8 position_covariance_type'),
+    'gps_msgs/msg/GPSFix': _GPS_FIX,
+    'gps_common/msg/GPSFix': _GPS_FIX,
     'sensor_msgs/msg/JointState': (
         *HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
     'geometry_msgs/msg/Twist': _vector_fields('linear') + _vector_fields('angular'),

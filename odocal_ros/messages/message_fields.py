@@ -135,6 +135,11 @@ def stamp_ns(sec: Ints, nanosec: Ints) -> Ints:
 
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
+GPS_FIXES = ('gps_msgs/msg/GPSFix', 'gps_common/msg/GPSFix')    # of ROS 2 and ROS 1
+GEODETIC = (FIX, *GPS_FIXES)
+# format: status of a GPSFix with corrections of a satellite; other codes above 2 are those of a
+# base station (DGPS, RTK), as 2 is
+WAAS_FIX = 33
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
 Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
@@ -213,6 +218,13 @@ def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, kno
                               covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
 
 
+def _gps_fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
+             status: Ints) -> samples.FixSamples:
+    """Return fixes with the status of a NavSatFix."""
+    return _fix(stamps, received, position, covariance, known,
+                np.where(status == WAAS_FIX, 1, np.clip(status, -1, 2)))
+
+
 def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
               *covariance: Floats) -> samples.VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
@@ -220,6 +232,10 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
     return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
+_GEODETIC = (fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),
+             array_column('position_covariance', *range(9)),
+             fixed_column(np.int64, 'position_covariance_type'),
+             fixed_column(np.int64, 'status.status'))
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
 _ORIENTATION = (vector_column('orientation', 'xyzw'), array_column('orientation_covariance', 0),
                 array_column('orientation_covariance', 8))
@@ -228,10 +244,8 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
                     vector_column('linear_acceleration'),
                     array_column('linear_acceleration_covariance', 0)), _imu),
     ('heading', IMU): (_ORIENTATION, _heading),
-    ('fix', FIX): ((fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),
-                    array_column('position_covariance', *range(9)),
-                    fixed_column(np.int64, 'position_covariance_type'),
-                    fixed_column(np.int64, 'status.status')), _fix),
+    ('fix', FIX): (_GEODETIC, _fix),
+    **{('fix', kind): (_GEODETIC, _gps_fix) for kind in GPS_FIXES},
     ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((vector_column('twist.linear'),),
                                                          _velocity),
     ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (

@@ -9,7 +9,7 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import candidates, choose_topics, required_slots, resolve_topic
-from odocal_ros.messages.message_fields import FIX
+from odocal_ros.messages.message_fields import GEODETIC
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.config import Config, with_settings
 
@@ -106,7 +106,8 @@ def replay_command(path: str, topics: dict[str, TopicInfo], config: Config,
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
         found = candidates(topics, slot, config, {s: t for s, t in mapping.items() if s != slot})
-        local = slot == 'fix' and topics[topic].msgtype != FIX      # stated, as it is unusual
+        # stated, as it is unusual
+        local = slot == 'fix' and topics[topic].msgtype not in GEODETIC
         if slot in overrides or len(found) > 1 or topic not in found or local:
             words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
