@@ -232,6 +232,7 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
     return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
+# format: of both
 _GEODETIC = (fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),
              array_column('position_covariance', *range(9)),
              fixed_column(np.int64, 'position_covariance_type'),

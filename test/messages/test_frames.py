@@ -212,5 +212,6 @@ def test_map_coordinates_and_nan_are_no_positions():
 
 
 def test_other_types_are_refused_with_those_that_serve():
-    with pytest.raises(BadData, match='sensor_msgs/msg/NavSatFix or geometry_msgs/msg/PoseSt'):
+    with pytest.raises(BadData, match='sensor_msgs/msg/NavSatFix or gps_msgs/msg/GPSFix or '
+                       'gps_common/msg/GPSFix or geometry_msgs/msg/PoseStamped'):
         make_reader('fix', 'sensor_msgs/msg/Imu', Config())

@@ -79,8 +79,9 @@ def test_one_of_each():
     (topics(fix=None, tf='tf2_msgs/msg/TFMessage'), {}, {},
      'name a tf2_msgs/msg/TFMessage or nav_msgs/msg/Odometry with --fix-topic'),
     (topics(fix=None, lidar_odometry=ODOM), {'odometer': '/odometer'}, {},
-     r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, geometry_msgs/msg/PoseStamped, .*\) in the '
-     'bag; name .*/Odometry with --fix-topic; the bag has'),
+     r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, gps_msgs/msg/GPSFix, .*'
+     r'geometry_msgs/msg/PoseStamped, .*\) in the bag; name .*/Odometry with --fix-topic; '
+     'the bag has'),
     (topics(fix=None, odometer=None, odom=ODOM), {'odometer': 'odom', 'fix': '/odom'}, {},
      '^/odom is both --odometer-topic and --fix-topic: an odometer cannot be calibrated against '
      'itself'),
