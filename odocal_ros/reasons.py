@@ -105,10 +105,10 @@ class Code(Enum):
                               'ground a wrong gyro axis looks like this, and the pitch is then '
                               'wrong. If the axes are right, set imu.misalignment_sigma to the '
                               'value of this IMU.')
-    LEVER_ARM_OFF = CAUTION, ('Measure this lever arm again and set it (from base_link: x '
-                              'forward, y left, z up). If both lever arms differ by the same '
-                              'amount, check imu.lever_arm. A vehicle that slides in turns (skid '
-                              'steering, tracks) also looks like this: then change nothing.')
+    LEVER_ARM_OFF = CAUTION, ('Measure this lever arm and imu.lever_arm, and set them (from '
+                              'base_link: x forward, y left, z up): only their difference is '
+                              'estimated. A vehicle that slides in turns (skid steering, '
+                              'tracks) also looks like this: then change nothing.')
     GYRO_SIGN = REJECT, ('Correct the signs in the IMU driver, or the order of the '
                          'coordinates. imu.mounting_rpy cannot: it rotates gyro and accelerometer '
                          'together.')

@@ -241,7 +241,7 @@ def _findings(found: dict[str, Any]) -> list[str]:
     if not found['findings']:
         return ['all data for a calibration is available'] if found['command'] else []
     lines = []
-    for only, title in ((None, 'before calibrating'), (
+    for only, title in ((None, 'before calibrating (counts of the whole recording)'), (
             'two_point', 'affects the two-point method only; the smoother needs none of it')):
         reasons = [reason for reason in found['findings'] if reason['only'] == only]
         lines += [title] * bool(reasons)

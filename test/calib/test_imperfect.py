@@ -199,6 +199,17 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, 
     assert ('easure' in reason.do) != ('larger' in text)
 
 
+@pytest.mark.parametrize(('imu_arm', 'part'), [
+    ((0.0, 0.0, 0.0), 'imu.lever_arm is not set: '), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm ')])
+def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
+    value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
+    value[CONSTANTS.index('odometer_lever_arm_x')] = 1.0
+    reason, = remarks._lever_arm_reasons(value, sigma, np.zeros(len(CONSTANTS)), with_settings(
+        Config(), {'imu.lever_arm': imu_arm}))
+    assert 'odometer.lever_arm x: not set, estimated +1.00' in reason.text
+    assert part in reason.remedy
+
+
 def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_a_value_is():
     usual = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'consumer', 'seed': 4}
     _, config, leg = made(**usual, antenna_lever_arm=(1.5, 0.0, 1.0))

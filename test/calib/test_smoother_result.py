@@ -116,8 +116,8 @@ def test_an_uncertainty_that_model_errors_increase_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
     for uncertainty, text in ((1.0, ''),
-                              (2.0, '0.80 deg (multiplied by 2 for model errors); the limit is '
-                               '0.5 deg. ')):
+                              (2.0, '0.80 deg, including a factor of 2 for model errors; the '
+                               'limit is 0.5 deg. ')):
         _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(),
                                         uncertainty)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]

@@ -140,7 +140,7 @@ def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, y
                    changed_angles: Collection[str]) -> list[Reason]:
     """Return the reasons for mounting angles that are not determined, or far from nominal."""
     reasons = []
-    limit_text = (f' (multiplied by {factor:.2g} for model errors)' * (factor > 1)
+    limit_text = (f', including a factor of {factor:.2g} for model errors' * (factor > 1)
                   + f'; the limit is {np.rad2deg(limit):.2g} deg')
     off = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[layout.YAW] > limit / factor:

@@ -53,9 +53,12 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_REMEDY = (
-    'Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
-    'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
-    'keep the setting.')
+    'Axes: from base_link, x forward, y left, z up. {} Slip in turns (skid steering, tracks) has '
+    'the same effect; then keep the setting.')
+# by whether imu.lever_arm is set
+IMU_ARM = {False: 'imu.lever_arm is not set: the distance of the IMU from base_link has the same '
+                  'effect, so set it first.',
+           True: 'A wrong imu.lever_arm has the same effect; check it too.'}
 
 
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
@@ -227,8 +230,8 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
                 texts.append(f'{name} {axis}: not set, estimated {text}{rough}')
                 actions.append(f'Measure {name} {axis} and set it.')
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for', ' '.join(
-        [*actions, LEVER_ARM_REMEDY] if any('easure' in x for x in actions)
-        else actions))] if texts else []
+        [*actions, LEVER_ARM_REMEDY.format(IMU_ARM[any(config.imu.lever_arm)])]
+        if any('easure' in x for x in actions) else actions))] if texts else []
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
