@@ -127,7 +127,7 @@ CREATED = '2026-01-02T03:04:05+00:00'
 
 
 class Args:
-    force, json, quiet, holdout = True, False, False, False
+    force, json, quiet, holdout, brief = True, False, False, False, False
 
 
 @pytest.mark.parametrize('quiet', [False, True])
