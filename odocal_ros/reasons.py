@@ -266,6 +266,9 @@ class Reason:
     text: str
     do: str = ''
 
+    def __str__(self) -> str:
+        return f'{self.code.name}: {self.text}'
+
     @property
     def remedy(self) -> str:
         return self.do or self.code.remedy

@@ -29,7 +29,7 @@ MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 
 
 @dataclass(frozen=True, eq=False)
-class Chunk:
+class PackedChunk:
     """
     Messages of one channel, packed.
 
@@ -48,7 +48,8 @@ class Chunk:
         return len(self.record) + len(self.index)
 
 
-def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence: int = 0) -> Chunk:
+def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes],
+         sequence: int = 0) -> PackedChunk:
     """Return messages of a channel (one or more) as a chunk, numbered from ``sequence``."""
     head = MESSAGE_HEAD.pack
     parts: list[bytes] = []
@@ -65,8 +66,8 @@ def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence:
     body = (mcap.CHUNK_HEAD.pack(start_ns, end_ns, len(records), zlib.crc32(records)) + _text(form)
             + struct.pack('<Q', len(packed)) + packed)
     index = struct.pack('<HI', channel, entries.nbytes) + entries.tobytes()
-    return Chunk(channel, start_ns, end_ns, len(raws), _record(mcap.CHUNK, body),
-                 _record(mcap.MESSAGE_INDEX, index))
+    return PackedChunk(channel, start_ns, end_ns, len(raws), _record(mcap.CHUNK, body),
+                       _record(mcap.MESSAGE_INDEX, index))
 
 
 @cache
@@ -92,7 +93,8 @@ class Written(NamedTuple):
     counts: Counter[int]
 
 
-def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
+def write_file(path: Path, channels: Mapping[int, Channel],
+               chunks: Iterable[PackedChunk]) -> Written:
     """
     Write an mcap file completely or not at all; it is on the disk when this returns.
 
@@ -102,7 +104,8 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
         return _fill(file, channels, chunks)
 
 
-def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
+def _fill(file: WholeFile, channels: Mapping[int, Channel],
+          chunks: Iterable[PackedChunk]) -> Written:
     described = b''.join(
         _record(mcap.SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
@@ -126,7 +129,7 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
     return Written(at, start_ns, end_ns, counts)
 
 
-def _chunk_index(chunk: Chunk, at: int) -> bytes:
+def _chunk_index(chunk: PackedChunk, at: int) -> bytes:
     """Return the index record of a chunk at an offset of the file."""
     _, _, size, _, form, packed = _chunk_body(chunk.record)
     return _record(mcap.CHUNK_INDEX, struct.pack(
@@ -142,7 +145,7 @@ def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
     return start_ns, end_ns, size, crc, form, packed
 
 
-def read_chunks(path: Path) -> Iterator[Chunk]:
+def read_chunks(path: Path) -> Iterator[PackedChunk]:
     """Yield the chunks of a file that ``write_file`` wrote, one at a time."""
     with path.open('rb') as file:
         file.seek(len(mcap.MAGIC))
@@ -157,7 +160,7 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
             elif op == mcap.MESSAGE_INDEX:
                 channel, nbytes = struct.unpack_from('<HI', body, 9)
                 start_ns, end_ns, *_ = _chunk_body(record)
-                yield Chunk(channel, start_ns, end_ns, nbytes // 16, record, body)
+                yield PackedChunk(channel, start_ns, end_ns, nbytes // 16, record, body)
 
 
 def _record(op: int, body: bytes) -> bytes:

@@ -18,7 +18,7 @@ import re
 from typing import Any
 
 from odocal_ros.bagio.bag_file import Channel
-from odocal_ros.bagio.mcap_write import Chunk, read_chunks, write_file, Written
+from odocal_ros.bagio.mcap_write import PackedChunk, read_chunks, write_file, Written
 from odocal_ros.safe_io.atomic_files import disk, write_text
 
 JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
@@ -86,7 +86,7 @@ class SegmentedBag:
         # the first has the size of the pre-roll: it is only copied once
         return [s for s in self.segments[1:] if s.first == s.last]
 
-    def append(self, chunks: Sequence[Chunk]) -> None:
+    def append(self, chunks: Sequence[PackedChunk]) -> None:
         number = self.segments[-1].last + 1 if self.segments else 0
         self.segments.append(self._write(part_name(number, number), number, number, chunks))
 
@@ -116,7 +116,7 @@ class SegmentedBag:
                 disk(os.unlink, path)
         return self.segments[0].path
 
-    def add(self, chunks: Sequence[Chunk]) -> None:
+    def add(self, chunks: Sequence[PackedChunk]) -> None:
         """Add messages to the finished bag, as a file of its own."""
         number = len(self.extra) + 1
         self.extra.append(self._write(whole_name(self.folder, number), 0, 0, chunks))
@@ -130,7 +130,7 @@ class SegmentedBag:
         for segment in segments:
             disk(os.unlink, segment.path)
 
-    def _write(self, name: str, first: int, last: int, chunks: Iterable[Chunk]) -> Segment:
+    def _write(self, name: str, first: int, last: int, chunks: Iterable[PackedChunk]) -> Segment:
         path = self.folder / name
         return Segment(path, first, last, write_file(path, self.channels, chunks))
 
@@ -143,18 +143,18 @@ def _size(segments: Iterable[Segment]) -> int:
     return sum(segment.written.size for segment in segments)
 
 
-def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
+def _chunks_of(segments: Iterable[Segment]) -> Iterator[PackedChunk]:
     for segment in segments:
         yield from read_chunks(segment.path)
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
     import yaml
-    every = [f.written for f in files]
-    counts: Counter[int] = sum((one.counts for one in every), Counter())
+    written = [f.written for f in files]
+    counts: Counter[int] = sum((one.counts for one in written), Counter())
     text: str = yaml.safe_dump({'rosbag2_bagfile_information': {
         'version': 9, 'storage_identifier': 'mcap',
-        **_span(min(one.start_ns for one in every), max(one.end_ns for one in every), counts),
+        **_span(min(one.start_ns for one in written), max(one.end_ns for one in written), counts),
         'topics_with_message_count': [
             {'topic_metadata': {'name': c.topic, 'type': c.msgtype, 'serialization_format': 'cdr',
                                 'offered_qos_profiles': [], 'type_description_hash': ''},

@@ -91,7 +91,7 @@ def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting:
     why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
            for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
     # a method without its data (a second wheel) is not reported
-    return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r.code.name}: {r.text}',
+    return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r}',
                    f'{r.remedy} The values come from another method, which may not detect this '
                    'problem.')
             for name, r in why if r.code not in (Code.NO_METHOD, *stated_codes)]

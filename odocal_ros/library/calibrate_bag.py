@@ -5,7 +5,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, UTC
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,10 @@ from odocal_ros.library.arguments import (
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.find_legs import coverage_reasons, missing_stop_reasons, OPEN_LEG
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
+from odocal_ros.output.value_text import iso
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
-from odocal_ros.safe_io.text_formats import one_line
+from odocal_ros.safe_io.text_formats import date_text, one_line
 from odocal_ros.settings.config import Config, flat
 
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
@@ -183,9 +183,7 @@ def _without_refused(results: list[LegResult], listener: Notes) -> list[LegResul
     kept, notes = [], []
     for leg in results:
         if reason := rejecting_reason(leg):
-            start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
-            notes.append(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
-                         f'{reason.code.name}: {reason.text}')
+            notes.append(f'the leg of {date_text(iso(leg.start_ns))} is not used: {reason}')
         else:
             kept.append(leg)
     for note in notes if kept else ():

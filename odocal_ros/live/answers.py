@@ -13,6 +13,7 @@ from odocal_ros.forecast.forecast import PREDICTED_REST_S
 from odocal_ros.forecast.progress import clock_difference_text
 from odocal_ros.live.session import Restored, SessionView, State
 from odocal_ros.output.summary import sentence, values_in_words
+from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import cautions, Reason, Verdict
 from odocal_ros.safe_io.text_formats import error_text
 
@@ -45,7 +46,7 @@ def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg
                 f'{verdict.value}; all legs {text}')
     parts_of_answer = [text, good]
     for reason in cautions(calibration.reasons)[:MOST_REASONS]:
-        parts_of_answer += [f'{reason.code.name}: {reason.text}', reason.remedy]
+        parts_of_answer += [str(reason), reason.remedy]
     if advice and advice not in parts_of_answer:
         parts_of_answer.append(f'Next: {advice}')
     return calibration.verdict is not Verdict.REJECTED, _sentences(parts_of_answer)
@@ -64,8 +65,8 @@ def provisional_answer(at_stop: SessionView) -> str:
     if any(e.value is not None for e in known.values()):
         estimate = (f'the running estimate is {values_in_words(known)}, computed '
                     f'{at_stop.forecast_age_s:.0f} s before the end')
-    faults = [f'The leg would be rejected: {r.code.name}: {r.text}'
-              for r in at_stop.faults[:1] if at_stop.is_rejected_so_far]
+    faults = [f'The leg would be rejected: {reason}'
+              for reason in at_stop.faults[:1] if at_stop.is_rejected_so_far]
     of_all = ' of all legs' if session.legs else ''
     return _sentences([
         f'provisional: leg {session.leg_id} is being computed; {estimate}', *faults,
@@ -188,7 +189,7 @@ def _wheel_manoeuvres(now: SessionView) -> list[str]:
 def _recording_hint(now: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint as two lists: actions, then facts."""
     metres, required = metres_to_go(now), manoeuvres(now)
-    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
+    facts = list(map(str, now.faults[:1]))     # a caution, or a gap
     slow = now.max_speed < now.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
@@ -205,8 +206,7 @@ def _recording_hint(now: SessionView) -> tuple[list[str], list[str]]:
 
 
 def _fault_text(now: SessionView) -> str:
-    worst = now.faults[0]
-    text = f'{worst.code.name}: {worst.text}. {worst.remedy.rstrip(".")}'
+    text = f'{now.faults[0]}. {now.faults[0].remedy.rstrip(".")}'
     if now.session.is_automatic:
         return f'the leg will not be used: {text}; the next leg starts automatically'
     return f'call ~/cancel_leg and start again: the leg would be rejected: {text}'
@@ -230,7 +230,7 @@ def advice_after_result(now: SessionView) -> str:
     config = now.config
     lacking = config.verdict.min_legs - len(now.session.legs)
     if lacking > 0:
-        return f'drive {lacking} more leg{"s" * (lacking > 1)}'
+        return f'drive {counted(lacking, "more leg")}'
     if grave := cautions(reasons):
         return grave[0].remedy
     save = '' if config.output.autosave or now.saved else 'call ~/save, or '

@@ -7,6 +7,7 @@ import re
 from typing import Any
 
 from odocal_ros.live.session import SessionView, State
+from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Code
 from odocal_ros.safe_io.text_formats import brief_line
 
@@ -69,7 +70,7 @@ class TopicReport:
 
 def losses_text(lost: dict[str, int]) -> str:
     """Return the counts as text, empty if nothing was lost in a queue or on the network."""
-    return ', '.join(f'{count} message{"s" * (count != 1)} of {topic} lost'
+    return ', '.join(f'{counted(count, "message")} of {topic} lost'
                      for topic, count in lost.items() if count)
 
 
@@ -119,9 +120,9 @@ class Console:
         self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
-            what = ('legs start and end automatically' if now.config.leg.automatic else
+            action = ('legs start and end automatically' if now.config.leg.automatic else
                     'stand still for 10 s, then call ~/start_leg')
-            self._log.info(f'ready ({rates}): {what}' if rates else f'ready: {what}')
+            self._log.info(f'ready ({rates}): {action}' if rates else f'ready: {action}')
         elif self._missing_logged:
             self._log.info('all inputs are available again')
         self._ready, self._missing_logged = True, False
@@ -134,8 +135,7 @@ class Console:
         for fault in now.faults:
             if fault.code not in self._reported:
                 self._reported.add(fault.code)
-                self._log.warning(f'leg {leg_id}: {fault.code.name}: {fault.text}. '
-                                  f'{fault.remedy}')
+                self._log.warning(f'leg {leg_id}: {fault}. {fault.remedy}')
         if now.session.state is not State.RECORDING:
             return
         withdrawn = self._reported - self._withdrawn - {fault.code for fault in now.faults}

@@ -20,6 +20,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
+from odocal_ros.output.value_text import counted
 from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
@@ -109,8 +110,8 @@ class DrivePattern(SettledNode):
         reason = 'a pattern is already running' if self._route else self._stop_reason()
         others = self.count_publishers(self._publisher.topic_name) - 1
         if not reason and others:
-            reason = (f'{self._publisher.topic_name} has {others} other publisher'
-                      f'{"s" * (others != 1)}: end the other node, or remap one of them')
+            reason = (f'{self._publisher.topic_name} has {counted(others, "other publisher")}: '
+                      'end the other node, or remap one of them')
         response.success, response.message = not reason, reason
         if reason:
             self.get_logger().warning(f'~/start refused: {reason}')

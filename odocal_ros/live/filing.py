@@ -78,19 +78,19 @@ class ResultFolders:
         """
         root = newest.parent
         with locked(root):
-            made = filter(None, (RESULT_NAME.fullmatch(p.name) for p in root.iterdir()))
+            matches = filter(None, (RESULT_NAME.fullmatch(p.name) for p in root.iterdir()))
             # by the time, and the count within that second
-            names = [m[0] for m in sorted(made, key=lambda m: (m[1], int(m[2] or 1)))]
-            old = names[:-kept] if kept else []
+            names = [m[0] for m in sorted(matches, key=lambda m: (m[1], int(m[2] or 1)))]
+            outdated = names[:-kept] if kept else []
             linked = _link_target(root / LATEST)
             kept_names = {newest.name, linked,
                           *(f.before for f in self._written if f.folder.name == linked)}
-            for name in reversed(names if old else []):
+            for name in reversed(names if outdated else []):
                 found = stored_in(root / name)
                 if found and found.usable:
                     kept_names.add(name)
                     break
-            for name in (n for n in old if n not in kept_names):
+            for name in (n for n in outdated if n not in kept_names):
                 found = stored_in(root / name)
                 if found and found.config.get('leg.automatic'):
                     shutil.rmtree(root / name, ignore_errors=True)

@@ -14,7 +14,7 @@ import time
 from typing import TextIO
 
 from odocal_ros.bagio.bag_file import Channel
-from odocal_ros.bagio.mcap_write import Chunk
+from odocal_ros.bagio.mcap_write import PackedChunk
 from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
 from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
@@ -109,7 +109,8 @@ class LegJournal:
     journal ends with the data written so far, and the trouble stays.
     """
 
-    def __init__(self, plan: Plan, channels: dict[int, Channel], chunks: list[Chunk]) -> None:
+    def __init__(self, plan: Plan, channels: dict[int, Channel],
+                 chunks: list[PackedChunk]) -> None:
         self.plan = plan
         self.trouble = ''
         self._channels = channels
@@ -118,13 +119,13 @@ class LegJournal:
         self._lock: TextIO | None = None
         self._others = 0              # bytes of the other journals
         self._over = False            # given up, or finished
-        self.late: list[Chunk] = []  # marks that came after the end, not written yet
+        self.late: list[PackedChunk] = []  # marks that came after the end, not written yet
 
     @property
     def folder(self) -> str:
         return str(self._bag.folder) if self._bag else ''
 
-    def put(self, chunks: list[Chunk]) -> None:
+    def put(self, chunks: list[PackedChunk]) -> None:
         """Write chunks, after the waiting ones."""
         if self._over:
             return
@@ -148,7 +149,7 @@ class LegJournal:
         if self._lock is not None:
             self._lock.close()
 
-    def add(self, chunks: list[Chunk]) -> None:
+    def add(self, chunks: list[PackedChunk]) -> None:
         """Add a mark to the finished journal."""
         self.late += chunks
         self.retry()

@@ -11,7 +11,7 @@ import threading
 from typing import Any
 
 from odocal_ros.bagio.bag_file import Channel
-from odocal_ros.bagio.mcap_write import Chunk, pack
+from odocal_ros.bagio.mcap_write import pack, PackedChunk
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.messages import definition_of
 
@@ -35,10 +35,10 @@ class PreRoll:
     """The newest chunks of each topic, as far back as a leg may reach, limited in bytes."""
 
     def __init__(self) -> None:
-        self._held: dict[str, deque[tuple[int, Chunk]]] = {}
+        self._held: dict[str, deque[tuple[int, PackedChunk]]] = {}
         self.size = 0
 
-    def feed(self, slot: str, newest_ns: int, chunk: Chunk, reach_ns: int) -> None:
+    def feed(self, slot: str, newest_ns: int, chunk: PackedChunk, reach_ns: int) -> None:
         """Keep a chunk by the stamp of its last row; drop those more than ``reach_ns`` older."""
         held = self._held.setdefault(slot, deque())
         held.append((newest_ns, chunk))
@@ -49,10 +49,10 @@ class PreRoll:
         while self.size > PREROLL_BYTES:
             self._drop(max(self._held.values(), key=lambda h: sum(c.size for _, c in h)))
 
-    def _drop(self, held: deque[tuple[int, Chunk]]) -> None:
+    def _drop(self, held: deque[tuple[int, PackedChunk]]) -> None:
         self.size -= held.popleft()[1].size
 
-    def chunks(self) -> list[Chunk]:
+    def chunks(self) -> list[PackedChunk]:
         """Return all chunks in order of time."""
         return sorted((chunk for held in self._held.values() for _, chunk in held),
                       key=lambda chunk: chunk.start_ns)
@@ -153,7 +153,7 @@ class JournalWriter:
             self._closed[leg.plan.leg_id] = leg
             self._leg = None
 
-    def _packed(self, received: Received) -> Chunk:
+    def _packed(self, received: Received) -> PackedChunk:
         number = self._numbers.get(received.topic)
         if number is None:
             number = self._numbers[received.topic] = len(self._numbers) + 1

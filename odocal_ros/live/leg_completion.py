@@ -244,8 +244,7 @@ class LegCompletion:
         self._distance_m = sum(one.distance for one in done.results)
         if isinstance(done, worker.UnusedLeg):
             self.session.drop_unusable(done.reason)
-            text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
-                    f'{done.reason.code.name}: {done.reason.text}')
+            text = f'leg {leg_id}, {self._distance_m:.0f} m, is not used: {done.reason}'
             self._log.info(text)
             self._computing.answer(False, text)
             return

@@ -16,7 +16,7 @@ from odocal_ros.live.filing import LATEST, output_root
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.session import Refused, State
 from odocal_ros.output.stored import Stored, stored_in
-from odocal_ros.output.value_text import iso
+from odocal_ros.output.value_text import counted, iso
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITHIN
 from odocal_ros.reasons import Code
@@ -117,7 +117,7 @@ class AutomaticLegs(LegCompletion):
         for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
                 self._warned.add(reason.text)
-                self._log.warning(f'{reason.code.name}: {reason.text}. {reason.remedy}')
+                self._log.warning(f'{reason}. {reason.remedy}')
 
 
 def _foreign_result_reason(found: Stored, config: Config) -> str:
@@ -233,7 +233,7 @@ class Operation(AutomaticLegs):
         self._publishing.show_paths(worker.leg_paths(None, self._config()))
         self._filing.withdraw(0)
         self.show_status()
-        return True, f'reset: {len(dropped)} leg{"s" * (len(dropped) != 1)} dropped'
+        return True, f'reset: {counted(len(dropped), "leg")} dropped'
 
     def save(self) -> Future:
         if self.session.calibration is None:

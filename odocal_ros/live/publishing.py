@@ -28,7 +28,7 @@ from odocal_ros.live.messages import LATCHED
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.live.worker import Paths
-from odocal_ros.output.value_text import iso
+from odocal_ros.output.value_text import counted, iso
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.text_formats import date_text
@@ -126,7 +126,7 @@ def level(now: SessionView) -> Any:
 def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
     """Return one sentence: the state, the accuracy, and the next action."""
     session = now.session
-    legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
+    legs = counted(len(session.legs), 'leg')
     if session.carried:
         legs += f' and {session.carried.legs} before'
     state_text = {
@@ -142,7 +142,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
     if now.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {now.restored}'
     good = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
-    troubles = [f'{what}: {trouble}' for what, trouble in (
+    troubles = [f'{statement}: {trouble}' for statement, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
     return '; '.join(filter(None, (state_text, *_changes(session), good, now.lost, text,
@@ -163,7 +163,7 @@ def _changes(session: Session) -> list[str]:
 
 def _unused(session: Session) -> str:
     reason = session.unused
-    return f'a leg was not used: {reason.code.name}: {reason.text}' if reason else ''
+    return f'a leg was not used: {reason}' if reason else ''
 
 
 def _automatic(now: SessionView) -> str:

@@ -14,6 +14,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.forecast.quantities import Observability
 from odocal_ros.output.summary import values_in_words
+from odocal_ros.output.value_text import counted
 from odocal_ros.pipeline.floor_marks import FloorMark, next_point
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason, Verdict
@@ -67,7 +68,7 @@ class Restored:
         use = '' if self.valid else ', which was rejected'
         vehicle_text = f' of vehicle {one_line(self.vehicle)}' if self.vehicle else ''
         return (f'restored result of {self.stamp}{vehicle_text}{use}: '
-                f'{values_in_words(estimates)}; from {self.legs} leg{"s" * (self.legs != 1)}')
+                f'{values_in_words(estimates)}; from {counted(self.legs, "leg")}')
 
 
 class Session:

@@ -27,6 +27,7 @@ from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.message_fields import Pairs, TRANSFORMS
 from odocal_ros.messages.odometer_types import TYPES
 from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
+from odocal_ros.output.value_text import counted
 from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config
 
@@ -264,7 +265,7 @@ class Input:
                     + ', or restart the node' * (len(self.allowed) != 1))
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
-        publishers_text = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
+        publishers_text = counted(len(self.publishers), 'publisher')
         if not self.health.received_ns:
             return (f'{self.topic}: {publishers_text} found ({offers}) but no message yet; check '
                     'the driver')

@@ -43,7 +43,7 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
     missing = {r.text: r for one in runs for r in one.method.reasons
                if len(runs) == 1 and r.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE'))}
     for r in missing.values():
-        lines += ['', *wrapped(f'{r.code.name}: {r.text}. {r.remedy}')]
+        lines += ['', *wrapped(f'{r}. {r.remedy}')]
     return '\n'.join(lines)
 
 
@@ -128,6 +128,6 @@ def _improvements(before: Planned) -> list[str]:
 def _reasons(before: Plan) -> list[str]:
     lines = []
     for reason in before.reasons:
-        lines += textwrap.wrap(f'{reason.code.name}: {reason.text}. {reason.remedy}', 96,
+        lines += textwrap.wrap(f'{reason}. {reason.remedy}', 96,
                                initial_indent='  ', subsequent_indent='     ')
     return ['', *lines] if lines else []

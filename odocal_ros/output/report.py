@@ -4,7 +4,6 @@
 """The page report.html, which loads nothing from the network."""
 
 from collections import Counter
-from datetime import datetime, UTC
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -21,8 +20,9 @@ from odocal_ros.output import report_tables as tables
 from odocal_ros.output.plot_style import apply_style, Drawing
 from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
-from odocal_ros.output.value_text import join_same_reasons, known, length, time_span
+from odocal_ros.output.value_text import iso, join_same_reasons, known, length, time_span
 from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
@@ -84,7 +84,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
         'title': content['vehicle'] or ', '.join(bags) or 'live drive',
-        'created': _readable_date(content['created']),
+        'created': date_text(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
         'driven': driven(legs),
@@ -121,14 +121,6 @@ def _by_number_of_values(methods: dict[str, MethodResult],
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
 
 
-def _readable_date(created: str) -> str:
-    """Return an ISO date in readable form, unchanged if it cannot be parsed."""
-    try:
-        return f'{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
-    except ValueError:
-        return created
-
-
 def _budgets(methods: dict[str, MethodResult],
              legs: tuple[LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
     local = has_local_positions(legs)
@@ -149,7 +141,7 @@ def _draw_figures(
     figures: dict[int, list[Drawing]] = {}
     shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]
     with apply_style():
-        together = comparison_figure(calibration, 'all')
+        comparison = comparison_figure(calibration, 'all')
         for number, leg, evidence in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
             if figures and size > MOST_BYTES:
                 break
@@ -161,16 +153,17 @@ def _draw_figures(
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
     # also legs whose tracks were removed to save memory
-    had = [number for number, leg in numbered if leg.evidence is not None
+    with_track = [number for number, leg in numbered if leg.evidence is not None
            or leg.before is not None]
-    return legs, together, [number for number in had if number not in figures]
+    return legs, comparison, [number for number in with_track if number not in figures]
 
 
 def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> dict[str, Any]:
     rows, findings = tables.left_out(leg)
     methods = _by_number_of_values(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
-            'start': _utc(leg.start_ns), 'stop': _utc(leg.stop_ns), 'figures': figures,
+            'start': date_text(iso(leg.start_ns)), 'stop': date_text(iso(leg.stop_ns)),
+            'figures': figures,
             'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),
                       ('IMU samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
@@ -192,10 +185,3 @@ def _relative(leg: LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
     scale = known(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None
-
-
-def _utc(stamp_ns: int) -> str:
-    try:
-        return f'{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC'
-    except (ValueError, OverflowError, OSError):
-        return f'{stamp_ns} ns'

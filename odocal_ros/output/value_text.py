@@ -206,7 +206,7 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[s
         for reason in found:
             lines += [f'  {title}'] if title else []
             title = ''
-            lines += wrapped(f'{reason.code.name}: {reason.text}', '    ', '   ', width)
+            lines += wrapped(str(reason), '    ', '   ', width)
             lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)
     if any(re.search(r'\bt = ', line) for line in lines):
         lines.append('  t: seconds from the start of the leg')
@@ -223,19 +223,19 @@ def accept_line(calibration: Calibration, acceptance: Acceptance, config: Config
 
 def accept_words(acceptance: Acceptance) -> list[str]:
     """Return the decision, a line on each value, the cause and the action."""
-    lines = [acceptance.decision.value, *(f'  {_value(held)}' for held in acceptance.values)]
+    lines = [acceptance.decision.value, *(f'  {_value(entry)}' for entry in acceptance.values)]
     if acceptance.why:
         lines.append(f'  {acceptance.why}')
     return lines + ([f'  -> {acceptance.do}'] if acceptance.do else [])
 
 
-def _value(held: ValueDecision) -> str:
-    e, angle = held.estimate, held.estimate.unit == 'rad'
+def _value(entry: ValueDecision) -> str:
+    e, angle = entry.estimate, entry.estimate.unit == 'rad'
     factor = math.degrees(1.0) if angle else 1.0
     unit = ' deg' if angle else f' {e.unit}' * (e.unit not in ('', '1'))
-    name = held.name.replace('_', ' ')
+    name = entry.name.replace('_', ' ')
     limits = ' to '.join('any' if math.isinf(x) else f'{x * factor:g}'
-                         for x in (held.low, held.high))
+                         for x in (entry.low, entry.high))
     shown = 'not determined' if e.value is None else (
         f'{with_sigma(e.value, e.sigma, factor)}{unit}')
-    return f'{held.decision.value:9} {name} {shown}, limits {limits}{unit}'
+    return f'{entry.decision.value:9} {name} {shown}, limits {limits}{unit}'

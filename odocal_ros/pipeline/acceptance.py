@@ -92,8 +92,8 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
         config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
     if calibration.verdict is Verdict.REJECTED or (is_withheld and worst is Decision.PASS):
         why = next(r for r in calibration.reasons if r.code.severity is calibration.verdict)
-        return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: '
-                          f'{why.code.name}: {why.text}', why.remedy)
+        return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: {why}',
+                          why.remedy)
     undecided = [held for held in values if held.decision is Decision.UNDECIDED]
     if worst is not Decision.UNDECIDED:
         return Acceptance(worst, values)

@@ -6,6 +6,7 @@
 from dataclasses import replace
 import json
 
+from conftest import CREATED
 import pytest
 
 from odocal_ros.output import report_tables
@@ -56,7 +57,7 @@ def test_screen_and_report_show_it(good):
     assert '0.0500000 ± 0.0000012' in rows[0]
     assert report_tables.method_table(methods, (leg,))['verdicts'] == ['rejected (leg)'] * 2
     both = replace(calibration, legs=(leg, later(leg, 1, reasons=())))
-    page = report_html(both, Config(), as_json(both, Config(), [], ''))
+    page = report_html(both, Config(), as_json(both, Config(), [], CREATED))
     assert page.count('<td>rejected (leg)</td>') == 2      # in the table of the first leg
 
 
