@@ -94,10 +94,8 @@ class RowStore:
         path = self.path(row.key)
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path.parent), whole_file(path) as file:      # against another fleet command
-            sink = pa.BufferOutputStream()
-            pq.write_table(pa.Table.from_pylist([asdict(row)], schema=row_schema()), sink,
-                           compression='zstd')
-            file.write(sink.getvalue().to_pybytes())
+            pq.write_table(pa.Table.from_pylist([asdict(row)], schema=row_schema()),
+                           pa.PythonFile(file, mode='w'), compression='zstd')
 
     def get(self, key: str) -> Row | None:
         """Return the row of a key, None without one or if the file is not a row."""
@@ -109,24 +107,24 @@ class RowStore:
     def drop(self, key: str) -> None:
         self.path(key).unlink(missing_ok=True)
 
-    def remember(self, seen: str, key: str) -> None:
+    def remember(self, fingerprint: str, key: str) -> None:
         """Store the key of a bag's row under the hash of its place, size and date."""
-        path = self._seen(seen)
+        path = self._seen(fingerprint)
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path.parent):
             write_text(path, key)
 
-    def known(self, seen: str) -> str | None:
+    def known(self, fingerprint: str) -> str | None:
         """Return the key of the existing row of a bag, None without one."""
         try:
-            key = self._seen(seen).read_text()
+            key = self._seen(fingerprint).read_text()
             whole = KEY.fullmatch(key) and _is_complete(self.path(key))
         except (OSError, UnicodeDecodeError):
             return None
         return key if whole else None
 
-    def _seen(self, seen: str) -> Path:
-        return self.folder / 'seen' / seen[:2] / seen
+    def _seen(self, fingerprint: str) -> Path:
+        return self.folder / 'seen' / fingerprint[:2] / fingerprint
 
 
 def row_schema() -> Any:

@@ -4,7 +4,7 @@
 """Comparison of calibrations of one vehicle, to detect changes."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
 from typing import Any
@@ -157,9 +157,7 @@ class Comparison:
         names = [s.name for s in self.stored]
 
         def difference(d: Difference | None) -> dict[str, Any] | None:
-            return None if d is None else {
-                'since': names[d.since], 'change': d.change, 'sigma': d.sigma,
-                'sigmas': d.sigmas, 'sigmas_if_shared_cancels': d.sigmas_if_shared_cancels}
+            return None if d is None else asdict(d) | {'since': names[d.since]}
         return {
             'schema': 1, 'changed': self.changed, 'sentence': self.sentence,
             'notes': list(self.notes),

@@ -111,10 +111,8 @@ def kml(columns: Series) -> str:
 def parquet(columns: Series, path: Path) -> None:
     import pyarrow
     from pyarrow import parquet as files
-    buffer = pyarrow.BufferOutputStream()
-    files.write_table(pyarrow.table(columns), buffer)
     with whole_file(path) as file:
-        file.write(buffer.getvalue())
+        files.write_table(pyarrow.table(columns), pyarrow.PythonFile(file, mode='w'))
 
 
 def mcap(result: Calibration, path: Path) -> None:

@@ -3,7 +3,7 @@
 
 """The findings of ``odocal inspect`` as text."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 import math
 from typing import Any
 
@@ -49,20 +49,15 @@ def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     """Return the description of one input, one statement per line."""
-    points = [*_of_fields(topic), *_of_imu(topic), *_of_odometer(topic), *_of_fix(topic),
-              *_of_timing(topic)]
-    if topic.get('trouble'):
-        points.append(topic['trouble'])
+    points = [point for key, statements in STATEMENTS.items() if topic.get(key)
+              for point in statements(topic, topic[key])]
     if topic['name'] not in roles and not any('warning:' in p for p in points):
         points = points[:2 + len(topic.get('moves', ()))]     # unused topics: short
     return [one_line(topic['name']), *(line for point in points for line in wrapped(point))]
 
 
-def _of_fields(topic: dict[str, Any]) -> Iterator[str]:
+def _of_fields(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
     """Return a statement for each field of an unknown type that follows the path of the fixes."""
-    fields = topic.get('fields')
-    if not fields:
-        return
     for field in fields['found']:
         unit = 'm/count' if field['whole'] and field['quantity'] != 'rate' else 'm per unit'
         grows = (f'is proportional to the speed, {field["scale"]:.3g} m/s per unit'
@@ -76,10 +71,7 @@ def _of_fields(topic: dict[str, Any]) -> Iterator[str]:
                'tried)')
 
 
-def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
-    imu = topic.get('imu')
-    if not imu:
-        return
+def _of_imu(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str]:
     unit = imu['force_unit']
     if not imu['gravity']:
         yield 'no specific force: no accelerometer, or its data is not published'
@@ -102,13 +94,7 @@ def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
         yield f'has an orientation, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
 
 
-def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
-    if 'chosen' in topic:
-        yield topic['chosen']
-    yield from topic.get('moves', ())
-    odometer = topic.get('odometer')
-    if not odometer:
-        return
+def _of_odometer(_topic: dict[str, Any], odometer: dict[str, Any]) -> Iterator[str]:
     what = {'cumulative': 'running count', 'increment': 'counts since the previous message',
             'rate': 'speed'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
@@ -126,10 +112,7 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
         yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
 
 
-def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
-    fix = topic.get('fix')
-    if not fix:
-        return
+def _of_fix(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]:
     status = ', '.join(f'{count} {STATUS.get(value, "status " + value)}'
                        for value, count in fix['status'].items())
     if fix['sigma']:
@@ -146,17 +129,14 @@ def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
         yield f'position resolution {fix["position_step"]:.2f} m'
 
 
-def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
-    timing = topic.get('timing')
-    if not timing:
-        return
+def _of_timing(topic: dict[str, Any], timing: dict[str, Any]) -> Iterator[str]:
     if timing['headerless']:
         jitter = timing['arrival_jitter']
         yield 'no header: arrival time (bag time) is used as stamp' + (
             '' if jitter is None else f'; arrival jitter {1e3 * jitter:.1f} ms')
-    elif abs(late := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
-        where = 'after' if late > 0 else 'before'
-        yield (f'messages are recorded {abs(late):.3f} s {where} the time in their header '
+    elif abs(delay := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
+        where = 'after' if delay > 0 else 'before'
+        yield (f'messages are recorded {abs(delay):.3f} s {where} the time in their header '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     stamp_faults = [f'{timing[key]} {what}' for key, what in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
@@ -167,6 +147,13 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
         yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
                f'longest {longest["length"]:.2f} s at {longest["at"]:.2f} s')
+
+
+# facts of a topic: function of the topic and of these facts that yields statements
+STATEMENTS: dict[str, Callable[[dict[str, Any], Any], Iterable[str]]] = {
+    'fields': _of_fields, 'imu': _of_imu, 'chosen': lambda _topic, chosen: [chosen],
+    'moves': lambda _topic, moves: moves, 'odometer': _of_odometer, 'fix': _of_fix,
+    'timing': _of_timing, 'trouble': lambda _topic, trouble: [trouble]}
 
 
 def _drive(found: dict[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.cli import print_json, print_text
-from odocal_ros.offline.replay import settings_from_arguments
+from odocal_ros.offline.replay import add_settings_arguments, settings_from_arguments
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading')
 FIX_CORRELATION_TIMES = {'white': 0.0, 'correlated': 60.0}      # s
@@ -57,9 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--rounds', type=int, metavar='N', help='with --indoor: number of repetitions (default 1)')
     add('--track-width', type=float, metavar='M', help='with --indoor: distance between left and '
         'right wheels (default 0.3)')
-    add('--config', metavar='FILE', help='ROS parameter file, as for replay')
-    add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
-        help='any setting by its parameter name; repeatable')
+    add_settings_arguments(parser)
     for slot in SLOTS:
         add(topic_option(slot), metavar='TOPIC',
             help=f'with --bag: topic of the {INPUTS[slot].label}')

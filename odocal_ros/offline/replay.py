@@ -45,13 +45,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_input_arguments(parser: argparse.ArgumentParser,
                         default: str = 'the only topic of a fitting type') -> None:
     """Declare the options for settings and topics; ``default``: the topic without an option."""
-    add = parser.add_argument
-    add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
-    add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
-        help='any setting by its parameter name; repeatable')
+    add_settings_arguments(parser)
     for slot in TOPICS:
-        add(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {INPUTS[slot].label}; default: {default}')
+        parser.add_argument(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
+                            help=f'topic of the {INPUTS[slot].label}; default: {default}')
+
+
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--config', metavar='FILE', help='ROS parameter file, the same YAML as '
+                        'for the node')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
+                        dest='settings', help='any setting by its parameter name; repeatable')
 
 
 def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) -> None:

@@ -4,6 +4,7 @@
 """odocal simulate: a bag of a drive with known truth; --fleet: the bags of many vehicles."""
 
 import argparse
+from dataclasses import fields
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from odocal_ros.sim.scenarios import Drive
 
 MANIFEST = 'manifest.csv'
-# option: (metavar, help); its name is a field of SimOptions
+# fields of SimOptions as options: (metavar, help); help of angles
 NUMBERS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
@@ -108,12 +109,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, (what, text) in NUMBERS.items():
         add(_flag(name), type=float, metavar=what, help=text)
     for name, text in DEGREES.items():
-        add(_flag(name) + '-deg', type=float, metavar='DEG', dest=f'{name}_deg', help=text)
+        add(_flag(name) + '-deg', type=degrees, metavar='DEG', dest=name, help=text)
     for name in LEVER_ARMS:
         add(_flag(name), type=float, nargs=3, metavar=('X', 'Y', 'Z'),
             help='m forward, left, up of the rear axle')
-    add('--mounting-rpy-deg', type=float, nargs=3, metavar=('R', 'P', 'Y'),
-        help='nominal rotation from the IMU frame to forward-left-up')
+    add('--mounting-rpy-deg', type=degrees, nargs=3, metavar=('R', 'P', 'Y'),
+        dest='mounting_rpy', help='nominal rotation from the IMU frame to forward-left-up')
     add('--vehicle', choices=('real', 'clean'), help='random vehicle by seed and IMU grade: real '
         'has all sensor effects (docs/zoo.md), clean has none')
     add('--effect', action='append', metavar='NAME', dest='effects',
@@ -137,6 +138,11 @@ def _flag(name: str) -> str:
     return '--' + name.replace('_', '-')
 
 
+def degrees(text: str) -> float:
+    """Return degrees in rad; the name is in the error of argparse."""
+    return math.radians(float(text))
+
+
 def _span(text: str) -> tuple[float, float]:
     begin, _, end = text.partition(':')
     try:
@@ -147,24 +153,16 @@ def _span(text: str) -> tuple[float, float]:
 
 
 def options_of(args: argparse.Namespace) -> 'SimOptions':
+    """Return the drive's options: the arguments with the name of a field of SimOptions."""
     from odocal_ros.sim.options import SimOptions
-    names = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
-             'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]
-    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    for name in DEGREES:
-        if getattr(args, f'{name}_deg') is not None:
-            options[name] = math.radians(getattr(args, f'{name}_deg'))
-    for name in LEVER_ARMS:
-        if getattr(args, name) is not None:
-            options[name] = tuple(getattr(args, name))
+    given = {field.name: getattr(args, field.name, None) for field in fields(SimOptions)}
+    options: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in given.items() if value is not None}
     # each seed has its own date, so that drives do not overlap in time
     seed = options.get('seed', SimOptions.seed)
     days = 3650    # then the days of the seeds repeat
     options['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
-    if args.mounting_rpy_deg is not None:
-        options['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
-    if args.outages:
-        options['outages'] = tuple(args.outages)
     return _with_figures(args, options)
 
 

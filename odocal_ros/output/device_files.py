@@ -35,6 +35,34 @@ DEVICES = 'wheel_input.txt'
 MICRO = 1e6    # definition: millionths in 1
 TWIST, IMU_ERRORS = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
 UNKNOWN = 1e6      # definition: variance of unmeasured components, as in ROS drivers
+# comments of the files
+FOR_CONTROLLERS = """\
+# for ros2_controllers: copy the block of your controller into its parameter file,
+# under the name of your controller; the calibrated wheel must be one
+# that the controller drives. The multipliers are relative to odometer.nominal_scale:
+# if other multipliers were active during the drive, multiply them by these.
+# Older releases call the radius rear_wheels_radius or rear_wheel_radius.
+"""
+FOR_DEVICES = """\
+# for receivers and inertial systems that count the wheel themselves; the pulse is that of the
+# counter calibrated: a device that counts other edges needs a multiple
+"""
+FOR_TWIST = """\
+# Covariance of the twist of the calibrated wheels in {base}, for one message per
+# {period:.4g} s of the odometer. Estimated from this calibration: reading error, wheel noise,
+# scale, track width and their sigmas. Not included: an odometer delay, later tyre changes.
+# Velocity (m/s)^2, turn rate (rad/s)^2; order x, y, z, about x, y, z. {unknown:g}: not measured.
+# robot_localization reads it from the messages: copy the diagonal into elements 0, 7, 14, 21,
+# 28, 35 of twist.covariance of your driver, or its table below if the driver knows the speed.
+# ros2_controllers: copy the line under the name of your controller.
+"""
+FOR_IMU_ERRORS = """\
+# Errors of the IMU that this calibration determined better than the prior; of several legs the
+# value with the smallest sigma. Axes: the IMU turned by imu.mounting_rpy (none: its own), after
+# imu.gyro_scale and imu.accel_scale. True value = reading - bias - scale * reading, and for
+# axis_ab - axis_ab * reading b in axis a. rad/s, m/s^2, rad; scale without a unit. Biases are
+# those at the start of the leg: they change with temperature and at every start.
+"""
 
 
 def controllers(calibration: Calibration, config: Config,
@@ -43,15 +71,8 @@ def controllers(calibration: Calibration, config: Config,
     blocks = _blocks(calibration, config)
     if not blocks:
         return {}
-    lines = [head(calibration, content).rstrip(),
-             '# for ros2_controllers: copy the block of your controller into its parameter file,',
-             '# under the name of your controller; the calibrated wheel must be one',
-             '# that the controller drives. The multipliers are relative to '
-             'odometer.nominal_scale:',
-             '# if other multipliers were active during the drive, multiply them by these.',
-             '# Older releases call the radius rear_wheels_radius or rear_wheel_radius.']
-    text = '\n'.join(lines) + '\n'
-    return {CONTROLLERS: text + ''.join(parameter_block(v, name) for name, v in blocks.items())}
+    return {CONTROLLERS: head(calibration, content) + FOR_CONTROLLERS + ''.join(
+        parameter_block(values, name) for name, values in blocks.items())}
 
 
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
@@ -117,15 +138,11 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
     if scale.value is None or scale.unit != 'm/pulse':
         return {}
     micrometres = with_sigma(scale.value, scale.sigma, MICRO)
-    lines = [head(calibration, content).rstrip(),
-             '# for receivers and inertial systems that count the wheel themselves; the pulse is '
-             'that of the',
-             '# counter calibrated: a device that counts other edges needs a multiple',
-             f'# one pulse: {micrometres} um; {inverse(scale)}']
+    lines = [f'# one pulse: {micrometres} um; {inverse(scale)}']
     for where, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
         lines += ['', *textwrap.wrap(where, 98, initial_indent='# ', subsequent_indent='# ')]
         lines += [setting] if setting else []
-    return {DEVICES: '\n'.join(lines) + '\n'}
+    return {DEVICES: head(calibration, content) + FOR_DEVICES + '\n'.join(lines) + '\n'}
 
 
 def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
@@ -162,28 +179,14 @@ def wheel_covariance(calibration: Calibration, config: Config,
         return {}
     usual = noise.variances(noise.speed, noise.turn_rate)
     density = math.sqrt(usual[0] * noise.period)
-    lines = [
-        head(calibration, content).rstrip(),
-        f'# Covariance of the twist of the calibrated wheels in {config.frames.base}, for one '
-        'message per',
-        f'# {noise.period:.4g} s of the odometer. Estimated from this calibration: reading '
-        'error, wheel noise,',
-        '# scale, track width and their sigmas. Not included: an odometer delay, later tyre '
-        'changes.',
-        '# Velocity (m/s)^2, turn rate (rad/s)^2; order x, y, z, about x, y, z. '
-        f'{UNKNOWN:g}: not measured.',
-        '# robot_localization reads it from the messages: copy the diagonal into elements 0, 7, '
-        '14, 21,',
-        '# 28, 35 of twist.covariance of your driver, or its table below if the driver knows the '
-        'speed.',
-        '# ros2_controllers: copy the line under the name of your controller.',
-        *([] if noise.has_turn_rate else [
-            '# Without a left and a right wheel the turn rate is not measured: use a gyro.']),
-        '# VIO with wheels (VINS-Fusion forks), m/s per sqrt(Hz):',
-        f'#   wheel_velocity_noise_sigma: {density:.3g}']
+    text = FOR_TWIST.format(base=config.frames.base, period=noise.period, unknown=UNKNOWN)
+    if not noise.has_turn_rate:
+        text += '# Without a left and a right wheel the turn rate is not measured: use a gyro.\n'
+    text += ('# VIO with wheels (VINS-Fusion forks), m/s per sqrt(Hz):\n'
+             f'#   wheel_velocity_noise_sigma: {density:.3g}\n')
     diagonal = {'twist_covariance_diagonal': _diagonal(usual)}
-    text = '\n'.join(lines) + '\n'
-    return {TWIST: text + parameter_block(diagonal, 'diff_drive_controller') + _table(noise)}
+    return {TWIST: head(calibration, content) + text
+            + parameter_block(diagonal, 'diff_drive_controller') + _table(noise)}
 
 
 def _diagonal(variances: np.ndarray[Any, Any]) -> list[float]:
@@ -223,19 +226,8 @@ def imu_errors(calibration: Calibration, config: Config,
             found[f'gyro_bias_{axis}'] = {'value': bias.value, 'sigma': bias.sigma}
     if not found:
         return {}
-    lines = [
-        head(calibration, content).rstrip(),
-        '# Errors of the IMU that this calibration determined better than the prior; of several '
-        'legs the',
-        '# value with the smallest sigma. Axes: the IMU turned by imu.mounting_rpy (none: its '
-        'own), after',
-        '# imu.gyro_scale and imu.accel_scale. True value = reading - bias - scale * reading, and '
-        'for axis_ab',
-        '# - axis_ab * reading b in axis a. rad/s, m/s^2, rad; scale without a unit. Biases are '
-        'those at the',
-        '# start of the leg: they change with temperature and at every start.']
-    text = '\n'.join(lines) + '\n'
-    return {IMU_ERRORS: text + parameter_block(dict(sorted(found.items())), 'imu_errors')}
+    return {IMU_ERRORS: head(calibration, content) + FOR_IMU_ERRORS
+            + parameter_block(dict(sorted(found.items())), 'imu_errors')}
 
 
 def _known(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:

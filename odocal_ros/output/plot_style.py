@@ -6,7 +6,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 import io
-import os
 from pathlib import Path
 import re
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.errors import BadUsage
+from odocal_ros.safe_io.atomic_files import whole_file
 
 # Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
@@ -130,15 +129,11 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, or raise BadUsage."""
-    part = path.with_name(f'.{path.name}.part')
-    try:
-        ending = path.suffix[1:].lower()
-        # without a date, the same result gives the same file
-        figure.savefig(part, format=ending, dpi=150,
-                       metadata={'Date': None} if ending == 'svg' else None)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise BadUsage(f'{path}: cannot be written ({error.strerror}); give a writable '
-                       'folder') from None
+    """Write a figure; raise OSError if that fails."""
+    ending = path.suffix[1:].lower()
+    data = io.BytesIO()
+    # without a date, the same result gives the same file
+    figure.savefig(data, format=ending, dpi=150,
+                   metadata={'Date': None} if ending == 'svg' else None)
+    with whole_file(path) as file:
+        file.write(data.getvalue())
