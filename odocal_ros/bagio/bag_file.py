@@ -186,12 +186,12 @@ def next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
 
 def group_overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:
     """Yield groups of items that overlap in time; the items are in order of ``start_ns``."""
-    together: list[Any] = []
+    group: list[Any] = []
     end_ns = 0
     for item in items:
-        if together and item.start_ns >= end_ns:
-            yield together
-            together, end_ns = [], 0
-        together.append(item)
+        if group and item.start_ns >= end_ns:
+            yield group
+            group, end_ns = [], 0
+        group.append(item)
         end_ns = max(end_ns, item.end_ns)
-    yield together
+    yield group

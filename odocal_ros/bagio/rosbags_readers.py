@@ -39,12 +39,12 @@ PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 
 
 @contextmanager
-def require_rosbags(what: str) -> Iterator[None]:
+def require_rosbags(user: str) -> Iterator[None]:
     """Raise BadUsage if an import of rosbags, which is optional, fails; ``what`` needs it."""
     try:
         yield
     except ModuleNotFoundError:
-        raise BadUsage(f'{what} needs the Python package rosbags, which is not installed: '
+        raise BadUsage(f'{user} needs the Python package rosbags, which is not installed: '
                        'pip install rosbags') from None
 
 
@@ -68,7 +68,7 @@ def strip_idl(text: str) -> str:
 
     Raises ValueError for computed constants: messages have none, and 1 << 2**40 is large.
     """
-    kept, depth, annotated = [], 0, False
+    parts, depth, annotated = [], 0, False
     for token in TOKEN.findall(text):
         if depth:
             depth += (token == '(') - (token == ')')
@@ -77,11 +77,11 @@ def strip_idl(text: str) -> str:
         elif annotated and token == '(':
             depth, annotated = 1, False
         elif token.startswith(('//', '/*')):
-            kept.append(' ')
+            parts.append(' ')
         else:
             annotated = annotated and token.isspace()
-            kept.append(token)
-    plain = ''.join(kept)
+            parts.append(token)
+    plain = ''.join(parts)
     if '<<' in plain or '*' in plain:
         raise ValueError('computed constants')
     return plain
@@ -161,8 +161,8 @@ class Types:
         except (MemoryError, LimitReached):
             raise
         except Exception as error:   # a parser's errors
-            why = ' '.join(str(error).split())[:100] or type(error).__name__
-            raise BadData(f'{msgtype}: its definition in the bag cannot be parsed ({why}); use '
+            cause = ' '.join(str(error).split())[:100] or type(error).__name__
+            raise BadData(f'{msgtype}: its definition in the bag cannot be parsed ({cause}); use '
                           'another topic') from None
 
 
@@ -172,14 +172,14 @@ def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> 
     if depth > deepest:
         raise ValueError('it contains itself')
 
-    def of(field: tuple[Any, Any]) -> int:
-        kind, what = field
+    def count_of(field: tuple[Any, Any]) -> int:
+        kind, details = field
         if kind.name == 'NAME':
-            return _count_elements(what, fielddefs, depth + 1)
-        return of(what[0]) * int(what[1]) if kind.name == 'ARRAY' else 1
+            return _count_elements(details, fielddefs, depth + 1)
+        return count_of(details[0]) * int(details[1]) if kind.name == 'ARRAY' else 1
     total = 0
     for _, field in fielddefs[msgtype][1]:
-        total += of(field)
+        total += count_of(field)
         if total > ELEMENTS * factor():
             break
     return total
@@ -222,9 +222,9 @@ class Rosbag1File(BagFile):
 
     def _unreadable(self, error: Exception) -> BadBag:
         # an error of rosbags may contain the one that it is raised from, as a tuple
-        why = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
-        why = why if ' ' in why else 'damaged records'      # a key, or nothing
-        return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
+        cause = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
+        cause = cause if ' ' in cause else 'damaged records'      # a key, or nothing
+        return BadBag(f"{self.path}: cannot be read ({cause}); try 'rosbag reindex' on it")
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time, as CDR."""

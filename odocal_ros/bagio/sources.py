@@ -102,9 +102,9 @@ def _folder(path: Path) -> Source:
             files = without_joined(files)
         if not files:
             raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint_on_subfolders(path)}')
-        what = 'names no existing file' if listed else 'is missing'
+        fault = 'names no existing file' if listed else 'is missing'
         if metadata is None or listed:
-            notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
+            notes.append(f'{path}: metadata.yaml {fault}; read {len(files)} file'
                          f'{"s" * (len(files) > 1)} in name order')
     return Source(path.resolve().name, tuple(files), tuple(notes), metadata or BagMetadata())
 
@@ -150,9 +150,9 @@ def _read_metadata(path: Path) -> BagMetadata:
     except limits.LimitReached as error:
         return BagMetadata(fault=f'{error}; it is ignored')
     except Exception as error:      # any error: types, numbers, nesting, encoding
-        why = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
+        cause = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
             'not the structure that rosbag2 writes')
-        return BagMetadata(fault=f'{path}: cannot be parsed ({why}) and is ignored')
+        return BagMetadata(fault=f'{path}: cannot be parsed ({cause}) and is ignored')
 
 
 def _parse_metadata(content: dict[str, dict[str, Any]]) -> BagMetadata:
@@ -210,9 +210,9 @@ def kind_of(path: Path) -> str:
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return kind
-    what = 'is an empty file' if not head else 'is not a bag'
-    raise BadBag(f'{path.name}: {what}; give a folder with metadata.yaml or a .mcap, .db3 or .bag '
-                 'file')
+    fault = 'is an empty file' if not head else 'is not a bag'
+    raise BadBag(f'{path.name}: {fault}; give a folder with metadata.yaml or a .mcap, .db3 or '
+                 '.bag file')
 
 
 def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path:

@@ -155,12 +155,12 @@ def median(x: Floats) -> float:
     few = np.sort(x[::64])
     low, high = few[[int(0.45 * len(few)), int(0.55 * len(few))]]
     below, above = np.count_nonzero(x < low), np.count_nonzero(x > high)
-    amid = x[(x >= low) & (x <= high)]
+    middle = x[(x >= low) & (x <= high)]
     at = len(x) // 2 - below        # of the upper of the two in the middle
-    if not 0 < at < len(amid) or below + len(amid) + above < len(x):     # NaN is neither
+    if not 0 < at < len(middle) or below + len(middle) + above < len(x):     # NaN is neither
         return float(np.median(x))
-    amid.partition(at)
-    return float(amid[at] if len(x) % 2 else (amid[:at].max() + amid[at]) / 2)
+    middle.partition(at)
+    return float(middle[at] if len(x) % 2 else (middle[:at].max() + middle[at]) / 2)
 
 
 def columns(x: Floats) -> Iterator[Floats]:

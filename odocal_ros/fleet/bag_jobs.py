@@ -82,27 +82,28 @@ class BagOutcome:
 
 def calibrate_bag(job: BagJob) -> BagOutcome:
     """Ensure that the data set has the row of a bag; compute it if it is missing."""
-    store, began = RowStore(job.folder), time.monotonic()
-    seen = ''
+    store, started_s = RowStore(job.folder), time.monotonic()
+    fingerprint = ''
     _load_libraries()
-    with _resource_limits(job, lambda why: store.put(job.failed(why, seen=seen))):
+    with _resource_limits(job, lambda cause: store.put(job.failed(cause, seen=fingerprint))):
         try:
-            seen = bag_fingerprint(job.bag.bag, job.settings)
-            if found := _existing_row(store, job, seen):
+            fingerprint = bag_fingerprint(job.bag.bag, job.settings)
+            if found := _existing_row(store, job, fingerprint):
                 return BagOutcome(found.key, found.status, False)
-            row, computed = _compute_row(job, store, seen, began)
+            row, computed = _compute_row(job, store, fingerprint, started_s)
             store.put(row)
-            store.remember(seen, row.key)
+            store.remember(fingerprint, row.key)
             store.drop(job.failed_key)
             return BagOutcome(row.key, row.status, computed)
         except OdocalError as error:
-            why = error_text(error)
+            cause = error_text(error)
         except Exception as error:     # noqa: BLE001 one bag must not stop others
-            why = f'internal error ({type(error).__name__}: {error_text(error)}); please report it'
+            cause = (f'internal error ({type(error).__name__}: {error_text(error)}); '
+                     'please report it')
             if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
-                why = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
+                cause = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
     # outside the memory limit: the row needs memory
-    row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
+    row = job.failed(cause, seen=fingerprint, seconds=time.monotonic() - started_s)
     store.put(row)
     return BagOutcome(row.key, FAILED, True)
 
@@ -121,18 +122,19 @@ def _load_libraries() -> None:
     cho_factor(matrix @ matrix)
 
 
-def _existing_row(store: RowStore, job: BagJob, seen: str) -> Row | None:
+def _existing_row(store: RowStore, job: BagJob, fingerprint: str) -> Row | None:
     """Return the existing row of an unchanged bag, None without one."""
-    if key := store.known(seen):
+    if key := store.known(fingerprint):
         return store.get(key)
     failed = store.get(job.failed_key)
     # a bag that ended its worker may have no hash: only its place is known
-    if failed is not None and failed.seen in ('', seen):
+    if failed is not None and failed.seen in ('', fingerprint):
         return failed
     return None
 
 
-def _compute_row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bool]:
+def _compute_row(job: BagJob, store: RowStore, fingerprint: str,
+                 started_s: float) -> tuple[Row, bool]:
     """Return the row of a bag, and whether it was computed, not copied from a known one."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
@@ -143,13 +145,13 @@ def _compute_row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple
             size = sum(Path(file).stat().st_size for file in bag.files)
         key = key_of(sha256, job.settings)
         if (known := store.get(key)) is not None:
-            return replace(known, bag=job.bag.bag, seen=seen), False
+            return replace(known, bag=job.bag.bag, seen=fingerprint), False
         found = calibrated(path, job.topics, job.config, job.legs)
     legs = found.result.legs
     return job.row(
-        key=key, seen=seen, sha256=sha256, topics=json.dumps(found.inputs[0]['topics']),
+        key=key, seen=fingerprint, sha256=sha256, topics=json.dumps(found.inputs[0]['topics']),
         settings=json.dumps(changed_settings(found.config), sort_keys=True), bytes=size,
-        seconds=time.monotonic() - began, driven_s=sum(leg.duration for leg in legs),
+        seconds=time.monotonic() - started_s, driven_s=sum(leg.duration for leg in legs),
         start_ns=min((leg.start_ns for leg in legs), default=0),
         legs=text_of_legs(list(legs))), True
 

@@ -105,8 +105,8 @@ def _read_manifest(name: str) -> list[FleetBag]:
         raise BadUsage(f'{name}: cannot be read as a manifest ({error_text(error)})') from None
     lacking = {'vehicle', 'bag'} - set(table.column_names)
     if lacking or not table.num_rows:
-        what = f'no column {" and ".join(sorted(lacking))}' if lacking else 'holds no bag'
-        raise BadUsage(f'{name}: {what}; '
+        fault = f'no column {" and ".join(sorted(lacking))}' if lacking else 'holds no bag'
+        raise BadUsage(f'{name}: {fault}; '
                        f'required columns: vehicle, bag; optional: {", ".join(COLUMNS[2:])}')
     known = [column for column in COLUMNS if column in table.column_names]
     root = name[:len(name) - len(PurePosixPath(name).name)]

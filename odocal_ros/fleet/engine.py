@@ -108,8 +108,8 @@ def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], n
             found = future.result()
         except CancelledError:
             raise OdocalError(CONNECTION_LOST) from None
-        except Exception as what:     # noqa: BLE001 of the task, or that its workers were ended
-            error = what
+        except Exception as failure:     # noqa: BLE001 of the task, or that its workers were ended
+            error = failure
         yield number.pop(future.key), found, error
         future.release()
 

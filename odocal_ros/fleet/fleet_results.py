@@ -82,10 +82,10 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
 
 def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
     group: list[VehicleJob] = []
-    together = 500    # bags of a group of vehicles, at least
+    least_bags = 500    # bags of a group of vehicles, at least
     for job in jobs:
         group.append(job)
-        if sum(len(one.bags) for one in group) >= together:
+        if sum(len(one.bags) for one in group) >= least_bags:
             yield tuple(group)
             group = []
     if group:
@@ -176,8 +176,8 @@ def _draw_reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequenc
         (output / 'reports' / tables.folder_name(row['vehicle'])).resolve()))
         for row in reported]
     keys = [f'{k}-{id(report_jobs)}' for k in range(len(report_jobs))]
-    for k, why, error in task_results(client, draw_report, report_jobs, 'report', keys):
-        reported[k]['report'] = why if error is None else f'{type(error).__name__}: {error}'
+    for k, cause, error in task_results(client, draw_report, report_jobs, 'report', keys):
+        reported[k]['report'] = cause if error is None else f'{type(error).__name__}: {error}'
 
 
 def draw_report(job: ReportJob) -> str:
@@ -200,7 +200,7 @@ def summary_text(vehicles: Sequence[dict[str, Any]], output: Path, most: int) ->
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     failed = sum(row['bags_failed'] for row in vehicles)
     bags = sum(row['bags'] for row in vehicles)
-    lines = [', '.join(f'{n} {what}' for what, n in sorted(counts.items()))
+    lines = [', '.join(f'{n} {decision}' for decision, n in sorted(counts.items()))
              + f'; {counted(bags, "bag")}, {failed} failed']
     flagged = [row for row in vehicles if tables.needs_inspection(row)]
     lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in flagged[:most]]

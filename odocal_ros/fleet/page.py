@@ -24,6 +24,7 @@ from odocal_ros.fleet.tables import (
 from odocal_ros.output.plot_style import (
     apply_style,
     BLUE,
+    Drawing,
     even_rows,
     GREEN,
     GREY,
@@ -42,8 +43,8 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
           'pitch_mounting_angle': 'Pitch mounting angle'}
 
 
-def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
-    """Return (svg, title, description) of each figure that has data."""
+def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[Drawing]:
+    """Return each figure that has data."""
     drawn = []
     with apply_style():
         for name in COMPARED:
@@ -56,7 +57,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
     return drawn
 
 
-def _population_figure(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
+def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
     """Draw each vehicle's value against its model's median, one column a model."""
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = new_figure_column(2.8)
@@ -82,8 +83,8 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> tuple[str, str,
     title = f'{TITLES[name]} by model.'
     description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
                    'outside the plot.')
-    return svg(figure, f'population-{COMPARED[name]}', f'{title} {description}'), title, \
-        description
+    return title, description, svg(figure, f'population-{COMPARED[name]}',
+                                   f'{title} {description}')
 
 
 def _limit_axis(ax: Any, points: np.ndarray) -> None:
@@ -100,7 +101,7 @@ def _limit_axis(ax: Any, points: np.ndarray) -> None:
         ax.plot(hidden[:, 0], np.full(len(hidden), sign * 0.95 * most), mark, ms=6, color=RED)
 
 
-def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
+def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> Drawing | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
@@ -132,7 +133,7 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str
     title = 'Scale over time.'
     description = ('Legs relative to the current scale of their vehicle. Lines: vehicles that '
                    'changed or need inspection, the worst first.')
-    return svg(figure, 'control', f'{title} {description}'), title, description
+    return title, description, svg(figure, 'control', f'{title} {description}')
 
 
 def _read_points(path: Path, known: set[str],

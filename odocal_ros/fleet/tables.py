@@ -155,7 +155,7 @@ def needs_inspection(row: dict[str, Any]) -> bool:
 def _severity(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
     """Return the sorting key of a vehicle, the worst first."""
     verdict = row['decision'] or row['verdict']
-    far = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
+    largest_deviation = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
     return (not row['legs'] and -1 or 0, WORST_FIRST.index(verdict), not row['outlier'],
             row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
-            not row['rejected_for'], -far, row['vehicle'])
+            not row['rejected_for'], -largest_deviation, row['vehicle'])

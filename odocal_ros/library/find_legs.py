@@ -74,15 +74,15 @@ def coverage_reasons(recorder: LegRecorder) -> tuple[Reason, ...]:
     if not ends:
         return ()
     begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
-    what = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.0f} s {where}'
+    gaps = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.0f} s {where}'
             for slot, (a, b) in ends.items()
             for does, missing, where in (('begins', a - begin, 'after the first topic'),
                                          ('ends', end - b, 'before the last topic'))
             if missing > CUT_SHORT_NS]
-    return (Reason(Code.TOPIC_GAP, f'{", ".join(what)}: the leg is limited to the time '
+    return (Reason(Code.TOPIC_GAP, f'{", ".join(gaps)}: the leg is limited to the time '
                    'that all topics cover', 'Wait for messages of all topics and the first fix '
                    'before the drive, and record to its end. If a topic failed, check its driver, '
-                   'cable and the recorder.'),) if what else ()
+                   'cable and the recorder.'),) if gaps else ()
 
 
 def has_dropped_legs(bag: Bag) -> bool:

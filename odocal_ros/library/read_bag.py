@@ -212,7 +212,7 @@ def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_
     if recorder.form.quantity != 'cumulative':
         value = np.cumsum(value)
 
-    def moved(at: Floats) -> Floats:
+    def moved_within(at: Floats) -> Floats:
         out: Floats = np.abs(np.interp(at + WITHIN, t, value) - np.interp(at - WITHIN, t, value))
         return out
     times = np.array([(mark.stamp_ns - start_ns) * 1e-9 for mark in marks])
@@ -220,8 +220,8 @@ def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_
         if not (len(t) and t[0] <= time - WITHIN and time + WITHIN <= t[-1]):
             raise BadUsage(f'--mark {time:g}: the odometer has no data there; required: seconds '
                            'from the first message of the bag')
-    top = float(moved(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
-    for time, far in zip(times.tolist(), moved(times).tolist(), strict=True):
-        if far > STILL_SHARE * top:
+    largest = float(moved_within(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
+    for time, distance in zip(times.tolist(), moved_within(times).tolist(), strict=True):
+        if distance > STILL_SHARE * largest:
             raise BadUsage(f'--mark {time:g}: the wheels turn within {WITHIN:g} s of it; '
                            'required: a time at which the robot stands on a point')

@@ -156,14 +156,14 @@ def residuals(result: Calibration) -> Series:
     return stack_legs(found)
 
 
-def _residual_rows(leg: LegResult, left: SensorResiduals) -> Series:
-    m, c = left.value.shape
-    known = np.isfinite(left.sigma).ravel()
-    t, e = np.repeat(left.t, c), leg.evidence
-    far = np.full(m * c, np.nan) if e is None else np.interp(t, e.t, e.distance)
-    columns = {'t': t, 'sensor': np.full(m * c, left.sensor),
-               'component': np.tile(left.components, m),
-               'value': left.value.ravel().astype(float),
-               'sigma': left.sigma.ravel().astype(float),
-               'unit': np.full(m * c, left.unit), 'distance_m': far}
+def _residual_rows(leg: LegResult, residuals: SensorResiduals) -> Series:
+    m, c = residuals.value.shape
+    known = np.isfinite(residuals.sigma).ravel()
+    t, e = np.repeat(residuals.t, c), leg.evidence
+    distance = np.full(m * c, np.nan) if e is None else np.interp(t, e.t, e.distance)
+    columns = {'t': t, 'sensor': np.full(m * c, residuals.sensor),
+               'component': np.tile(residuals.components, m),
+               'value': residuals.value.ravel().astype(float),
+               'sigma': residuals.sigma.ravel().astype(float),
+               'unit': np.full(m * c, residuals.unit), 'distance_m': distance}
     return {name: column[known] for name, column in columns.items()}

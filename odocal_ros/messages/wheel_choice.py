@@ -62,13 +62,13 @@ def select_wheels(names: Sequence[str], count: int) -> Choice | str:
         return Choice((found[0],), True, f'joints {_list_text(keys)}: only {found[0]} is used, '
                       'selected by name')
     if len(found) == 2:
-        what = 'joints' if names else 'values'
+        noun = 'joints' if names else 'values'
         first, second = found
-        return Choice((first, second), False, f'{what} {_list_text(keys)}: the mean of {first} '
+        return Choice((first, second), False, f'{noun} {_list_text(keys)}: the mean of {first} '
                       f'and {second} is used. Left and right cannot be decided from the data; '
                       'below, the first is called left')
-    what = f'the joints {_list_text(keys)}' if names else f'a list of {count} values'
-    return (f'the wheels among {what} are not clear: set odometer.wheels'
+    noun = f'the joints {_list_text(keys)}' if names else f'a list of {count} values'
+    return (f'the wheels among {noun} are not clear: set odometer.wheels'
             f'{"" if names else " (indices from 0)"}, or odometer.field for one; '
             'odocal inspect shows how each value moves')
 

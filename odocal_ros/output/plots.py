@@ -82,7 +82,7 @@ def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
 
 
 def _track(evidence: Evidence, name: str, before_word: str,
-           slips: list[dict[str, float]] | tuple[Any, ...]) -> tuple[str, str, str]:
+           slips: list[dict[str, float]] | tuple[Any, ...]) -> style.Drawing:
     figure, (ax,) = style.new_figure_column(5.2)
     draw_track(ax, evidence, before_word, slips)
     style.add_legend(figure, ax)
@@ -140,7 +140,7 @@ def _band(ax: Any, path_length: Floats, sigma: Floats) -> None:
         ax.plot(path_length[band], edge, '--', color='black', linewidth=0.6)
 
 
-def _residuals(evidence: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
+def _residuals(evidence: Evidence, name: str, before_word: str) -> style.Drawing:
     factor, unit = style.length_unit(evidence.distance[-1])
     path_length = factor * evidence.fix_distance
     figure, axes = style.new_figure_column(5.2, 3)
@@ -166,7 +166,7 @@ def _residuals(evidence: Evidence, name: str, before_word: str) -> tuple[str, st
     return 'Residuals', text, style.svg(figure, f'{name}-residuals', text)
 
 
-def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> tuple[str, str, str]:
+def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style.Drawing:
     part = evidence.sections
     factor, unit = style.length_unit(evidence.distance[-1])
     middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
@@ -190,7 +190,7 @@ def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> tuple
     return 'Scale by section', text, style.svg(figure, f'{name}-sections', text)
 
 
-def _motion(evidence: Evidence, name: str) -> tuple[str, str, str]:
+def _motion(evidence: Evidence, name: str) -> style.Drawing:
     figure, (upper, lower) = style.new_figure_column(3.6, 2)
     for ax, x in ((upper, 3.6 * evidence.speed), (lower, np.rad2deg(evidence.yaw_rate))):
         rows = style.peak_rows(x)
@@ -204,7 +204,7 @@ def _motion(evidence: Evidence, name: str) -> tuple[str, str, str]:
     return 'Speed and turn rate', text, style.svg(figure, f'{name}-motion', text)
 
 
-def _fixes(evidence: Evidence, name: str) -> tuple[str, str, str]:
+def _fixes(evidence: Evidence, name: str) -> style.Drawing:
     figure, (ax,) = style.new_figure_column(2.7)
     for status in np.unique(evidence.fix_status):
         rows = np.flatnonzero(evidence.fix_status == status)
@@ -225,7 +225,7 @@ def _fixes(evidence: Evidence, name: str) -> tuple[str, str, str]:
     return 'Fix quality', text, style.svg(figure, f'{name}-fixes', text)
 
 
-def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
+def _biases(t: Floats, biases: Floats, name: str) -> style.Drawing:
     # without an accelerometer its bias is zero throughout
     shown = [one for one in zip(biases, (np.rad2deg(3600.0), 1e3), (
         'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True) if np.any(one[0])]

@@ -175,15 +175,16 @@ def left_out(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]
     """Return the unused fixes, counted by reason, and the findings about the leg's data."""
     rows = []
     if leg.evidence is not None:
-        seen = Counter(leg.evidence.excluded_because)
-        whole = sum(seen.values())
+        counts = Counter(leg.evidence.excluded_because)
+        total = sum(counts.values())
         times = leg.evidence.t_excluded
-        for why, n in seen.most_common():
-            at = [t for t, w in zip(times, leg.evidence.excluded_because, strict=True) if w == why]
+        for reason, n in counts.most_common():
+            at = [t for t, why in zip(times, leg.evidence.excluded_because, strict=True)
+                  if why == reason]
             # the list is thinned out: counts are of the whole
-            count = round(n * leg.evidence.excluded / whole)
+            count = round(n * leg.evidence.excluded / total)
             rows.append((f'{count} of {leg.evidence.fixes + leg.evidence.excluded} fixes',
-                         f'{why}; first at t = {min(at):.1f} s, last at t = {max(at):.1f} s'))
+                         f'{reason}; first at t = {min(at):.1f} s, last at t = {max(at):.1f} s'))
     elif leg.rejected_fixes:
         rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
     return rows, [r for r in leg.reasons if r.code in OF_DATA]

@@ -44,10 +44,10 @@ def fit_text(found: SpeedScale) -> str:
         return ''
     offset, lag = found.offset, found.lag
     low = 'low' if offset[0] > 0 else 'high'
-    late = 'later' if lag[0] > 0 else 'earlier'
+    delay = 'later' if lag[0] > 0 else 'earlier'
     return (f'Fit: factor {with_sigma(*found.factor)}; the odometer reads '
             f'{with_sigma(abs(offset[0]), offset[1])} m/s {low} and is '
-            f'{with_sigma(abs(lag[0]), lag[1])} s {late} than the fixes')
+            f'{with_sigma(abs(lag[0]), lag[1])} s {delay} than the fixes')
 
 
 def by_speed(found: SpeedScale, name: str) -> style.Drawing:
@@ -80,7 +80,7 @@ def by_window(found: Floats, name: str) -> style.Drawing:
     return 'Scale against the length of the window', text, picture
 
 
-def comparison_figure(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
+def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:
     """Draw scale, yaw and pitch by method and leg; empty for single values."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
             for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
@@ -117,7 +117,7 @@ def _angle(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estima
     return f'{ANGLES[name]} mounting angle, deg', points, band
 
 
-def _draw(panels: list[Panel], name: str, legs: int) -> tuple[str, str, str]:
+def _draw(panels: list[Panel], name: str, legs: int) -> style.Drawing:
     heights = [0.24 * len(points) for _, points, _ in panels]
     whole = sum(heights) + 0.75 * len(panels)
     figure, axes = style.new_figure_column(whole, len(panels), sharex=False, heights=heights)

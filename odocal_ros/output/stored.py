@@ -65,11 +65,11 @@ def read_stored(path: Path) -> Stored:
         return stored_from(content, name)
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)
-        why = f'there is no {MAIN} in it' if in_folder else error.strerror
-        raise BadUsage(f'{name}: {why}; give a calibration.json or its folder') from None
+        cause = f'there is no {MAIN} in it' if in_folder else error.strerror
+        raise BadUsage(f'{name}: {cause}; give a calibration.json or its folder') from None
     except (ValueError, RecursionError) as error:      # of json, utf-8, or a value below
-        why = (str(error).splitlines() or ['nested too deep'])[0]
-        raise BadUsage(f'{name}: not a calibration.json of odocal ({why})') from None
+        cause = (str(error).splitlines() or ['nested too deep'])[0]
+        raise BadUsage(f'{name}: not a calibration.json of odocal ({cause})') from None
 
 
 def _no_constant(text: str) -> None:
@@ -117,9 +117,9 @@ def known_imu(config: Config) -> CarriedInformation | None:
         found = read_stored(Path(config.imu.constants).expanduser())
     except BadUsage as error:
         raise BadUsage(f'imu.constants: {error}') from None
-    here = flat(config)
+    settings = flat(config)
     other = ['vehicle'] * (found.vehicle != config.vehicle) + [
-        name for name in SAME_IMU if found.config.get(name) != plain(here[name])]
+        name for name in SAME_IMU if found.config.get(name) != plain(settings[name])]
     if other:
         raise BadUsage(f'imu.constants: {found.name} has another {" and ".join(other)}: the same '
                        'IMU with unchanged mounting is required')
@@ -200,9 +200,9 @@ def objection(old: Stored, new: Stored) -> str:
             or old.carried and new.carried and new.carried.includes(old.carried):
         return ''
     for name in ('scale_factor', *wheel_factors(old.estimates), 'yaw_mounting_angle'):
-        why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))
-        if why:
-            return why
+        reason = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))
+        if reason:
+            return reason
     return ''
 
 

@@ -222,14 +222,14 @@ def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
 
     rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
     """
-    have = [(check, n) for check, n in checks if check is not None and n]
-    if not have:
+    known_checks = [(check, n) for check, n in checks if check is not None and n]
+    if not known_checks:
         return None
-    total = sum(n for _, n in have)
+    total = sum(n for _, n in known_checks)
     return TrackCheck(
-        rms=math.sqrt(sum(n * check.rms**2 for check, n in have) / total),
-        mean=sum(n * check.mean for check, n in have) / total,
-        **{name: max(getattr(check, name) for check, _ in have)
+        rms=math.sqrt(sum(n * check.rms**2 for check, n in known_checks) / total),
+        mean=sum(n * check.mean for check, n in known_checks) / total,
+        **{name: max(getattr(check, name) for check, _ in known_checks)
            for name in ('max', 'end', 'percent_of_distance')})
 
 
