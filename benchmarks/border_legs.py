@@ -42,9 +42,9 @@ def driven(vehicle, legs, grade, fixes):
 
     from odocal_ros.estimator import smooth
     from odocal_ros.settings.nominal import GRADES
-    from odocal_ros.sim.noise import stream
+    from odocal_ros.sim.noise import make_rng
     seed = FIRST_SEED + 100 * vehicle
-    rng, of_grade = stream(seed, 'what the vehicle is'), GRADES[grade]
+    rng, of_grade = make_rng(seed, 'what the vehicle is'), GRADES[grade]
     own = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
            'gyro_scale_error': float(of_grade.gyro_scale_error / 3 * rng.standard_normal()),
            'scale': float(0.0213 * np.exp(0.01 * rng.standard_normal())),

@@ -58,9 +58,9 @@ FIGURES = (('scale', 'ppm', 1e6), ('ratio', 'ppm', 1e6), ('width', 'ppm', 1e6),
 def options_of(seed):
     """Return the SimOptions of a drive."""
     from odocal_ros.sim.draw import draw_vehicle
-    from odocal_ros.sim.noise import stream
+    from odocal_ros.sim.noise import make_rng
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_KIND)
-    rng = stream(seed, 'robot')
+    rng = make_rng(seed, 'robot')
     own = {'duration': round(float(rng.uniform(30, 180)), 1),
            'track_width': float(rng.uniform(0.15, 0.6)),
            'wheel_difference': float(rng.normal(0, 0.01)),

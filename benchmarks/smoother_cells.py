@@ -68,9 +68,9 @@ GOAL_STRESS = 87.0
 def simulated(seed, **options):
     """Return a drive with a heading drawn, and what an operator sets."""
     from odocal_ros.settings.config import with_settings
-    from odocal_ros.sim.noise import stream
+    from odocal_ros.sim.noise import make_rng
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    rng = stream(seed, 'what differs from drive to drive')
+    rng = make_rng(seed, 'what differs from drive to drive')
     heading, side, when = rng.uniform(-np.pi, np.pi, 2).tolist() + [float(rng.uniform(30, 500))]
     if isinstance(options.get('outages'), float):
         options['outages'] = ((when, when + options['outages']),)

@@ -73,7 +73,7 @@ class Cell:
         from odocal_ros.data.samples import OdometerSamples
         from odocal_ros.nav.geodesy import radii
         from odocal_ros.sim import sensors
-        from odocal_ros.sim.noise import stream
+        from odocal_ros.sim.noise import make_rng
         options = dataclasses.replace(self.options, seed=seed)
         gyro, accel = sensors.imu_errors(options, len(self.imu.stamp_ns))
         imu = dataclasses.replace(self.imu, w_i=self.imu.w_i + gyro, f_i=self.imu.f_i + accel)
@@ -85,7 +85,7 @@ class Cell:
             longitude=self.fix.longitude
             + error[:, 0] / ((normal + height) * np.cos(self.fix.latitude)),
             height=height + error[:, 2], covariance_n=self.covariance)
-        phase = stream(seed, 'pulse phase L').uniform()
+        phase = make_rng(seed, 'pulse phase L').uniform()
         counts = sensors.FIRST_COUNT + np.floor(self.pulses + phase).astype(np.int64)
         recorder = LegRecorder()
         for slot, block in (('imu', imu), ('fix', fix), ('odometer', OdometerSamples(
@@ -96,14 +96,14 @@ class Cell:
     def config(self, seed: int):
         """Return the settings of such a drive, and the error of the heading, rad."""
         from odocal_ros.settings.config import Config, with_settings
-        from odocal_ros.sim.noise import stream
+        from odocal_ros.sim.noise import make_rng
         settings = {'imu.grade': self.options.imu_grade,
                     'odometer.nominal_scale': self.options.nominal_scale}
         if self.options.imu_grade == 'navigation':
             return with_settings(Config(), settings | {
                 'method': 'two_point',
                 'alignment.heading_source': 'gyrocompass'}), None
-        error = HEADING_SIGMA * stream(seed, 'known heading').standard_normal()
+        error = HEADING_SIGMA * make_rng(seed, 'known heading').standard_normal()
         return with_settings(Config(), settings | {
                 'method': 'two_point',
             'alignment.heading_source': 'fixed',

@@ -55,14 +55,14 @@ def drive(seed: int) -> dict:
     from odocal_ros.pipeline.calibrate import calibrate
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.nominal import GRADES
-    from odocal_ros.sim.noise import stream
+    from odocal_ros.sim.noise import make_rng
     from odocal_ros.sim.options import DEFAULTS
     from odocal_ros.sim.scenarios import SimOptions, simulate
     options = {'scenario': 'town', 'two_wheels': True} | CHEAP | list(CELLS.values())[
         (seed - FIRST_SEED) // SEEDS_A_CELL]
     given = options.pop('given', False)
     grade = GRADES[options.get('imu_grade', DEFAULTS[options['scenario']]['imu_grade'])]
-    draw = stream(seed, 'what the settings believe').standard_normal(7)
+    draw = make_rng(seed, 'what the settings believe').standard_normal(7)
     made = simulate(SimOptions(
         seed=seed, fix_delay=float(LATENCY * draw[0]), odometer_delay=float(
             LATE_ODOMETER * draw[1]), antenna_lever_arm=tuple(map(float, ARM * draw[2:5])),

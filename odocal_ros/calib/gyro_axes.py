@@ -40,6 +40,7 @@ LONGEST_GAP = 1.0      # s, judgement: of the IMU, turns within a longer one are
 # rad^2, judgement: a chord with a U-turn in it, and the next, are off by 0.35 rad each (0.1 to 0.2
 # for a mower whose rows are 1.6 m apart)
 U_TURN = 0.25
+NO_ROTATION = 'imu.mounting_rpy cannot correct this: it rotates gyro and accelerometer together.'
 
 
 def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
@@ -59,42 +60,44 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
                   for axis in nearest]
 
 
-def turning(inputs: Inputs, located: LocatedFixes, faces: ImuOrientation | None,
+def turning(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
             gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.least_motion)
     found = gyro_reasons(ratio, gyro_scale)
     if not any(one.code is Code.GYRO_SIGN for one in found):
-        return ratio, gyro_axes(inputs, located, faces) or found
+        return ratio, gyro_axes(inputs, located, orientation) or found
     text = found[0].text
-    if faces and abs(faces.inward) > max(-INVERTED, FAR_SIGMAS * faces.inward_sigma):
+    if orientation and abs(orientation.inward) > max(
+            -INVERTED, FAR_SIGMAS * orientation.inward_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
-                 if faces.inward < 0 else ', but match the accelerations in turns: latitude and '
-                 'longitude (x and y) are swapped, or linear_acceleration is negated')
+                 if orientation.inward < 0 else ', but match the accelerations in turns: latitude '
+                 'and longitude (x and y) are swapped, or linear_acceleration is negated')
     return ratio, (Reason(Code.GYRO_SIGN, text, '' if inputs.has_accelerometer else
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
 
 def gyro_axes(inputs: Inputs, located: LocatedFixes,
-              faces: ImuOrientation | None) -> tuple[Reason, ...]:
+              orientation: ImuOrientation | None) -> tuple[Reason, ...]:
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    located : the fixes in metres and approximate scale.   faces : fit of the accelerations. A flat
-    road does not show roll and pitch, a straight one no yaw.
+    located : the fixes in metres and approximate scale.   orientation : fit of the accelerations.
+    A flat road does not show roll and pitch, a straight one no yaw.
     """
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
     axes, names = sensor_axes(up / np.linalg.norm(up))
     found = by_course(inputs, located, w_i, axes, names)
     if not found and inputs.has_accelerometer:
-        inverted = faces and faces.inward < min(INVERTED, -FAR_SIGMAS * faces.inward_sigma)
+        inverted = orientation and orientation.inward < min(
+            INVERTED, -FAR_SIGMAS * orientation.inward_sigma)
         if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         found = by_gravity(inputs, located, w_i, f_i, axes, names)
-        if faces and inverted:
-            return _inverted_turns(faces, found, names)
+        if orientation and inverted:
+            return _inverted_turns(orientation, found, names)
     if not found:
         return ()
     do = ', '.join(f'negate angular_velocity.{sent}' if sent == true[-1] else
@@ -103,22 +106,21 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     if len(found) == 1 and found[0][0] != found[0][1][-1]:
         do += ', and check the other axes'
     return (Reason(Code.GYRO_AXES, '; '.join(text for *_, text in found),
-                   f'Correct the IMU driver: {do}. imu.mounting_rpy cannot correct this: it '
-                   'rotates gyro and accelerometer together.'),)
+                   f'Correct the IMU driver: {do}. {NO_ROTATION}'),)
 
 
-def _inverted_turns(faces: ImuOrientation, found: Found, names: list[str]) -> tuple[Reason, ...]:
+def _inverted_turns(orientation: ImuOrientation, found: Found,
+                    names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
-    seen = (f'accelerations in turns are opposite to turn rate and speed (ratio {faces.inward:.2f}'
-            f' ± {faces.inward_sigma:.2f} instead of 1)')
+    seen = ('accelerations in turns are opposite to turn rate and speed (ratio '
+            f'{orientation.inward:.2f} ± {orientation.inward_sigma:.2f} instead of 1)')
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
         return (Reason(Code.IMU_AXES, f'{seen}, and the turn of gravity about {found[0][0]} is '
                        f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
-                       'imu.mounting_rpy cannot correct this: it rotates gyro and accelerometer '
-                       'together.'),)
+                       + NO_ROTATION),)
     return (Reason(Code.GYRO_SIGN, f'{seen}: the sign of angular_velocity.{names[2][-1]}, or of '
                    f'linear_acceleration.{level[0]} or {level[1]}, is wrong',
                    'Correct the sign in the IMU driver. imu.mounting_rpy cannot: it rotates gyro '

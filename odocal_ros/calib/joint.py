@@ -4,9 +4,9 @@
 """
 Joint estimate of a vehicle's constants from several legs, equal to one fit of all their rows.
 
-Each leg is given by its border. The constants are the same in every leg, except ln K, a random
-walk from leg to leg; priors count once: docs/method.md (S35). New tyres or a load change the scale
-beyond the random walk.
+Each leg is given by its marginal information. The constants are the same in every leg, except
+ln K, a random walk from leg to leg; priors count once: docs/method.md (S35). New tyres or a load
+change the scale beyond the random walk.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,14 +47,14 @@ class JointEstimate:
     bent: Floats = field(default_factory=lambda: np.zeros(0))  # rad, linearisation errors
 
 
-def fit_jointly(borders: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
+def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
                 drifting: str = 'scale_factor', angles: Sequence[str] = (),
                 curved: Sequence[str] = (), usual: Mapping[str, float] | None = None,
                 same: Sequence[bool] = ()) -> JointEstimate:
     """
     Combine legs of one vehicle; all sigmas are widened if legs differ beyond them and the scatter.
 
-    borders : by time, at least one.   steps : (J - 1,) sigma of the change of ``drifting`` from
+    marginals : by time, at least one.   steps : (J - 1,) sigma of the change of ``drifting`` from
     leg to leg.   drifting : the constant with a random walk.   angles : constants with a period
     of one turn.   curved : constants in which a leg's equations are not linear: 1 - cos of their
     change becomes an error of that leg alone.   usual : usual scatter sigma of constants between
@@ -62,19 +62,19 @@ def fit_jointly(borders: Sequence[MarginalInformation], steps: Sequence[float] |
     of the same leg, without scatter.
     """
     usual = usual or {}
-    legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
+    legs = LinkedLegs(list(marginals), drifting, np.asarray(steps, float), angles)
     bent = _add_linearisation_errors(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
     drives = legs.combine_sections(same)
     scatter = _scatter(drives, usual)
     # a single leg has no scatter
-    alone = len(drives.borders) == 1 and not borders[0].evidence
+    alone = len(drives.marginals) == 1 and not marginals[0].evidence
     between = {} if alone else scatter.sigmas
     left, rest = (in_scatter + of_legs - of_drives for in_scatter, of_legs, of_drives in zip(
         drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
     factor = float(np.sqrt(left / rest)) if rest and normal_deviate(left,
                                                                     rest) > NORMAL_95 else 1.0
-    where = drives.place(len(drives.borders) - 1)
+    where = drives.place(len(drives.marginals) - 1)
     x, C = drives.solve() if alone else _average_over_scatter(drives, scatter, usual)
     carried = drives.carried(x[where], scatter.sigmas, scatter.evidence).widened(factor)
     return JointEstimate(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma,
@@ -142,7 +142,7 @@ def _find_disputed(legs: LinkedLegs, between: dict[str, float],
         left, rest = legs.disagreement({**between, name: np.inf})
         # below, the legs do not determine the constant
         return normal_deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
-    if len(legs.borders) < 2:
+    if len(legs.marginals) < 2:
         return ()
     as_they_are = legs.disagreement(between)
     odds = {name: deviates(name) for name in legs.names}
@@ -153,27 +153,27 @@ def _find_disputed(legs: LinkedLegs, between: dict[str, float],
 
 def _add_linearisation_errors(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
     """Add a linearisation error to each leg, by the distance from its point; return it, (J,)."""
-    first, at = legs.borders, [legs.names.index(n) for n in curved]
+    first, at = legs.marginals, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
     for _ in range(3 if curved else 0):     # with reduced weights the estimate changes
         x, _ = legs.solve()
         moved = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
         bent = (moved**2).sum(axis=1) / 2
-        legs.take([b.loosened(dict.fromkeys(curved, size))
+        legs.replace_marginals([b.loosened(dict.fromkeys(curved, size))
                    for b, size in zip(first, bent, strict=True)])
     return bent
 
 
 @dataclass(frozen=True)
 class ScaleStep:
-    """A change of ln K from border ``leg`` - 1 to border ``leg``, and its size in sigmas."""
+    """A change of ln K from leg number ``leg`` - 1 to ``leg``, from 0, and its size in sigmas."""
 
     leg: int
     change: float
     sigmas: float
 
 
-def scale_steps(borders: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
+def scale_steps(marginals: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
                 drifting: str, angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
     Return changes of the scale from its prediction by the earlier legs, beyond REMARK_SIGMAS.
@@ -181,13 +181,13 @@ def scale_steps(borders: Sequence[MarginalInformation], steps: Sequence[float] |
     Arguments as for ``fit_jointly``. After a change, only later legs predict the scale.
     """
     steps, found = np.array(steps, float), []
-    for j in range(1, len(borders)):
-        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+    for j in range(1, len(marginals)):
+        legs = LinkedLegs(marginals[:j + 1], drifting, steps[:j], angles)
         sigmas = float(legs.deviations()[j, legs.drifting])
         if abs(sigmas) <= REMARK_SIGMAS:
             continue
         steps[j - 1] = FREE_STEP
-        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+        legs = LinkedLegs(marginals[:j + 1], drifting, steps[:j], angles)
         x, _ = legs.solve()
         before, now = (x[legs.place(k)[legs.drifting]] for k in (j - 1, j))
         found.append(ScaleStep(j, float(now - before), sigmas))

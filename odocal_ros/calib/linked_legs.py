@@ -77,20 +77,20 @@ class LinkedEquations:
 
 
 class LinkedLegs:
-    """Borders with common names, the priors of the constants, and the random walk of one."""
+    """Marginals of legs with common names, priors of the constants, random walk of one."""
 
-    def __init__(self, borders: Sequence[MarginalInformation], drifting: str,
+    def __init__(self, marginals: Sequence[MarginalInformation], drifting: str,
                  steps: Sequence[float] | Floats, angles: Sequence[str] = ()) -> None:
         """Take legs by time; ``steps`` (J - 1,): sigmas of the change of ``drifting``."""
-        self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
-        self.take([_on(b, self.names) for b in borders])
-        last = self.borders[-1]
+        self.names = tuple(dict.fromkeys(n for b in marginals for n in b.names))
+        self.replace_marginals([_on(b, self.names) for b in marginals])
+        last = self.marginals[-1]
         for name in angles:
             about = last.value[self.names.index(name)]
-            self.take([b.turned(name, about) for b in self.borders])
+            self.replace_marginals([b.turned(name, about) for b in self.marginals])
         self.centre = last.centre
         self.sigma, self.used = (
-            np.max([getattr(b, which) for b in self.borders], axis=0)
+            np.max([getattr(b, which) for b in self.marginals], axis=0)
             for which in ('sigma', 'used'))
         self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
@@ -102,20 +102,21 @@ class LinkedLegs:
         is_new_leg = [not together for together in same] or [True] * len(self.steps)
         if all(is_new_leg):
             return self
-        borders = self.borders[:1]
-        for border, own in zip(self.borders[1:], is_new_leg, strict=True):
-            borders = [*borders, border] if own else [*borders[:-1], borders[-1].plus(border)]
-        return LinkedLegs(borders, self.names[self.drifting], self.steps[is_new_leg])
+        marginals = self.marginals[:1]
+        for marginal, own in zip(self.marginals[1:], is_new_leg, strict=True):
+            marginals = [*marginals, marginal] if own else [
+                *marginals[:-1], marginals[-1].plus(marginal)]
+        return LinkedLegs(marginals, self.names[self.drifting], self.steps[is_new_leg])
 
-    def take(self, borders: list[MarginalInformation]) -> None:
-        """Replace the borders; each must have the names of all."""
-        self.borders = borders
+    def replace_marginals(self, marginals: list[MarginalInformation]) -> None:
+        """Set the marginals of the legs; each must have the names of all."""
+        self.marginals = marginals
         self._clean: dict[float, LegInformation] = {}
 
     def information(self, least: float = 0.0) -> 'LegInformation':
         """Return the information of the legs in directions with more than ``least`` priors."""
         if least not in self._clean:      # requested for each constant
-            self._clean[least] = information(self.borders, self.unit, least)
+            self._clean[least] = information(self.marginals, self.unit, least)
         return self._clean[least]
 
     def place(self, j: int) -> Ints:
@@ -139,7 +140,7 @@ class LinkedLegs:
         if prior:
             at = self.place(steps)
             weight[at] = np.isfinite(self.used)
-            off[at] = (self.centre - self.borders[-1].value) / self.unit
+            off[at] = (self.centre - self.marginals[-1].value) / self.unit
         at_zero = float(weight @ off**2)
         return LinkedEquations(H + np.diag(weight), g + weight * off, cost + at_zero,
                                (weight, weight * off, at_zero), others, rank + steps)
@@ -152,7 +153,7 @@ class LinkedLegs:
         J, k, rest = len(legs.D), self.drifting, np.delete(np.arange(len(self.names)),
                                                            self.drifting)
         taken, DA, pull, rank = self._scattering(legs, spread)
-        off = np.stack([b.value - self.borders[-1].value for b in self.borders]) / self.unit
+        off = np.stack([b.value - self.marginals[-1].value for b in self.marginals]) / self.unit
         g_legs = pull + (legs.D @ off[:, :, None]
                          - taken @ (np.swapaxes(DA, 1, 2) @ off[:, :, None]))[:, :, 0]
         cost = float((off * (g_legs + pull)).sum() + (legs.nearest * pull).sum())
@@ -167,8 +168,8 @@ class LinkedLegs:
         """Return the unknowns and their covariance, of leg j at ``place``."""
         x, C = self.equations(self.information(), spread).solved()
         scale, last = np.empty((2, len(x)))
-        for j in range(len(self.borders)):
-            scale[self.place(j)], last[self.place(j)] = self.unit, self.borders[-1].value
+        for j in range(len(self.marginals)):
+            scale[self.place(j)], last[self.place(j)] = self.unit, self.marginals[-1].value
         return last + x * scale, C * np.multiply.outer(scale, scale)
 
     def log_likelihood(self, spread: dict[str, float]) -> float:
@@ -177,7 +178,7 @@ class LinkedLegs:
         size = size / self.unit[at]
         equations = self.equations(self.information(), spread)
         out = -(equations.least_cost() + equations.log_determinant) / 2
-        own = self.information().D[:, at][:, :, at][[not b.evidence for b in self.borders]]
+        own = self.information().D[:, at][:, :, at][[not b.evidence for b in self.marginals]]
         return float(out - np.linalg.slogdet(
             np.eye(len(at)) + own * np.multiply.outer(size, size))[1].sum() / 2)
 
@@ -185,15 +186,15 @@ class LinkedLegs:
                 evidence: dict[str, Floats]) -> MarginalInformation:
         """Return the information of all legs at ``value``; evidence : of the scatter, by name."""
         equations = self.equations(self.information(), spread, prior=False)
-        D, pull = equations.eliminate_others(self.place(len(self.borders) - 1))
+        D, pull = equations.eliminate_others(self.place(len(self.marginals) - 1))
         D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
         return MarginalInformation(self.names, value, D, pull
-                                   - D @ (value - self.borders[-1].value),
+                                   - D @ (value - self.marginals[-1].value),
                                    self.centre, self.sigma, self.used, evidence)
 
     def evidence(self, name: str, points: int) -> Floats:
         """Return the log likelihood of a constant's scatter by combined legs: (points,)."""
-        return sum((b.evidence[name] for b in self.borders if name in b.evidence),
+        return sum((b.evidence[name] for b in self.marginals if name in b.evidence),
                    np.zeros(points))
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
@@ -215,11 +216,11 @@ class LinkedLegs:
         of one additional unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
         """
         x, C = self.solve()
-        out = np.zeros((len(self.borders), len(self.names)))
+        out = np.zeros((len(self.marginals), len(self.names)))
         legs = self.information(1.0)
         for j, (D, pull) in enumerate(zip(legs.D, legs.pull, strict=True)):
             where = self.place(j)
-            pull = pull - D @ ((x[where] - self.borders[j].value) / self.unit)
+            pull = pull - D @ ((x[where] - self.marginals[j].value) / self.unit)
             own = C[np.ix_(where, where)] / np.multiply.outer(self.unit, self.unit)
             variance = np.diag(D - D @ own @ D)
             # no test if the others have less than a millionth of the leg's information
@@ -234,7 +235,7 @@ class LinkedLegs:
         at = [self.names.index(n) for n in spread or ()]
         sigmas = np.array(list((spread or {}).values())) / self.unit[at]
         taken, DA, A = eliminate_own_errors(legs.D, at, sigmas)
-        taken[[bool(b.evidence) for b in self.borders]] = 0.0
+        taken[[bool(b.evidence) for b in self.marginals]] = 0.0
         free = (np.isinf(sigmas) & taken.any(axis=1)).sum()
         pull = legs.pull - (taken @ (np.swapaxes(A, 1, 2) @ legs.pull[:, :, None]))[:, :, 0]
         return taken, DA, pull, int(legs.rank.sum() - free)
@@ -250,36 +251,35 @@ class LegInformation:
     rank: Ints       # (J,) of D
 
 
-def information(borders: Sequence[MarginalInformation], unit: Floats,
+def information(marginals: Sequence[MarginalInformation], unit: Floats,
                 least: float) -> LegInformation:
-    """Return the information of borders in directions of more than ``least``: (m,) unit."""
-    J, m = len(borders), len(unit)
+    """Return the information of legs in directions of more than ``least``: (m,) unit."""
+    J, m = len(marginals), len(unit)
     out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
-    for j, border in enumerate(borders):
-        size, V = np.linalg.eigh(border.information * np.multiply.outer(unit, unit))
+    for j, marginal in enumerate(marginals):
+        size, V = np.linalg.eigh(marginal.information * np.multiply.outer(unit, unit))
         # of doubles, times the loss by elimination
         keep = size > max(LEG_ROUNDING * size[-1], least, 1e-300)
         size, V = size[keep], V[:, keep]
-        along = V.T @ (border.pull * unit)
+        along = V.T @ (marginal.pull * unit)
         out.D[j], out.pull[j], out.nearest[j] = V * size @ V.T, V @ along, V @ (along / size)
         out.rank[j] = len(size)
     return out
 
 
-def _on(border: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
-    """Return a border with more names, without information or prior on the new ones."""
-    if border.names == names:
-        return border
-    at = [names.index(n) for n in border.names]
+def _on(marginal: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
+    """Return a marginal with more names, without information or prior on the new ones."""
+    if marginal.names == names:
+        return marginal
+    at = [names.index(n) for n in marginal.names]
     m = len(names)
     D = np.zeros((m, m))
-    D[np.ix_(at, at)] = border.information
+    D[np.ix_(at, at)] = marginal.information
 
-    def on(values: Floats, rest: float) -> Floats:
-        out = np.full(m, rest)
+    def on(values: Floats) -> Floats:
+        out = np.zeros(m)       # sigma 0: has no effect in the maximum over legs
         out[at] = values
         return out
-    # sigma 0: has no effect in the maximum over legs
-    return MarginalInformation(names, on(border.value, 0.0), D, on(border.pull, 0.0),
-                               on(border.centre, 0.0),
-                               on(border.sigma, 0.0), on(border.used, 0.0), border.evidence)
+    return MarginalInformation(
+        names, on(marginal.value), D, on(marginal.pull), on(marginal.centre), on(marginal.sigma),
+        on(marginal.used), marginal.evidence)

@@ -43,7 +43,7 @@ class MarginalInformation:
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
 
     def plus(self, other: 'MarginalInformation') -> 'MarginalInformation':
-        """Return the sum with a border of the same constants, at this one's ``value``."""
+        """Return the sum with that of a leg of the same constants, at this one's ``value``."""
         pull = other.pull - other.information @ (self.value - other.value)
         return replace(self, information=self.information + other.information,
                        pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
@@ -51,7 +51,9 @@ class MarginalInformation:
 
     def loosened(self, sigmas: dict[str, float]) -> 'MarginalInformation':
         """
-        Return the border of a leg whose constants differ from the vehicle's by errors of its own.
+        Return the information of a leg whose constants have errors of its own.
+
+        The constants of the vehicle are without them.
 
         sigmas : by name, of each constant's own error d; inf: no information on it remains.
         The data depend on x + d; d is eliminated, docs/method.md (S34).
@@ -63,7 +65,7 @@ class MarginalInformation:
                        pull=self.pull - taken @ (A.T @ self.pull))
 
     def with_errors(self, effects: Floats) -> 'MarginalInformation':
-        """Return the border of the same x, a covariance larger by E E', effects (m, L), (S33a)."""
+        """Return the information on x, a covariance larger by E E', effects (m, L), (S33a)."""
         weight = 1 / self.used**2
         G = (self.information + np.diag(weight)) @ effects
         taken = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
@@ -85,7 +87,7 @@ class MarginalInformation:
             self.used[at], evidence)
 
     def turned(self, name: str, about: float) -> 'MarginalInformation':
-        """Return the border with an angle, rad, wrapped to within half a turn of ``about``."""
+        """Return it with an angle, rad, wrapped to within half a turn of ``about``."""
         value, i = self.value.copy(), self.names.index(name)
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)

@@ -40,15 +40,14 @@ class MarkFix:
     covariance_n: Floats       # (3, 3) m^2
     standing: bool             # averaged at rest
     used: int                  # fixes
-    dropped: int
     height_known: bool = True  # False if any fix has no height
     surveyed: bool = False     # from settings
 
 
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
-             correlation_time: float = np.nan) -> tuple[Floats, Floats, int, int]:
+             correlation_time: float = np.nan) -> tuple[Floats, Floats, int]:
     """
-    Return mean, (3,) m, covariance, (3, 3) m^2, used and dropped fixes of one place: (T6), (T7).
+    Return mean, (3,) m, covariance, (3, 3) m^2, and used fixes of one place: (T6), (T7).
 
     t : (n,) times, s.   position_n : (n, 3) fixes, m, motion removed.   covariance_n : (n, 3, 3)
     stated, m^2.   correlation_time : of the errors, s; 0: white; NaN: estimated from the data.
@@ -60,7 +59,7 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     mean = weight @ position_n
     whole = np.einsum('n,nij->ij', weight, covariance_n)
     share = _variance_share(t, position_n - mean, whole, weight, correlation_time)
-    return mean, whole * share, int(keep.sum()), int((~keep).sum())
+    return mean, whole * share, int(keep.sum())
 
 
 def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
@@ -151,8 +150,8 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
     p = position_n[pick] - displacement_n(t[pick])
     height_known = bool(np.isfinite(p[:, 2]).all())
     p = np.where(np.isfinite(p), p, 0.0)
-    mean, covariance, used, dropped = mean_fix(t[pick], p, covariance_n[pick], correlation_time)
-    return MarkFix(t_mark, mean, covariance, span is not None, used, dropped, height_known)
+    mean, covariance, used = mean_fix(t[pick], p, covariance_n[pick], correlation_time)
+    return MarkFix(t_mark, mean, covariance, span is not None, used, height_known)
 
 
 def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:

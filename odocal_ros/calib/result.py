@@ -34,6 +34,11 @@ class Estimate:
     unit: str
     method: str = ''
 
+    @property
+    def relative_sigma(self) -> float | None:
+        """Return the sigma over the size of the value, None without them."""
+        return self.sigma / abs(self.value) if self.value and self.sigma is not None else None
+
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of calibration.json."""
         entry = {'value': self.value, 'sigma': self.sigma, 'unit': self.unit}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several legs of the smoother to one result, on the border of their equations."""
+"""Several legs of the smoother to one result, by their marginal information."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,9 +45,9 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     """
     Return the result of one fit of all legs of one vehicle, the scale as in the last leg.
 
-    results : those with a border, at least one.   times_ns : when each leg was driven.   config :
-    limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, 1, 2, ... by
-    default; 0: legs of an earlier result.   local : positions in a local frame.
+    results : those with ``marginal``, at least one.   times_ns : when each leg was driven.
+    config : limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, by
+    default 1, 2, ...; 0: legs of an earlier result.   local : positions in a local frame.
 
     A value that no leg determines alone may be determined by all. If the legs disagree, the sigma
     includes their scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently
@@ -57,12 +57,12 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
     days = np.diff(np.asarray(times_ns)[order]) / DAY_NS
-    borders = _share_sizes([leg.marginal for leg in legs])
+    marginals = _share_sizes([leg.marginal for leg in legs])
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
-    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
+    changes = scale_steps(marginals, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = fit_jointly(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
+    found = fit_jointly(marginals, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
                         CONSTANTS[:PARAMETER_COUNT],
                         dict(zip(CONSTANTS[:PARAMETER_COUNT], SCATTER, strict=True)),
                         (days == 0).tolist())
@@ -102,23 +102,23 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
                         found.carried)
 
 
-def _share_sizes(borders: Sequence[MarginalInformation]) -> list[MarginalInformation]:
-    """Return borders with the same sizes of imperfections: geometric means by information."""
+def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInformation]:
+    """Return marginals with the same sizes of imperfections: geometric means by information."""
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
-    for border in borders:
-        prior = 1 / border.used**2
-        data = 1 / np.diag(np.linalg.inv(border.information + np.diag(prior))) - prior
-        known = data / (data + 1 / (SIZE * border.sigma**2))        # docs/method.md (S29)
-        for name, used, weight in zip(border.names, border.used, known, strict=True):
+    for marginal in marginals:
+        prior = 1 / marginal.used**2
+        data = 1 / np.diag(np.linalg.inv(marginal.information + np.diag(prior))) - prior
+        known = data / (data + 1 / (SIZE * marginal.sigma**2))        # docs/method.md (S29)
+        for name, used, weight in zip(marginal.names, marginal.used, known, strict=True):
             if name in imperfect:
                 logs.setdefault(name, []).append((np.log(used), max(weight, 1e-9)))
     sizes = {}
     for name, pairs in logs.items():
         log, weight = np.transpose(pairs)
         sizes[name] = float(np.exp(np.average(log, weights=weight)))
-    return [replace(border, used=np.array([sizes.get(name, used) for name, used in zip(
-        border.names, border.used, strict=True)])) for border in borders]
+    return [replace(marginal, used=np.array([sizes.get(name, used) for name, used in zip(
+        marginal.names, marginal.used, strict=True)])) for marginal in marginals]
 
 
 def _scale_change_reason(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:

@@ -24,7 +24,6 @@ from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.forecast import planned_methods
 from odocal_ros.forecast.planned_drive import drive_from_rates
 from odocal_ros.forecast.predict import Sigmas
-from odocal_ros.forecast.smoother_forecast import relative_sigma
 from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.planar_run import known_values
@@ -292,7 +291,7 @@ def ratio_sigma(method: MethodResult) -> float | None:
         return float(method.details['ratio_sigma'])
     left, right = (method.estimates.get(f'scale_factor_{side}') for side in settings.SIDES)
     rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
-    a, b = (relative_sigma(one) if one else None for one in (left, right))
+    a, b = (one.relative_sigma if one else None for one in (left, right))
     if a is None or b is None or rho is None:
         return None
     return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))

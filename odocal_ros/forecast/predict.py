@@ -182,17 +182,17 @@ def _expected_mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
     forward = np.array([1.0, 0.0, 0.0])
     position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ forward
     if surveyed:
-        return MarkFix(t, position_n, np.eye(3) * surveyed[3]**2, span is not None, 0, 0,
+        return MarkFix(t, position_n, np.eye(3) * surveyed[3]**2, span is not None, 0,
                        surveyed=True)
     window = max(MARK_WINDOW, 2.5 / sigmas.fix_rate)
     low, high = span or (t - window, t + window)
     low, high = max(low, drive.t[0]), min(high, drive.duration)
     n = max(1, int((high - low) * sigmas.fix_rate))
     times = low + np.arange(n) / sigmas.fix_rate
-    _, covariance, used, _ = mean_fix(times, np.zeros((n, 3)),
-                                      np.tile(sigmas.covariance_n, (n, 1, 1)),
-                                      sigmas.correlation_time)
-    return MarkFix(t, position_n, covariance, span is not None, used, 0)
+    _, covariance, used = mean_fix(times, np.zeros((n, 3)),
+                                   np.tile(sigmas.covariance_n, (n, 1, 1)),
+                                   sigmas.correlation_time)
+    return MarkFix(t, position_n, covariance, span is not None, used)
 
 
 def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:

@@ -227,7 +227,7 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
         if quantity.of_two_wheels and not two_wheels and not any(
                 e is not None and e.value is not None for e in found):
             continue
-        known[name] = max(_relative_sigma(e, quantity.relative) for e in found)
+        known[name] = max(_sigma_or_infinity(e, quantity.relative) for e in found)
         if not valid or names_with_reason & set(quantity.estimates):
             bad.add(name)
     return _check_sigmas(known, config) | dict.fromkeys(bad, NO)
@@ -259,10 +259,9 @@ def _check_sigmas(sigmas: dict[str, float | None], config: Config) -> dict[str, 
     return ok
 
 
-def _relative_sigma(estimate: Estimate | None, relative: bool) -> float:
+def _sigma_or_infinity(estimate: Estimate | None, relative: bool) -> float:
     """Return the sigma of an estimate, relative to its value or not; infinite without one."""
-    if estimate is None or estimate.value is None or estimate.sigma is None:
+    if estimate is None or estimate.value is None:
         return math.inf
-    if relative:
-        return estimate.sigma / abs(estimate.value) if estimate.value else math.inf
-    return estimate.sigma
+    sigma = estimate.relative_sigma if relative else estimate.sigma
+    return math.inf if sigma is None else sigma

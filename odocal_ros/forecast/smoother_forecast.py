@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import choose, deciding_methods, PLANAR, REASON_ESTIMATES
-from odocal_ros.calib.result import Estimate, LegResult, MethodResult
+from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import RunningEstimate
@@ -97,14 +97,9 @@ def forecast_wheels(method: MethodResult) -> WheelsForecast | None:
     """Return the running estimate of two wheels, None for one counter."""
     if 'track_width' not in method.estimates:
         return None
-    left, right, width = (relative_sigma(method.estimates[name]) for name in (
+    left, right, width = (method.estimates[name].relative_sigma for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     return WheelsForecast(None if left is None or right is None else max(left, right), width)
-
-
-def relative_sigma(e: Estimate) -> float | None:
-    """Return the sigma divided by the value, None without them."""
-    return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
 def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast:
@@ -183,7 +178,7 @@ def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> 
 def _planar_scale(result: LegResult, limit: float) -> ParameterForecast:
     """Return the forecast of the scale, whose sigma falls with the root of the distance."""
     scale = result.methods[PLANAR].estimates['scale_factor']
-    sigma = relative_sigma(scale)
+    sigma = scale.relative_sigma
     if sigma is None or scale.value is None or scale.sigma is None:
         return ParameterForecast(None, limit, None, manoeuvre=DRIVE_ON)
     metres = result.distance * max((sigma / limit)**2 - 1, 0.0) if limit else math.inf

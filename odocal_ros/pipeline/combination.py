@@ -65,7 +65,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and name in leg.methods], config, before, has_local_positions(used))
         for name in method_names}
-    on_border = {name for leg in used for name, m in leg.methods.items() if m.marginal}
+    with_marginal = {name for leg in used for name, m in leg.methods.items() if m.marginal}
     estimates, estimating_methods = choose(methods, config.method)
     reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
                            before is not None)
@@ -76,7 +76,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
         own_reasons = [r for name in estimating_methods
                        for r in relevant_reasons(methods[name].reasons, name, estimates)
                        if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
-                       or name in on_border and r.code in COMBINED_CODES]
+                       or name in with_marginal and r.code in COMBINED_CODES]
         reasons += [r for r in (*own_reasons, *check_limits(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))

@@ -148,7 +148,7 @@ class PreparedLeg(LocatedFixes):
         if point:
             position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
             return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
-                           standing_at(t, self.spans) is not None, 0, 0, surveyed=True)
+                           standing_at(t, self.spans) is not None, 0, surveyed=True)
         inputs, here = self.inputs, path(np.array(t))
         rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
         return fix_at(t, standing_at(t, self.spans),
@@ -230,10 +230,10 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return fields, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    fields |= {name: track_statistics(track_residuals(path, pin, fixes), path_length)
-               for name, path in (('before', before), ('after', after))}
-    path_at = np.interp(fixes[0], *path_length_over_time(prepared))
     off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
+    fields |= {'before': track_statistics(off_before, path_length),
+               'after': track_statistics(off_after, path_length)}
+    path_at = np.interp(fixes[0], *path_length_over_time(prepared))
     fields['per_distance'] = errors_per_distance(path_at, off_before, off_after)
     kept, outlier_reasons = without_outliers(prepared, after, start, between)
     found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)),

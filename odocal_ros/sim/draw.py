@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.sim.draw_effects import EFFECTS, RARE
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import flat, GRADES, ROWS, SIZES, Vehicle
@@ -54,12 +54,12 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     options |= given
     if effects is None:
         odometer = ('', 'coarse_pulses', 'coarse_speed')[int(
-            stream(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers')))]
+            make_rng(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers')))]
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == odometer]
     real: dict[str, Any] = {}
     there = []
     for name in names:
-        changes, figures = (EFFECTS | RARE)[name](stream(seed, f'vehicle {name}'), vehicle)
+        changes, figures = (EFFECTS | RARE)[name](make_rng(seed, f'vehicle {name}'), vehicle)
         if changes or figures:      # a draw may have no effect
             there.append(name)
         options |= changes
@@ -68,7 +68,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
 
 
 def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:
-    rng, which = stream(seed, 'vehicle'), GRADES.index(grade)
+    rng, which = make_rng(seed, 'vehicle'), GRADES.index(grade)
     roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in ROWS['mounting'][which])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)
     quarter = int(rng.integers(1, 4)) if rng.uniform() < 0.2 else 0     # known

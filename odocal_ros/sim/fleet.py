@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from odocal_ros.settings.levels import DAY_NS
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
 WALK = 1e-4              # judgement: of the scale, relative, per square root of a day
@@ -62,12 +62,12 @@ class FleetVehicle:
 
 def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     """Return ``vehicles`` vehicles with ``bags`` drives each, one per week."""
-    order = stream(seed, 'fleet').permutation(vehicles).tolist()
+    order = make_rng(seed, 'fleet').permutation(vehicles).tolist()
     fates: dict[int, str] = {}
     for what, share in FATES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
             fates[order.pop()] = what
-    return [_vehicle(k, bags, fates.get(k), stream(seed, f'fleet vehicle {k}'))
+    return [_vehicle(k, bags, fates.get(k), make_rng(seed, f'fleet vehicle {k}'))
             for k in range(vehicles)]
 
 

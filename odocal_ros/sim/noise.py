@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sample times, random numbers with a stream for each sensor, noise and drift processes."""
+"""Sample times, random numbers with a generator for each sensor, noise and drift processes."""
 
 from typing import Any
 import zlib
@@ -16,7 +16,7 @@ REMAINDER = 0.2     # judgement: share of the accumulated drift that a loop clos
 TRANSPORT_DELAY = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
 
 
-def stream(seed: int, name: str) -> np.random.Generator:
+def make_rng(seed: int, name: str) -> np.random.Generator:
     """Return the named generator of a seed; settings of one sensor do not affect another's."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
@@ -43,8 +43,8 @@ def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) 
     drive[:1] = sigma * rng.standard_normal((1, 3))
     x: Floats = np.empty_like(drive)
     last = np.zeros(3)
-    for k, (d, push) in enumerate(zip(decay, drive, strict=True)):
-        x[k] = last = d * last + push
+    for k, (share, disturbance) in enumerate(zip(decay, drive, strict=True)):
+        x[k] = last = share * last + disturbance
     return x
 
 
@@ -59,19 +59,21 @@ def reference_drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
     """Return errors (n, 3) m, ENU, that change with travel (n,), m, and jump at loop closures."""
     if not options.reference_drift:
         return 0.0
-    rng, length = stream(options.seed, 'reference drift'), options.drift_length
+    rng, length = make_rng(options.seed, 'reference drift'), options.drift_length
     path = np.abs(np.diff(travel, prepend=travel[:1]))
-    left = np.exp(-path / length) if length else np.ones(len(t))
-    closes = stream(options.seed, 'loop closures').uniform(size=len(t)) < np.diff(
+    remaining = np.exp(-path / length) if length else np.ones(len(t))     # share of the last error
+    is_closed = make_rng(options.seed, 'loop closures').uniform(size=len(t)) < np.diff(
         t, prepend=t[:1]) / (options.closure_time or np.inf)
-    usual = stationary_sigma(options)
-    size = usual * np.sqrt(1 - left**2) if length else options.reference_drift * np.sqrt(path)
-    left = np.where(closes, REMAINDER, left)
-    out, steps = np.zeros((len(t), 3)), size[:, None] * rng.standard_normal((len(t), 2))
-    out[0, :2] = usual * rng.standard_normal(2)
+    sigma = stationary_sigma(options)
+    step_sigma = (sigma * np.sqrt(1 - remaining**2) if length
+                  else options.reference_drift * np.sqrt(path))
+    remaining = np.where(is_closed, REMAINDER, remaining)
+    errors = np.zeros((len(t), 3))
+    steps = step_sigma[:, None] * rng.standard_normal((len(t), 2))
+    errors[0, :2] = sigma * rng.standard_normal(2)
     for k in range(1, len(t)):
-        out[k, :2] = left[k] * out[k - 1, :2] + steps[k]
-    return out
+        errors[k, :2] = remaining[k] * errors[k - 1, :2] + steps[k]
+    return errors
 
 
 def stationary_sigma(options: Any) -> float:

@@ -12,7 +12,7 @@ from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
-from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT_DELAY
+from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPORT_DELAY
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 
@@ -84,11 +84,11 @@ def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float
         if any(step := getattr(real, f'{name}_step')):
             total = total + (t >= real.bias_step_at)[:, None] * np.array(step)
         if wander:
-            total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
+            total = total + _wander(make_rng(options.seed, f'real {name} wander'), wander,
                                     real.wander_time, t)
         if shake:
             level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
-            total = total + level * vibration(stream(options.seed, f'real {name} vibration'),
+            total = total + level * vibration(make_rng(options.seed, f'real {name} vibration'),
                                               shake, options.imu_rate, len(t))
             if name == 'accel' and real.rectification:
                 total = total + real.rectification * (shake * level)**2
@@ -177,14 +177,14 @@ def errors(t: Floats, options: SimOptions) -> Floats | float:
     real = options.real
     total: Floats | float = 0.0
     for k, (sigma, tau) in enumerate(real.slow_errors):
-        slow = gauss_markov(stream(options.seed, f'real slow {k}'), sigma, tau, t)
+        slow = gauss_markov(make_rng(options.seed, f'real slow {k}'), sigma, tau, t)
         total = total + slow * [1.0, 1.0, UP]
     return total + burst_errors(t, options) if real.bursts else total
 
 
 def burst_errors(t: Floats, options: SimOptions) -> Floats:
     """Return errors by multipath: bursts to any side, of smooth onset: (n, 3)."""
-    real, rng = options.real, stream(options.seed, 'real bursts')
+    real, rng = options.real, make_rng(options.seed, 'real bursts')
     total, hours = np.zeros((len(t), 3)), t[-1] / 3600
     for _ in range(rng.poisson(real.bursts * hours)):
         begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
@@ -232,7 +232,7 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     north, east, up = ((after - before) / (2 * HALF_STEP)).T
     true = np.stack([east * (normal + height) * np.cos(latitude), north * (meridian + height), up],
                     -1)
-    time, rng = options.velocity_correlation_time, stream(options.seed, 'velocity')
+    time, rng = options.velocity_correlation_time, make_rng(options.seed, 'velocity')
     error = (gauss_markov(rng, sigma, time, t) if time
              else sigma * rng.standard_normal((len(t), 3)))
     far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers

@@ -18,7 +18,7 @@ from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_rpy, yaw_from
 from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
-from odocal_ros.sim.noise import stamps, stream
+from odocal_ros.sim.noise import make_rng, stamps
 from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real_sensors import own_angles, velocity
@@ -117,7 +117,7 @@ class Drive:
 
 def motion_of(options: SimOptions) -> Motion:
     make = with_sideways_moves if options.drive in HOLONOMIC else ROUTES[options.scenario]
-    route = make(options.duration, stream(options.seed, 'route'))
+    route = make(options.duration, make_rng(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
     real = options.real
@@ -141,9 +141,10 @@ def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]
     real = options.real
     if not real.kerbs:
         return ()
-    ways = route.speed.integral()(np.arange(0.0, route.speed.end, 1.0))
-    gaps = stream(options.seed, 'kerbs').uniform(0.5, 1.5, int(np.ptp(ways) / real.kerb_distance))
-    begins = float(ways.min()) + np.cumsum(gaps * real.kerb_distance)
+    travel = route.speed.integral()(np.arange(0.0, route.speed.end, 1.0))
+    count = int(np.ptp(travel) / real.kerb_distance)
+    gaps = make_rng(options.seed, 'kerbs').uniform(0.5, 1.5, count)
+    begins = float(travel.min()) + np.cumsum(gaps * real.kerb_distance)
     return tuple((float(s), real.kerbs * (-1)**k) for k, s in enumerate(begins))
 
 
@@ -152,7 +153,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     step = 0.1      # s between draws
     breaks = np.round(np.arange(0.0, route.speed.end + step, step), 9)
     size = options.sway * np.clip(np.abs(route.speed(breaks)), 0.0, 1.0)
-    draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
+    draws = size * make_rng(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
         v = body.lateral_velocity(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)

@@ -23,12 +23,12 @@ from odocal_ros.sim import body, real_sensors, wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import (
     gauss_markov,
+    make_rng,
     PHASE,
     random_walk,
     reference_drift,
     stamps,
     stationary_sigma,
-    stream,
     TRANSPORT_DELAY,
     white,
 )
@@ -51,7 +51,7 @@ def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
     grade, real = SIM_GRADES[options.imu_grade], options.real
     gyro, accel = (
-        sigma * stream(options.seed, f'{name} bias').standard_normal(3) if own is None
+        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if own is None
         else np.array(own) for name, sigma, own in (
             ('gyro', grade.gyro_bias, real.gyro_bias),
             ('accelerometer', grade.accel_bias, real.accel_bias)))
@@ -62,11 +62,12 @@ def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer errors in frame i, (n, 3) each: noise, bias and its walk."""
     grade, rate, seed = SIM_GRADES[options.imu_grade], options.imu_rate, options.seed
     gyro, accel = turn_on_biases(options)
-    walks = (random_walk(stream(seed, 'gyro walk'), grade.gyro_bias_walk, rate, (n, 3)),
-             random_walk(stream(seed, 'accelerometer walk'), grade.accel_bias_walk, rate, (n, 3)))
-    return (gyro + walks[0] + white(stream(seed, 'gyro white'), grade.gyro_noise, rate, (n, 3)),
-            accel + walks[1] + white(stream(seed, 'accelerometer white'), grade.accel_noise,
-                                     rate, (n, 3)))
+
+    def error(name: str, bias: Floats, walk: float, noise: float) -> Floats:
+        walked = random_walk(make_rng(seed, f'{name} walk'), walk, rate, (n, 3))
+        return bias + walked + white(make_rng(seed, f'{name} white'), noise, rate, (n, 3))
+    return (error('gyro', gyro, grade.gyro_bias_walk, grade.gyro_noise),
+            error('accelerometer', accel, grade.accel_bias_walk, grade.accel_noise))
 
 
 def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
@@ -86,7 +87,7 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         variance = np.full(len(t), options.orientation_sigma**2)
     real = options.real
     if real.imu_latency or real.imu_jitter or real.imu_batch > 1:
-        ns = real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
+        ns = real_sensors.stamped(ns, make_rng(options.seed, 'real imu stamps'), real.imu_latency,
                                   real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
     return samples.ImuSamples(
@@ -110,7 +111,7 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
     if sigma is None:
         return samples.ScalarSamples.none()
     ns, t = stamps(motion.duration, rate, PHASE['pressure'])
-    state, draw = motion.at(t), stream(options.seed, 'pressure').standard_normal
+    state, draw = motion.at(t), make_rng(options.seed, 'pressure').standard_normal
     weather, by_wind, warmer = draw(3) * [1e-3, 6e-3, 0.03]    # m/s, m per (m/s)^2, relative
     height = (state.height + by_wind * state.speed**2 + weather * t) / (1 + warmer)
     value = ground * np.exp(-(height + sigma * draw(len(t))) / scale_height)
@@ -121,7 +122,7 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
     """Return q_ni with a constant heading error, like that of a compass."""
     q_ni = rotations.quat_from_matrix(attitude(state) @ imu_rotation(options))
-    error = sigma * stream(options.seed, name).standard_normal()
+    error = sigma * make_rng(options.seed, name).standard_normal()
     return rotations.quat_multiply(rotations.quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
@@ -143,7 +144,7 @@ def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     if not jitter:
         late: Ints = ns + round(delay * 1e9)
         return late
-    return real_sensors.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
+    return real_sensors.stamped(ns, make_rng(options.seed, f'real {name} stamps'), delay, jitter)
 
 
 def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
@@ -152,7 +153,7 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
     real, spun = options.real, slip(state, options, wheel.draws)
     grown = 1 + wheels.growth(state, real)
     if options.odometer == 'speed':
-        noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
+        noise = options.speed_noise * make_rng(options.seed, 'speed').standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it
         pulled = wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
@@ -167,7 +168,7 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
     rolled = rolled / scale
-    phase = stream(options.seed, f'pulse phase {wheel.draws}').uniform()   # angle of the disc
+    phase = make_rng(options.seed, f'pulse phase {wheel.draws}').uniform()   # angle of the disc
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
@@ -181,10 +182,10 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
         moving |= np.abs(state.sway[:, 0]) > AT_REST
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
-        walk = stream(options.seed, f'slip walk {side}')
+        walk = make_rng(options.seed, f'slip walk {side}')
         spun += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(spun)))
     if options.slip_events:     # each takes a second
-        rng = stream(options.seed, f'slip events {side}')
+        rng = make_rng(options.seed, f'slip events {side}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for at in rng.choice(state.t[moving], spins):
             spun += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
@@ -236,7 +237,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     for begin, end in options.outages:
         seen &= (t < begin) | (t >= end)
     if real.drops:
-        seen &= stream(options.seed, 'real drops').uniform(size=n) >= real.drops
+        seen &= make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
     return samples.take(sent, seen)
 
 
@@ -246,12 +247,13 @@ def _axes(options: SimOptions) -> Floats:
 
 def fix_errors(t: Floats, options: SimOptions) -> Floats:
     """Return the errors of fixes at (n,) times, ENU, m: (n, 3), outliers included."""
-    draws = stream(options.seed, 'fix white').standard_normal((len(t), 3))
+    draws = make_rng(options.seed, 'fix white').standard_normal((len(t), 3))
     if options.fix_noise == 'correlated':
-        slow = gauss_markov(stream(options.seed, 'fix slow'), 1.0, options.fix_correlation_time, t)
+        slow = gauss_markov(make_rng(options.seed, 'fix slow'), 1.0,
+                            options.fix_correlation_time, t)
         draws = slow + WHITE_SHARE * draws
     errors = _axes(options) * draws
-    rng = stream(options.seed, 'outliers')
+    rng = make_rng(options.seed, 'outliers')
     far, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
     reach = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (far < options.outliers)
     errors[:, 0] += reach * np.cos(bearing)

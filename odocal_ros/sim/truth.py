@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES, SKID
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
 from odocal_ros.sim.wheels import effective_width, SIDEWAYS, wheels_of
@@ -117,7 +117,7 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
         'gnss': {'lever_arm': _configured_arm(options, 'antenna')},
     }
     if known_heading_sigma is not None:
-        error = known_heading_sigma * stream(options.seed, 'known heading').standard_normal()
+        error = known_heading_sigma * make_rng(options.seed, 'known heading').standard_normal()
         groups['alignment'] = {'heading_source': 'fixed',
                                'heading': float(drive.truth.heading + error),
                                'heading_sigma': float(known_heading_sigma)}

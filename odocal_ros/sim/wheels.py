@@ -11,7 +11,7 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.time_series import running_integral
 from odocal_ros.settings.config import MECANUM, OMNI, SIDES, SKID
 from odocal_ros.sim.motion import contact_speed, State, turn_rate
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import G
@@ -72,7 +72,7 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
 def _scales(options: SimOptions, counted: Bools) -> list[float]:
     """Return the factors of more than two wheels, drawn; counted : (n,) those of the mean."""
     n = len(counted)
-    scales = 1 + options.wheel_difference * stream(options.seed, 'wheels').standard_normal(n)
+    scales = 1 + options.wheel_difference * make_rng(options.seed, 'wheels').standard_normal(n)
     scales *= options.scale * np.mean(1 / scales[counted])
     return [float(scale) for scale in scales]
 

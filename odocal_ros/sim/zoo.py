@@ -11,7 +11,6 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 
-Pair = tuple[float, float]
 Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, fields of Real
 GRADES = ('consumer', 'industrial', 'tactical')
 # definition: units of data sheets in SI; G as rounded there, far within any distribution here

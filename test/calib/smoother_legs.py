@@ -17,7 +17,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim import body, motion, sensors
-from odocal_ros.sim.noise import random_walk, stream
+from odocal_ros.sim.noise import make_rng, random_walk
 from odocal_ros.sim.options import SIM_GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -98,7 +98,7 @@ def _biases(drive, since):
     o, grade = drive.options, SIM_GRADES[drive.options.imu_grade]
     n = len(sensors.stamps(drive.motion.duration, o.imu_rate)[0])
     k = np.clip(np.round(since * o.imu_rate).astype(int), 0, n - 1)
-    return ((first + random_walk(stream(o.seed, name), walk, o.imu_rate, (n, 3)))[k]
+    return ((first + random_walk(make_rng(o.seed, name), walk, o.imu_rate, (n, 3)))[k]
             for first, name, walk in (
                 (drive.truth.gyro_bias, 'gyro walk', grade.gyro_bias_walk),
                 (drive.truth.accel_bias, 'accelerometer walk', grade.accel_bias_walk)))

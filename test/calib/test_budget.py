@@ -76,7 +76,7 @@ def alignment(**figures):
 def sources(track, *, standing=True, cov=0.0, fix_scale=(1.0, 1.0, 1.0), more=None, **figures):
     options = {'quantum': 0.0, 'time_sigma': 0.0, 'velocity_change': np.zeros(3),
                'lever_arm_sigma': 0.0, 'odometer_time_sigma': 0.0} | (more or {})
-    marks = [MarkFix(t, np.zeros(3), np.eye(3) * cov, standing, 9, 0)
+    marks = [MarkFix(t, np.zeros(3), np.eye(3) * cov, standing, 9)
              for t in (track.t[0], track.t[-1])]
     found = budget(F, track.P[-1], *marks, track.t, track.P @ F, track.q_nb,
                    alignment(**figures), fix_scale=np.array(fix_scale), **options)

@@ -38,8 +38,8 @@ def run(n, white, tau, correlation_time=np.nan, stated=STATED):
     errors = (errors + np.sqrt(white) * rng.standard_normal((n, RUNS, 3))) * [1.0, 1.0, 2.0]
     z, sigma = [], []
     for k in range(RUNS):
-        mean, covariance, _, _ = mean_fix(t, errors[:, k], np.tile(stated, (n, 1, 1)),
-                                          correlation_time)
+        mean, covariance, _ = mean_fix(t, errors[:, k], np.tile(stated, (n, 1, 1)),
+                                       correlation_time)
         sigma.append(np.sqrt(np.diag(covariance)))
         z.append(mean / sigma[-1])
     return np.array(z), np.median(sigma, axis=0)
@@ -95,20 +95,19 @@ def test_outliers_are_left_out_in_the_level_and_in_height(axis):
     rng = np.random.default_rng(4)
     p = rng.standard_normal((100, 3))
     p[[7, 50, 51], axis] += 1000.0
-    mean, _, used, dropped = mean_fix(np.arange(100) * 0.2, p, np.tile(STATED, (100, 1, 1)))
-    assert (used, dropped) == (97, 3)
+    mean, _, used = mean_fix(np.arange(100) * 0.2, p, np.tile(STATED, (100, 1, 1)))
+    assert used == 97
     assert np.abs(mean).max() < 0.5                      # five sigmas of a mean of 97
 
 
 def test_better_fixes_weigh_more_and_a_single_one_is_itself():
     p = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    mean, _, _, _ = mean_fix(np.array([0.0, 1.0]), p, np.stack([STATED, STATED / 9]))
+    mean, _, _ = mean_fix(np.array([0.0, 1.0]), p, np.stack([STATED, STATED / 9]))
     np.testing.assert_allclose(mean, [0.9, 0.0, 0.0])
-    mean, covariance, used, dropped = mean_fix(np.zeros(1), np.array([[3.0, 4.0, 5.0]]),
-                                               STATED[None])
+    mean, covariance, used = mean_fix(np.zeros(1), np.array([[3.0, 4.0, 5.0]]), STATED[None])
     np.testing.assert_array_equal(mean, [3.0, 4.0, 5.0])
     np.testing.assert_array_equal(covariance, STATED)
-    assert (used, dropped) == (1, 0)
+    assert used == 1
 
 
 def test_a_mark_belongs_to_the_standstill_it_touches():
@@ -148,7 +147,7 @@ def test_no_fix_near_a_mark_is_none_and_one_without_height_leaves_it_unknown():
 
 
 def mark(variance, used):
-    return MarkFix(0.0, np.zeros(3), variance * STATED, True, used, 0)
+    return MarkFix(0.0, np.zeros(3), variance * STATED, True, used)
 
 
 @pytest.mark.parametrize('tau', [15.0, 60.0])
@@ -219,8 +218,7 @@ def test_chance_scatter_does_not_widen_white_fixes():
     rng, stated = np.random.default_rng(8), np.tile(STATED, (60, 1, 1))
     t, variances = np.arange(60) * RATE, []
     for _ in range(300):
-        _, covariance, used, _ = mean_fix(t, rng.standard_normal((60, 3)) * [1.0, 1.0, 2.0],
-                                          stated)
+        _, covariance, used = mean_fix(t, rng.standard_normal((60, 3)) * [1.0, 1.0, 2.0], stated)
         variances.append(covariance[0, 0] * used)
     # the larger of 1 and a scatter that errs by 1 / sqrt(60) would make 1.05 on the mean; one
     # drive in a thousand is judged slow or scattered, beyond three sigmas

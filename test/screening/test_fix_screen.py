@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import dead_reckoned_fixes
 from odocal_ros.screening.screen import screen
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
@@ -36,7 +36,7 @@ def driven(stop=(0, 0)):
 def received(sigma, tunnel, scale=0.02, stop=(0, 0)):
     """Return what a receiver sends there: (n, 3) m; in the tunnel by its own odometer."""
     true = driven(stop)
-    noise = sigma * stream(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
+    noise = sigma * make_rng(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
     inside = (at_s >= tunnel[0]) & (at_s < tunnel[1])
     if inside.any():
         begin = np.flatnonzero(inside)[0]
@@ -104,7 +104,7 @@ def test_an_odometer_that_is_late_at_each_braking_is_no_tunnel(lag, tunnel):
     late = np.convolve(np.pad(speed, (len(past), 0), mode='edge'), weight / weight.sum())
     true, track = (np.interp(at_s, fine, np.cumsum(v * 0.01 * np.exp(1j * turned(fine))))
                    for v in (speed, late[len(past):][:len(fine)]))
-    noise = 0.003 * stream(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
+    noise = 0.003 * make_rng(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
     inside = tunnel & (at_s >= 210) & (at_s < 226)
     place = true + np.where(inside, 0.02 * (true - true[210]), noise)
     place_n = np.stack([place.real, place.imag, 0 * at_s], -1)

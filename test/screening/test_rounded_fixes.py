@@ -14,7 +14,7 @@ from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening.rounded_fixes import rounding_variance
 from odocal_ros.screening.screen import screen
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 
 pytestmark = pytest.mark.core
 LATITUDE, LONGITUDE = np.deg2rad(48.1), np.deg2rad(11.5)
@@ -45,8 +45,8 @@ def rounded(kind):
 def fixes(seed=0, n=600, side=1.0):
     """Return fixes of a winding road with a standstill at its end, 2 m apart: (n, 3)."""
     place = np.cumsum(2 * (np.arange(n) < n - STOP) * np.exp(0.8j * np.sin(0.03 * np.arange(n))))
-    place = np.stack([place.real, side * place.imag], -1) + stream(seed, 'place').uniform(size=2)
-    place += 0.01 * stream(seed, 'noise').standard_normal((n, 2)) * (
+    place = np.stack([place.real, side * place.imag], -1) + make_rng(seed, 'place').uniform(size=2)
+    place += 0.01 * make_rng(seed, 'noise').standard_normal((n, 2)) * (
         np.arange(n) < n - STOP)[:, None]
     return np.c_[(place / RADII + [LONGITUDE, LATITUDE])[:, ::-1], np.zeros(n)]
 

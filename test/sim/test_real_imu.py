@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
 from odocal_ros.sim import real_sensors
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.real_sensors import turn_and_push
@@ -27,7 +27,7 @@ def options(**figures):
 
 
 def test_the_imu_reads_by_its_model():
-    rng = stream(1, 'test')
+    rng = make_rng(1, 'test')
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
     w_m, f_m = real_sensors.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
@@ -63,7 +63,7 @@ def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
 
 @pytest.mark.parametrize('rate', [50.0, 200.0])
 def test_vibration_shakes_as_said_and_goes_nowhere(rate):
-    x = real_sensors.vibration(stream(2, 'test'), 0.5, rate, MANY)
+    x = real_sensors.vibration(make_rng(2, 'test'), 0.5, rate, MANY)
     # resonances 6 Hz wide: some 2 * 6 Hz draws a second
     assert x.var() / 0.25 == pytest.approx(1, rel=5 * np.sqrt(2 / (3 * MANY / rate * 12)))
     power = np.abs(np.fft.rfft(x, axis=0))**2
@@ -91,14 +91,14 @@ def test_a_bias_steps_once_by_its_size():
 
 def test_stamps_are_late_in_order_and_in_batches():
     ns = np.arange(MANY) * 10_000_000
-    late = (real_sensors.stamped(ns, stream(3, 'test'), 0.02, 0.003) - ns) * 1e-9
+    late = (real_sensors.stamped(ns, make_rng(3, 'test'), 0.02, 0.003) - ns) * 1e-9
     # stamps so far apart seldom cross: mean within 5 sigma, spread as said
     assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
     assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
-    wild = real_sensors.stamped(ns, stream(3, 'test'), 0.02, 0.02)
+    wild = real_sensors.stamped(ns, make_rng(3, 'test'), 0.02, 0.02)
     assert (np.diff(wild) >= real_sensors.LEAST_GAP_NS).all()
     assert (wild >= ns).all()
-    batch = real_sensors.stamped(ns, stream(3, 'test'), 0.002, 0.0, 4)
+    batch = real_sensors.stamped(ns, make_rng(3, 'test'), 0.002, 0.0, 4)
     assert set(np.diff(batch).tolist()) == {real_sensors.LEAST_GAP_NS,
                                             40_000_000 - 3 * real_sensors.LEAST_GAP_NS}
     assert (batch[:4] - ns[3] >= 2_000_000).all()
@@ -131,7 +131,7 @@ def cross(x, y, z):
 
 @pytest.mark.parametrize('seed', range(5))
 def test_in_the_own_frame_turn_and_push_are_felt_as_said(seed):
-    gyro, accel = stream(seed, 'test').normal(0, 0.02, (2, 3, 3))
+    gyro, accel = make_rng(seed, 'test').normal(0, 0.02, (2, 3, 3))
     R = turn_and_push(gyro, accel)
     assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     assert np.linalg.det(R) == pytest.approx(1)

@@ -13,7 +13,7 @@ from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start
-from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
+from odocal_ros.sim.noise import gauss_markov, make_rng, random_walk, white
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
 from odocal_ros.sim.scenarios import motion_of, simulate
@@ -53,7 +53,7 @@ def test_grades_are_those_of_the_method():
 
 @pytest.mark.parametrize('rate', [50.0, 400.0])
 def test_white_noise_has_its_density_at_any_rate(rate):
-    noise = white(stream(3, 'test'), 0.02, rate, (MANY, 3))
+    noise = white(make_rng(3, 'test'), 0.02, rate, (MANY, 3))
     assert noise.var() / rate == pytest.approx(0.02**2, rel=sure(3 * MANY))
     # white: neighbours do not know each other, 5 / sqrt(n)
     together = (noise[1:] * noise[:-1]).mean() / noise.var()
@@ -61,7 +61,7 @@ def test_white_noise_has_its_density_at_any_rate(rate):
 
 
 def test_a_random_walk_starts_at_zero_and_grows_with_the_root_of_time():
-    walk = random_walk(stream(3, 'test'), 0.1, 20.0, (1001, 3000))
+    walk = random_walk(make_rng(3, 'test'), 0.1, 20.0, (1001, 3000))
     assert (walk[0] == 0).all()
     assert walk[1000].var() == pytest.approx(0.1**2 * 50, rel=sure(3000))
     assert walk[250].var() == pytest.approx(0.1**2 * 12.5, rel=sure(3000))
@@ -70,7 +70,7 @@ def test_a_random_walk_starts_at_zero_and_grows_with_the_root_of_time():
 def test_gauss_markov_is_stationary_with_its_correlation_time():
     tau, sigma, dt = 20.0, 1.5, 0.2
     t = np.arange(MANY) * dt
-    x = gauss_markov(stream(3, 'test'), sigma, tau, t)
+    x = gauss_markov(make_rng(3, 'test'), sigma, tau, t)
     decay = np.exp(-dt / tau)
     push = x[1:] - decay * x[:-1]
     assert push.var() == pytest.approx(sigma**2 * (1 - decay**2), rel=sure(3 * MANY))
@@ -80,7 +80,7 @@ def test_gauss_markov_is_stationary_with_its_correlation_time():
     lag = round(tau / dt)
     together = (x[lag:] * x[:-lag]).mean() / x.var()
     assert together == pytest.approx(np.exp(-1), abs=5 * spread)
-    firsts = np.array([gauss_markov(stream(s, 'first'), sigma, tau, t[:1]) for s in range(1000)])
+    firsts = np.array([gauss_markov(make_rng(s, 'first'), sigma, tau, t[:1]) for s in range(1000)])
     assert firsts.var() == pytest.approx(sigma**2, rel=sure(3000))
 
 

@@ -8,7 +8,6 @@ IMU noise above its grade has a cause: quantisation, vibration, or the sensor it
 """
 
 from collections.abc import Collection
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,21 +59,20 @@ REMEDIES = {
 def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
     level = fit.levels.sigmas()
-    noise = _noise_over_grade(problem, level, config)
-    excess = noise.over_problem_grade
+    excess, noise_texts, remedy = _noise_over_grade(problem, level, config)
     # vibration is not white, and its spectrum is unknown
     noisy = excess > WORSE_THAN_GRADE
-    worse = noise.texts + _biases_over_grade(problem, fit, config)
+    worse = noise_texts + _biases_over_grade(problem, fit, config)
     reasons = [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
         f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used'
         + '. The noise may not be white; uncertainties were increased' * noisy,
-        noise.remedy)] if worse else []
+        remedy)] if worse else []
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
     if noisy and not worse:
         contradictions[f'IMU noise is {excess:.1f} times that of its grade (limit '
-                       f'{WORSE_THAN_GRADE:g}) and may not be white'] = noise.remedy
+                       f'{WORSE_THAN_GRADE:g}) and may not be white'] = remedy
     contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
                                 float(fit.state.constants[HEADING]))
@@ -86,26 +84,22 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     return max(1.0, 2.0 * bool(contradictions or noisy), 4.0 * step), reasons
 
 
-class _NoiseOverGrade(NamedTuple):
-    """White noise of the IMU relative to its grade."""
-
-    over_problem_grade: float   # largest ratio to the noise of the grade that the fit uses
-    texts: list[str]            # of the noises that exceed the configured grade
-    remedy: str                 # cause and action; '' if no noise exceeds a grade
-
-
 def _noise_over_grade(problem: Problem, level: dict[str, float],
-                      config: Config) -> _NoiseOverGrade:
-    """Return the IMU noise relative to the configured grade and to that of the problem."""
+                      config: Config) -> tuple[float, list[str], str]:
+    """
+    Return the IMU noise relative to its grade.
+
+    Largest ratio to the grade that the fit uses; texts on the noises that exceed the configured
+    grade; cause and action, '' if no noise exceeds a grade.
+    """
     stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
+    texts = [f'{NAMES[name]} noise is {level[name] / stated[name]:.1f} times'
+             for name in sensors if level[name] > WORSE_THAN_GRADE * stated[name]]
     remedy = find_noise_cause(problem, level, [
         name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
-    return _NoiseOverGrade(
-        max(level[name] / own[name] for name in sensors),
-        [f'{NAMES[name]} noise is {level[name] / stated[name]:.1f} times'
-         for name in sensors if level[name] > WORSE_THAN_GRADE * stated[name]], remedy)
+    return max(level[name] / own[name] for name in sensors), texts, remedy
 
 
 def _sensors(problem: Problem) -> list[str]:
@@ -263,22 +257,22 @@ def _setting(name: str, level: dict[str, float]) -> str:
     return f'set imu.{name}_noise to {level[name]:.2g} ({UNITS[name]}).'
 
 
-def _steps_in_words(quantisation_steps: dict[str, float]) -> str:
+def _steps_in_words(steps: dict[str, float]) -> str:
     return ' and '.join(
         f'the {NAMES[name]} has steps of ' + (
             f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
-        for name, step in quantisation_steps.items())
-
-
-def quantisation_steps(leg: SmootherLeg) -> dict[str, float]:
-    """Return the quantisation steps of gyro, rad/s, and accelerometer, m/s^2; 0: none."""
-    return {'gyro': _step(leg.w_b), 'accel': _step(leg.f_b)}
+        for name, step in steps.items())
 
 
 def find_quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
-    """Return the steps of sensors whose noise they explain; level : white noise, as a root."""
+    """
+    Return the quantisation steps of sensors whose noise they explain, rad/s and m/s^2.
+
+    level : roots of the white noise levels of 'gyro' and 'accel', SI per sqrt(Hz).
+    """
     interval = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
-    return {name: step for name, step in quantisation_steps(leg).items()
+    steps = {'gyro': _step(leg.w_b), 'accel': _step(leg.f_b)}
+    return {name: step for name, step in steps.items()
             if step**2 / 12 * interval > EXPLAINED * level[name]**2}
 
 

@@ -92,7 +92,7 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
                 *_without_estimate(problem, fit, sigma, ratio, estimates)]
     reasons += assumed_noise_reasons(problem, fit.levels)
     reasons += check_limits(estimates, leg.nominal_scale, config)
-    sources, border = _budget(leg, fit, marginals, posterior)
+    sources, information = _budget(leg, fit, marginals, posterior)
     details = _details(leg, problem, fit, sources, ratio, factor, sigma)
     details |= stored_residuals(leg, problem, fit) | wheel_details(wheels)
     details |= odometry_output.odometry_details(leg, problem, fit, marginals, factor)
@@ -103,7 +103,7 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     if grade is not None:
         details['level_pitch_angle'] = odometry_output.level_pitch(fit, marginals, factor)
     return MethodResult('smoother', tuple(reasons), estimates, PARAMETERS, tuple(sources), details,
-                        border)
+                        information)
 
 
 def _posterior(problem: Problem, fit: Fit, factor: float) -> _Posterior:
@@ -170,14 +170,14 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     sources = [*(replace(source, effects=source.effects * posterior.factor)
                  for source in error_sources(fit, marginals)),
                Source('model', np.diag(remarks.MODEL_FLOOR))]
-    border = marginal_information(fit, configured_constants(leg)).widened(posterior.factor)
+    information = marginal_information(fit, configured_constants(leg)).widened(posterior.factor)
     for error in posterior.beyond_fit:
         shared = error.source == 'height'      # unknown on one road as on the next
         sources.append(Source(error.source, error.sigma
                               * np.eye(PARAMETER_COUNT)[:, [error.constant]], shared))
         if not shared:
-            border = border.loosened({layout.CONSTANTS[error.constant]: error.sigma})
-    return sources, border
+            information = information.loosened({layout.CONSTANTS[error.constant]: error.sigma})
+    return sources, information
 
 
 def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,

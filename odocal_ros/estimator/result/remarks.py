@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from odocal_ros.calib.budget import HEIGHT_UNKNOWN
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
 from odocal_ros.estimator.factors.gnss import Fixes
@@ -174,8 +174,7 @@ def _bias_step_reasons(fit: Fit) -> list[Reason]:
     for name, bias, column, unit, unit_factor in (
             ('gyro', fit.state.gyro_bias, GYRO_STEP, 'deg/s', np.rad2deg(1.0)),
             ('accelerometer', fit.state.accel_bias, ACCEL_STEP, 'm/s^2', 1.0)):
-        is_outlier = np.r_[False, fit.variance_factors[:, column] > STEP_VARIANCE, False]
-        begin, end = np.flatnonzero(np.diff(is_outlier.astype(int))).reshape(-1, 2).T
+        begin, end = runs(fit.variance_factors[:, column] > STEP_VARIANCE).T
         size = np.linalg.norm(bias[end] - bias[begin], axis=1)
         if len(size):
             k = int(np.argmax(size))
