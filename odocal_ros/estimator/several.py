@@ -13,20 +13,26 @@ from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import fit_jointly, FREE_STEP, JointEstimate, scale_steps, ScaleStep
 from odocal_ros.calib.marginal_information import MarginalInformation
-from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.value_limits import cause_of_change, format_change
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 from odocal_ros.estimator.factors.pseudo_observations import SHARED, SIZE
 from odocal_ros.estimator.result.estimates import (
     estimate_constants,
+    FittedConstants,
     not_observable_reason,
     OPTIONAL,
 )
 from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
 from odocal_ros.estimator.result.outcome import SCALES, with_model_floor
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
-from odocal_ros.estimator.result.wheel_result import combine_wheels, wheel_details, wheel_estimates
+from odocal_ros.estimator.result.wheel_result import (
+    combine_wheels,
+    Wheel,
+    wheel_details,
+    wheel_estimates,
+)
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -54,52 +60,59 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     between two legs (SCALE_CHANGED).
     """
     order = np.argsort(times_ns, kind='stable')
-    legs = [results[i] for i in order]
-    names = [(numbers or range(1, len(results) + 1))[i] for i in order]
-    days = np.diff(np.asarray(times_ns)[order]) / DAY_NS
-    marginals = _share_sizes([leg.marginal for leg in legs])
-    steps = config.verdict.scale_drift_per_day * np.sqrt(days)
-    changes = scale_steps(marginals, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT]) \
-        if config.leg.automatic else []
-    steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = fit_jointly(marginals, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:PARAMETER_COUNT],
-                        CONSTANTS[:PARAMETER_COUNT],
-                        dict(zip(CONSTANTS[:PARAMETER_COUNT], SCATTER, strict=True)),
-                        (days == 0).tolist())
+    legs, times = [results[i] for i in order], np.asarray(times_ns)[order]
+    leg_numbers = [(numbers or range(1, len(results) + 1))[i] for i in order]
+    found, changes = _fit(legs, times, config)
     at = [found.names.index(name) for name in CONSTANTS]
-    C = with_model_floor(found.covariance[np.ix_(at, at)])
     common = _common_sources(legs)
+    C = with_model_floor(found.covariance[np.ix_(at, at)])
     C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
-    ratio = sigma / found.factor / found.sigma[at]
-    scale = legs[-1].estimates['scale_factor']
-    nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
-                    (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
-    estimates, refusals = estimate_constants(found.value[at], sigma, ratio, scale.unit,
-                                             nominal, config)
-    estimates |= combine_as_sent(legs, estimates['scale_factor'])
+    fitted = FittedConstants(found.value[at], sigma, sigma / found.factor / found.sigma[at])
     wheels = combine_wheels(legs)
-    if wheels:
-        wheel_values, wheel_reasons = wheel_estimates(wheels, wheels, estimates['scale_factor'],
-                                                      config)
-        estimates, refusals = estimates | wheel_values, refusals + wheel_reasons
-    estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
-    undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
-    if undetermined:
-        refusals.append(not_observable_reason(f'these {len(legs)} drives', undetermined,
-                                              local))
+    estimates, refusals = _estimate(legs, fitted, wheels, config, local)
     sources = _error_sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
-    reasons = [_scale_change_reason(change, np.asarray(times_ns)[order], names)
-               for change in changes]
-    return MethodResult('smoother', (*reasons, *_disagreement_reasons(found, names),
-                                     *refusals), estimates,
-                        PARAMETERS,
-                        sources, _details(found, found.value[at], C, sources, len(legs))
-                        | {'beside': additional_figures(found.value[at], C, grade)}
-                        | wheel_details(wheels),
+    details = _details(found, fitted.value, C, sources, len(legs)) | {
+        'beside': additional_figures(fitted.value, C, grade)} | wheel_details(wheels)
+    reasons = (*(_scale_change_reason(change, times, leg_numbers) for change in changes),
+               *_disagreement_reasons(found, leg_numbers), *refusals)
+    return MethodResult('smoother', reasons, estimates, PARAMETERS, sources, details,
                         found.carried)
+
+
+def _fit(legs: Sequence[MethodResult], times_ns: Ints,
+         config: Config) -> tuple[JointEstimate, list[ScaleStep]]:
+    """Return the joint estimate of legs in order of time, and permanent changes of the scale."""
+    days = np.diff(times_ns) / DAY_NS
+    marginals = _share_sizes([leg.marginal for leg in legs if leg.marginal])     # each has it
+    scale, *angles = parameters = CONSTANTS[:PARAMETER_COUNT]
+    steps = config.verdict.scale_drift_per_day * np.sqrt(days)
+    changes = scale_steps(marginals, steps, scale, angles) if config.leg.automatic else []
+    steps[[change.leg - 1 for change in changes]] = FREE_STEP
+    usual = dict(zip(parameters, SCATTER, strict=True))
+    return fit_jointly(marginals, steps, scale, angles, parameters, usual,
+                       (days == 0).tolist()), changes
+
+
+def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants, wheels: dict[str, Wheel],
+              config: Config, local: bool) -> tuple[dict[str, Estimate], list[Reason]]:
+    """Return the estimates of the legs together, and the reasons for those not determined."""
+    scales = ((leg.estimates[name].value for name in ('scale_factor', 'scale_ratio'))
+              for leg in legs)
+    nominal = next((K / ratio for K, ratio in scales if K and ratio), 0.0)
+    estimates, refusals = estimate_constants(fitted, legs[-1].estimates['scale_factor'].unit,
+                                             nominal, config)
+    estimates |= combine_as_sent(legs, estimates['scale_factor'])
+    if wheels:
+        of_wheels, reasons = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
+        estimates, refusals = estimates | of_wheels, refusals + reasons
+    estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
+    undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
+    if undetermined:
+        refusals.append(not_observable_reason(f'these {len(legs)} drives', undetermined, local))
+    return estimates, refusals
 
 
 def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInformation]:

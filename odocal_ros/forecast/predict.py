@@ -35,7 +35,13 @@ from odocal_ros.nav.alignment import (
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.geodesy import earth_rate_n, gravity
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
+from odocal_ros.nav.rotations import (
+    quat_conjugate,
+    quat_from_matrix,
+    quat_multiply,
+    rotate_back,
+    transpose,
+)
 from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
@@ -248,7 +254,7 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
     velocity_n = C_nb[:, :, 0] * drive.speed[pick][:, None]
     f_n = np.gradient(velocity_n, t, axis=0) + [0.0, 0.0, gravity(drive.latitude, drive.height)]
     q_nb = quat_from_matrix(C_nb)
-    return level_in_motion(t, np.einsum('nij,ni->nj', C_nb, f_n),
+    return level_in_motion(t, rotate_back(C_nb, f_n),
                            quat_multiply(quat_conjugate(q_nb[0]), q_nb),
                            drive.speed[pick][[0, -1]], drive.latitude, grade)
 

@@ -91,7 +91,7 @@ class TransformReader(Reader):
 
     def new_positions(self) -> Pairs:
         """Return the positions that can be computed now."""
-        stamps, received, position = self._chain.take()
+        stamps, received, position = self._chain.pop_positions()
         self._has_position = self._has_position or len(stamps) > 0
         self.unreadable = self._damaged if self._has_position else self._messages
         self.trouble = 'damaged messages' if self._has_position else self._missing_reason()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import gravity, OMEGA
-from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose, wrap
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, rotate, transpose, wrap
 from odocal_ros.settings.nominal import Grade
 
 # limits of the alignment of a leg, recorded or planned
@@ -126,7 +126,7 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     """
     T = t[-1] - t[0]
     C_0b = matrix_from_quat(q_0b)
-    f_0 = np.einsum('nij,nj->ni', C_0b, f_b)
+    f_0 = rotate(C_0b, f_b)
     lift = np.sum((f_0[:-1] + f_0[1:]) / 2 * np.diff(t)[:, None], axis=0)
     change = C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0]
     up_0 = lift - change

@@ -15,12 +15,12 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 LONGEST_STEP_NS = 500_000_000
 RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
 MOST_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
-NewPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
+StampedPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
 Values = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
 
 
 @dataclass(eq=False)
-class _Moving:
+class _MovingFrame:
     """Transforms of a child frame in its parent, in order of their stamps."""
 
     parent: str
@@ -37,7 +37,7 @@ class _Moving:
         self.received.append(received_ns)
         self.values.append(values)
 
-    def drop(self, count: int) -> None:
+    def drop_oldest(self, count: int) -> None:
         count = max(count, 0)
         for held in (self.stamps, self.received, self.values):
             del held[:count]
@@ -55,27 +55,27 @@ class FrameChain:
 
     def __init__(self, parent: str, child: str) -> None:
         self.parent, self.child = parent, child
-        self._moving: dict[str, _Moving] = {}
+        self._moving: dict[str, _MovingFrame] = {}
         self._static: dict[str, tuple[str, Values]] = {}
         self._path: list[str] | None = None      # children, from the parent downwards
         self._last: Values | None = None         # of the moving frame next to the parent
-        self._done: list[NewPositions] = []             # before the stamps started again
+        self._done: list[StampedPositions] = []             # before the stamps started again
 
     def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
             ) -> None:
         """Add a transform with a stamp; the first parent of a child applies."""
         if self._path is None or child in self._path:
-            edge = self._moving.setdefault(child, _Moving(parent))
+            edge = self._moving.setdefault(child, _MovingFrame(parent))
             if edge.parent != parent:
                 return
             if stamp_ns < edge.newest_ns - RESTART_NS:
-                self._done.append(self._known())
+                self._done.append(self._compute_positions())
                 for other in self._moving.values():
-                    other.drop(len(other.stamps))
+                    other.drop_oldest(len(other.stamps))
                     other.newest_ns = -1
             if len(edge.stamps) == MOST_WAITING:
-                self._done.append(self._known())
-                edge.drop(len(edge.stamps) - MOST_WAITING + 1)
+                self._done.append(self._compute_positions())
+                edge.drop_oldest(len(edge.stamps) - MOST_WAITING + 1)
             edge.add(stamp_ns, received_ns, values)
 
     def add_static(self, child: str, parent: str, values: Values) -> None:
@@ -105,13 +105,13 @@ class FrameChain:
             here = self._moving[here].parent if here in self._moving else self._static[here][0]
         return here, path
 
-    def take(self) -> NewPositions:
+    def pop_positions(self) -> StampedPositions:
         """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
-        done, self._done = [*self._done, self._known()], []
+        done, self._done = [*self._done, self._compute_positions()], []
         stamps, received, position = (np.concatenate(some) for some in zip(*done, strict=True))
         return stamps, received, position
 
-    def _known(self) -> NewPositions:
+    def _compute_positions(self) -> StampedPositions:
         """Return the new positions since the last restart of the stamps."""
         nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
@@ -139,13 +139,13 @@ class FrameChain:
                 values, near = _interpolate(edge, stamps)
                 good &= near
             position = _to_parent_frame(values, position)
-        first.drop(n)
+        first.drop_oldest(n)
         for edge in others:     # the previous one is needed for later positions
-            edge.drop(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
+            edge.drop_oldest(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
         return stamps[good], received[good], position[good]
 
 
-def _interpolate(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
+def _interpolate(edge: _MovingFrame, stamps: Ints) -> tuple[Floats, Bools]:
     """Return the transforms of a frame at stamps, (n, 7), and a mask of usable ones, (n,)."""
     t, values = np.array(edge.stamps), np.array(edge.values)
     before = np.searchsorted(t, stamps, side='right') - 1

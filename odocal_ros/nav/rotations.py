@@ -82,6 +82,12 @@ def rotate(C: Floats, vectors: Floats) -> Floats:
     return out
 
 
+def rotate_back(C: Floats, vectors: Floats) -> Floats:
+    """Return the inverse of ``rotate``: (K, 3, 3), (K, 3)."""
+    out: Floats = np.einsum('kij,ki->kj', C, vectors)
+    return out
+
+
 def level_left(forward_n: Floats) -> Floats:
     """Return the level unit axes to the left of forward axes in n: (K, 3)."""
     left = np.stack([-forward_n[:, 1], forward_n[:, 0], np.zeros(len(forward_n))], -1)

@@ -10,8 +10,8 @@ rear tyres cause sideslip: the axle's centre moves at an angle to its wheels.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.data.arrays import Floats, runs
+from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real import Real
@@ -37,10 +37,10 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
     # s; the error of a cubic is then (w h)^4 / 384 = 2e-6; a kerb is passed within 0.2 s
     step = 0.005 if hills.kerbs else 0.02
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
-    v, s = speed(t), speed.integral()(t)
+    travel = speed.integral()(t)
     # slopes at the rear axle and of the chord of the wheelbase, and derivatives by path length
-    slope, slope_by_path, _ = hills(s)
-    chord, chord_by_path = hills.chord(s, wheelbase) if wheelbase else (slope, slope_by_path)
+    slope, slope_by_path, _ = hills(travel)
+    chord, chord_by_path = hills.chord(travel, wheelbase) if wheelbase else (slope, slope_by_path)
     forward = speed.derivative().mean(t) + G * slope     # m/s^2
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung_response(real.body_roll * side_force(speed, yaw_rate, lean, t)
@@ -48,8 +48,8 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
     pitch, pitch_rate = sprung_response(-real.squat * forward, step)
     if lean:
         roll, roll_rate = roll + lean(t), roll_rate + lean.derivative()(t)
-    return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - slope),
-                                                pitch_rate - (chord_by_path - slope_by_path) * v)
+    return hermite(t, roll, roll_rate), hermite(
+        t, pitch - (chord - slope), pitch_rate - (chord_by_path - slope_by_path) * speed(t))
 
 
 def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Floats) -> Floats:
@@ -59,12 +59,10 @@ def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Float
 
 def kneeling_degree(speed: Profile, t: Floats) -> Floats:
     """Return the degree of kneeling of a bus at its stops, 0 to 1: (n,)."""
-    still = np.concatenate([[0], np.abs(speed(t)) < STILL, [0]]).astype(int)
-    begin, end = (np.flatnonzero(np.diff(still) == sign) for sign in (1, -1))
-    down = np.zeros(len(t))
-    for a, b in zip(t[begin[1:-1]], t[end[1:-1] - 1], strict=True):
-        down += np.clip(np.minimum(t - a, b - t) / KNEELING_TIME, 0.0, 1.0)
-    return down
+    degree = np.zeros(len(t))
+    for begin, end in t[runs(np.abs(speed(t)) < STILL) - [0, 1]][1:-1]:    # not before and after
+        degree += np.clip(np.minimum(t - begin, end - t) / KNEELING_TIME, 0.0, 1.0)
+    return degree
 
 
 def road_lean(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
@@ -84,21 +82,22 @@ def sprung_response(push: Floats, step: float) -> tuple[Floats, Floats]:
     push : (n,) u, the static tilt, rad, linear between rows.   step : s, between rows.
     """
     w, z = FREQUENCY, DAMPING
-    wd = w * np.sqrt(1 - z**2)
-    decay, s, c = np.exp(-z * w * step), np.sin(wd * step), np.cos(wd * step)
-    a, b = decay * (c + z * w / wd * s), decay * s / wd
-    d = decay * (c - z * w / wd * s)
-    slope = np.diff(push) / step
-    begin = push[:-1] - 2 * z / w * slope     # steady response to a ramp
-    y, dy = np.empty(len(push)), np.empty(len(push))
-    now, rate = float(push[0]), 0.0
-    y[0], dy[0] = now, rate
-    for k, (base, rise) in enumerate(zip(begin.tolist(), slope.tolist(), strict=True)):
-        off, off_rate = now - base, rate - rise
-        now = base + rise * step + a * off + b * off_rate
-        rate = rise - b * w * w * off + d * off_rate
-        y[k + 1], dy[k + 1] = now, rate
-    return y, dy
+    damped = w * np.sqrt(1 - z**2)      # frequency, rad/s
+    decay, sine, cosine = np.exp(-z * w * step), np.sin(damped * step), np.cos(damped * step)
+    # transition over a step of the deviation from the steady response, and of its rate
+    value_by_value, value_by_rate = decay * (cosine + z * w / damped * sine), decay * sine / damped
+    rate_by_rate = decay * (cosine - z * w / damped * sine)
+    slopes = np.diff(push) / step
+    steady = push[:-1] - 2 * z / w * slopes     # response to a ramp
+    values, rates = np.empty(len(push)), np.empty(len(push))
+    value, rate = float(push[0]), 0.0
+    values[0], rates[0] = value, rate
+    for k, (base, slope) in enumerate(zip(steady.tolist(), slopes.tolist(), strict=True)):
+        off, off_rate = value - base, rate - slope
+        value = base + slope * step + value_by_value * off + value_by_rate * off_rate
+        rate = slope - value_by_rate * w * w * off + rate_by_rate * off_rate
+        values[k + 1], rates[k + 1] = value, rate
+    return values, rates
 
 
 def lateral_velocity(speed: Profile, yaw_rate: Profile, sideslip: float, lean: Profile | None,
@@ -120,20 +119,22 @@ def imu_output(motion: Motion, state: State,
     if not motion.tilt:
         return w_v, f_v
     t, arm = state.t, np.asarray(lever_arm, dtype=float)
-    R = rotation(motion, t)
+    C_vb = rotation(motion, t)
     roll, rates = motion.tilt[0](t), [profile.derivative() for profile in motion.tilt]
-    dr, dp = (rate(t) for rate in rates)
-    ddr, ddp = (rate.derivative().mean(t) for rate in rates)
-    s, c = np.sin(roll), np.cos(roll)
+    roll_rate, pitch_rate = (rate(t) for rate in rates)
+    roll_acceleration, pitch_acceleration = (rate.derivative().mean(t) for rate in rates)
+    sine, cosine = np.sin(roll), np.cos(roll)
     # turn rate of the body relative to the vehicle, in body axes, and its derivative
-    w_r = np.stack([dr, dp * c, -dp * s], -1)
-    dw_r = np.stack([ddr, ddp * c - dp * dr * s, -ddp * s - dp * dr * c], -1)
-    arm_v = R @ arm
-    w_rv = np.einsum('nij,nj->ni', R, w_r)
+    w_relative = np.stack([roll_rate, pitch_rate * cosine, -pitch_rate * sine], -1)
+    dw_relative = np.stack([roll_acceleration,
+                     pitch_acceleration * cosine - pitch_rate * roll_rate * sine,
+                     -pitch_acceleration * sine - pitch_rate * roll_rate * cosine], -1)
+    arm_v = C_vb @ arm
+    w_rv = rotate(C_vb, w_relative)
     moved, turning = arm_v - arm, np.cross(w_rv, arm_v)
     # the arm moved by the tilt: Euler, centrifugal and Coriolis terms
     dw_v = np.gradient(w_v, t, axis=0) if len(t) > 1 else np.zeros_like(w_v)
     f_v = (f_v + np.cross(dw_v, moved) + np.cross(w_v, np.cross(w_v, moved))
-           + 2 * np.cross(w_v, turning) + np.cross(np.einsum('nij,nj->ni', R, dw_r), arm_v)
+           + 2 * np.cross(w_v, turning) + np.cross(rotate(C_vb, dw_relative), arm_v)
            + np.cross(w_rv, turning))
-    return np.einsum('nij,ni->nj', R, w_v) + w_r, np.einsum('nij,ni->nj', R, f_v)
+    return rotate_back(C_vb, w_v) + w_relative, rotate_back(C_vb, f_v)

@@ -59,11 +59,11 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     real: dict[str, Any] = {}
     there = []
     for name in names:
-        changes, figures = (EFFECTS | RARE)[name](make_rng(seed, f'vehicle {name}'), vehicle)
-        if changes or figures:      # a draw may have no effect
+        drawn = (EFFECTS | RARE)[name](make_rng(seed, f'vehicle {name}'), vehicle)
+        if drawn.options or drawn.real:      # a draw may have no effect
             there.append(name)
-        options |= changes
-        real |= figures
+        options |= drawn.options
+        real |= drawn.real
     return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
 
 

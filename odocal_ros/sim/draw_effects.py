@@ -22,20 +22,20 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
         np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
                          * np.clip(rng.standard_normal(3), -3.0, 3.0))
         figures[name] = flat(M)
-    return {}, figures
+    return Drawn(figures)
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    return {}, {'g_sensitivity': flat(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
+    return Drawn({'g_sensitivity': flat(rng.normal(0.0, vehicle.size('g sensitivity'), 9))})
 
 
 def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw turn-on biases by the vehicle's class, and their drift during the run."""
-    return {}, {
+    return Drawn({
         'gyro_bias': flat(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
         'accel_bias': flat(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
         'gyro_wander': vehicle.size('gyro wander'),
-        'accel_wander': vehicle.size('accelerometer wander')}
+        'accel_wander': vehicle.size('accelerometer wander')})
 
 
 def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -49,14 +49,14 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
         figures[name] = flat(sign * (median * np.exp(spread * rng.standard_normal(3))))
     least, most = vehicle.row('warmth')
     rise = rng.uniform(least, most) * math.exp(-since / tau)
-    return {}, figures | {'warm_rise': float(rise), 'warm_time': tau}
+    return Drawn(figures | {'warm_rise': float(rise), 'warm_time': tau})
 
 
 def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw the vibration of the IMU by road and engine."""
     rms = G * rng.uniform(0.02, 0.1)
-    return {}, {'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
-                'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))}
+    return Drawn({'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
+                  'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))})
 
 
 def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -64,8 +64,8 @@ def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     shortest, longest = vehicle.row('filter')
     latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.row('latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
-    return {}, {'imu_latency': float(latency), 'imu_jitter': vehicle.size('imu jitter'),
-                'imu_batch': 2 if batches else 1}
+    return Drawn({'imu_latency': float(latency), 'imu_jitter': vehicle.size('imu jitter'),
+                  'imu_batch': 2 if batches else 1})
 
 
 def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -73,7 +73,8 @@ def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     names = list(GRADES)
     stated = names.index(vehicle.grade) + int(rng.integers(-1, 2))
     configured_grade = names[max(0, min(stated, len(names) - 1))]
-    return {}, {} if configured_grade == vehicle.grade else {'configured_grade': configured_grade}
+    return Drawn({} if configured_grade == vehicle.grade else
+                 {'configured_grade': configured_grade})
 
 
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -85,51 +86,52 @@ def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     chance = rng.uniform()
     band = (0.0 if chance < 0.3 else rng.uniform(0.3, 1) if chance < 0.8 else rng.uniform(1, 3.5))
     rate = float(rng.choice([1.0, 2.0, 5.0, 10.0] if whole else [10.0, 20.0, 50.0]))
-    return (vehicle.speed_options | {'odometer_rate': rate},
-            real | {'dead_band': 0.0 if whole else band * KMH})
+    return Drawn(real | {'dead_band': 0.0 if whole else band * KMH},
+                 vehicle.speed_options | {'odometer_rate': rate})
 
 
 def coarse_pulses(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Count few pulses per metre: the teeth of a brake's tone wheel."""
     nominal = 1 / rng.uniform(15, 50)
-    return {'scale': vehicle.speed_options['scale'] * nominal, 'nominal_scale': float(nominal)}, {}
+    return Drawn(options={'scale': vehicle.speed_options['scale'] * nominal,
+                          'nominal_scale': float(nominal)})
 
 
 def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Delay stamps by filter and bus, with jitter."""
     late = lognormal(rng, *((0.015, 0.6) if vehicle.robot else (0.04, 0.5)
                             if vehicle.grade != 'tactical' else (0.005, 0.3)))
-    return {'odometer_delay': late}, {'odometer_jitter': 0.003}
+    return Drawn({'odometer_jitter': 0.003}, {'odometer_delay': late})
 
 
 def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let tyres grow with the square of the speed."""
-    return {}, {'speed_law': lognormal(rng, 0.002, 0.6)}
+    return Drawn({'speed_law': lognormal(rng, 0.002, 0.6)})
 
 
 def warming(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let tyres grow as they warm up."""
     half = 0.5 if vehicle.grade == 'tactical' else 1.0
-    return {}, {'warming': float(half * rng.uniform(0.001, 0.004)),
-                'warming_time': lognormal(rng, 600.0, 0.4)}
+    return Drawn({'warming': float(half * rng.uniform(0.001, 0.004)),
+                  'warming_time': lognormal(rng, 600.0, 0.4)})
 
 
 def slip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let tyres slip under traction and braking."""
-    return {}, {'tyre_slip': 1 / lognormal(rng, 30.0, 0.4), 'driven': bool(rng.uniform() < 0.5)}
+    return Drawn({'tyre_slip': 1 / lognormal(rng, 30.0, 0.4), 'driven': bool(rng.uniform() < 0.5)})
 
 
 def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let the rear axle drift outwards by the lateral acceleration."""
     drift = rng.uniform(0, 0.1) if vehicle.robot else lognormal(rng, 0.22, 0.35)
-    return {}, {'sideslip': float(drift * DEG)}
+    return Drawn({'sideslip': float(drift * DEG)})
 
 
 def squat(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let the body pitch and roll on its springs."""
     pitch, roll = (0.2, 0.5) if vehicle.robot else (lognormal(rng, 1.3, 0.4),
                                                     lognormal(rng, 4.5, 0.3))
-    return {}, {'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G)}
+    return Drawn({'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G)})
 
 
 def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -139,44 +141,45 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
         off = vehicle.size('arm error') * rng.standard_normal(3)
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
         real[f'{name}_arm_error'] = flat(-arm if zero else off)
-    return {}, real
+    return Drawn(real)
 
 
 def receiver_lag(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Filter positions as receivers do."""
-    return {}, {'receiver_lag': float(rng.uniform(0.01, 0.15))}
+    return Drawn({'receiver_lag': float(rng.uniform(0.01, 0.15))})
 
 
 def fix_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamp fixes at their arrival, as half of the drivers do."""
     if vehicle.grade == 'tactical' or not (vehicle.alone or rng.uniform() < 0.5):
-        return {}, {}
-    return {'fix_delay': lognormal(rng, 0.12, 0.4)}, {'fix_jitter': 0.01}
+        return Drawn()
+    return Drawn({'fix_jitter': 0.01}, {'fix_delay': lognormal(rng, 0.12, 0.4)})
 
 
 def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw correlated errors: most with a time of one minute, the rest of 15 minutes."""
     if vehicle.rtk:
-        return {'fix_sigma': 0.008}, {'slow_errors': ((0.01, 100.0),)}
+        return Drawn({'slow_errors': ((0.01, 100.0),)}, {'fix_sigma': 0.008})
     sbas = 0.6 if rng.uniform() < 0.4 else 1.0
     sigma = sbas * lognormal(rng, 1.5, 0.4)
-    return ({'fix_sigma': float(rng.uniform(0.02, 0.3))},
-            {'slow_errors': ((sigma * 0.6**0.5, 60.0), (sigma * 0.4**0.5, 900.0))})
+    return Drawn({'slow_errors': ((sigma * 0.6**0.5, 60.0), (sigma * 0.4**0.5, 900.0))},
+                 {'fix_sigma': float(rng.uniform(0.02, 0.3))})
 
 
 def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw bursts of wrong positions in a city; with RTK, occasional wrong fixes."""
     if vehicle.rtk:
-        return {}, {'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6, 'burst_time': 60.0}
+        return Drawn({'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6,
+                      'burst_time': 60.0})
     if not (vehicle.city or vehicle.alone):
-        return {}, {}
-    return {}, {'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0}
+        return Drawn()
+    return Drawn({'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0})
 
 
 def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """State sigmas that are not the true ones; in a city most are too small."""
     optimism = lognormal(rng, *((3.0, 0.7) if vehicle.city and not vehicle.rtk else (1.3, 0.5)))
-    return {}, {'stated_factor': 1 / optimism}
+    return Drawn({'stated_factor': 1 / optimism})
 
 
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -185,69 +188,69 @@ def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.alone):
         begin = float(rng.uniform(30.0, span))
         spans.append((begin, begin + min(lognormal(rng, 10.0, 1.0), 90.0)))
-    return {'outages': tuple(sorted(spans))}, {'drops': 0.01}
+    return Drawn({'drops': 0.01}, {'outages': tuple(sorted(spans))})
 
 
 def fused_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Fuse an uncalibrated odometer into the fixes, as car head units do."""
-    return {}, {'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
-                'receiver_odometer_time': lognormal(rng, 20.0, 0.5)}
+    return Drawn({'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
+                  'receiver_odometer_time': lognormal(rng, 20.0, 0.5)})
 
 
 def tracked_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Filter position and velocity, as receivers in vehicle mode do."""
-    return {}, {'receiver_tracking': float(rng.uniform(0.3, 1.0))}
+    return Drawn({'receiver_tracking': float(rng.uniform(0.3, 1.0))})
 
 
 def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Hold a published speed until it has changed by a step, as many buses do."""
-    return vehicle.speed_options, {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))}
+    return Drawn({'speed_hold': KMH * float(rng.choice((0.2, 0.5)))}, vehicle.speed_options)
 
 
 def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Send speeds after a low-pass filter, like most speed signals of cars."""
-    return (vehicle.speed_options | {'odometer_rate': 20.0},
-            {'speed_filter': float(rng.uniform(0.2, 0.6))})
+    return Drawn({'speed_filter': float(rng.uniform(0.2, 0.6))},
+                 vehicle.speed_options | {'odometer_rate': 20.0})
 
 
 def clocks(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamp odometer and fixes by clocks of their own."""
     odometer, fix = rng.uniform(2e-5, 1e-4, 2) * rng.choice((-1, 1), 2)
-    return {}, {'odometer_clock_rate': float(odometer), 'fix_clock_rate': float(fix)}
+    return Drawn({'odometer_clock_rate': float(odometer), 'fix_clock_rate': float(fix)})
 
 
 def late_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamp fixes at reception, after a latency that varies."""
-    return {'fix_delay': 0.25}, {'fix_jitter': float(rng.uniform(0.05, 0.1))}
+    return Drawn({'fix_jitter': float(rng.uniform(0.05, 0.1))}, {'fix_delay': 0.25})
 
 
 def tunnels(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Dead-reckon in the receiver through tunnels, with an odometer and a gyro of its own."""
     begins = rng.uniform((60.0, 300.0), (200.0, 420.0))
-    return {}, {'tunnels': tuple((float(b), float(rng.uniform(20.0, 120.0))) for b in begins),
-                'tunnel_odometer': float(rng.uniform(0.005, 0.02) * rng.choice((-1, 1))),
-                'tunnel_heading': float(DEG * rng.normal())}
+    return Drawn({'tunnels': tuple((float(b), float(rng.uniform(20.0, 120.0))) for b in begins),
+                  'tunnel_odometer': float(rng.uniform(0.005, 0.02) * rng.choice((-1, 1))),
+                  'tunnel_heading': float(DEG * rng.normal())})
 
 
 def reflections(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Receive only reflections near a wall for half a minute, with slow onset and end."""
-    return {}, {'bursts': 20.0, 'burst_size': 12.0, 'burst_time': 30.0, 'burst_onset': 10.0}
+    return Drawn({'bursts': 20.0, 'burst_size': 12.0, 'burst_time': 30.0, 'burst_onset': 10.0})
 
 
 def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Drive on ground with cross slopes; in a yard over kerbs too."""
     lean = {'cross_slope': float(DEG * rng.uniform(1.0, 2.0))}
     if vehicle.kind != 'yard':
-        return {}, lean | {'cross_slope_length': 200.0, 'wheelbase': 2.7}
-    return {}, lean | {'kerbs': float(rng.uniform(0.04, 0.08)), 'wheelbase': 0.5}
+        return Drawn(lean | {'cross_slope_length': 200.0, 'wheelbase': 2.7})
+    return Drawn(lean | {'kerbs': float(rng.uniform(0.04, 0.08)), 'wheelbase': 0.5})
 
 
 def bias_steps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Change the biases at a time in mid-drive: a knock, a strained board, another supply."""
     accel, gyro = rng.normal(size=(2, 3))
-    return {}, {'accel_step': flat(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
-                'gyro_step': flat(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
-                'bias_step_at': float(rng.uniform(100.0, 300.0))}
+    return Drawn({'accel_step': flat(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
+                  'gyro_step': flat(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
+                  'bias_step_at': float(rng.uniform(100.0, 300.0))})
 
 
 EFFECTS = {f.__name__: f for f in (

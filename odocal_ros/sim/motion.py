@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav import geodesy
-from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.profile import Hills, Profile
 
 STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
@@ -162,8 +162,7 @@ def attitude(state: State) -> Floats:
 
 def velocity_n(state: State) -> Floats:
     """Return the velocity over ground of v's origin in ENU, m/s: (n, 3)."""
-    v_n: Floats = np.einsum('nij,nj->ni', attitude(state), _velocity_v(state))
-    return v_n
+    return rotate(attitude(state), _velocity_v(state))
 
 
 def _velocity_v(state: State) -> Floats:
@@ -189,29 +188,24 @@ def inertial_v(state: State,
 
     w_ie_n = geodesy.earth_rate_n(state.latitude)
     transport = geodesy.transport_rate_n(state.latitude, state.height, v_n)
-    w_in = _into(C_nv, w_ie_n + transport)
+    w_in = rotate_back(C_nv, w_ie_n + transport)
     w_v = w_in + w_nv
     gamma = geodesy.gravity(state.latitude, state.height)
     coriolis = np.cross(2 * w_ie_n + transport, v_n)
     coriolis[:, 2] += gamma
-    f_v = a_v + _into(C_nv, coriolis)
+    f_v = a_v + rotate_back(C_nv, coriolis)
 
     arm = np.asarray(lever_arm_v, dtype=float)
     if arm.any():
-        a_n = np.einsum('nij,nj->ni', C_nv, a_v)
-        dw_v = dw_nv - np.cross(w_nv, w_in) + _into(
+        a_n = rotate(C_nv, a_v)
+        dw_v = dw_nv - np.cross(w_nv, w_in) + rotate_back(
             C_nv, geodesy.transport_rate_n(state.latitude, state.height, a_n))
-        w_e = _into(C_nv, w_ie_n)
+        w_e = rotate_back(C_nv, w_ie_n)
         # the Earth's own centrifugal part is in gravity already
         f_v = f_v + (np.cross(dw_v, arm) + np.cross(w_v, np.cross(w_v, arm))
                      - np.cross(w_e, np.cross(w_e, arm))
-                     - _into(C_nv, _gravity_change(state, C_nv @ arm, gamma)))
+                     - rotate_back(C_nv, _gravity_change(state, C_nv @ arm, gamma)))
     return w_v, f_v
-
-
-def _into(C_nv: Floats, a_n: Floats) -> Floats:
-    a_v: Floats = np.einsum('nij,ni->nj', C_nv, a_n)
-    return a_v
 
 
 def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:

@@ -3,7 +3,7 @@
 
 """Distributions of the errors of random vehicles, by IMU grade; sources in docs/zoo.md."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 
-Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, fields of Real
 GRADES = ('consumer', 'industrial', 'tactical')
 # definition: units of data sheets in SI; G as rounded there, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
@@ -44,6 +43,14 @@ ROWS: dict[str, tuple[tuple[float, ...], ...]] = {
     'mounting': ((3.0, 3.0, 3.0), (1.5, 1.5, 2.0), (0.5, 0.5, 0.5)),   # deg, roll, pitch, yaw
     'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),  # fine, coarse, speeds
 }
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """An effect of a vehicle: fields of Real, and of SimOptions; none if it is absent."""
+
+    real: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

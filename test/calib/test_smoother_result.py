@@ -20,7 +20,7 @@ from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.result.estimates import estimate_constants
+from odocal_ros.estimator.result.estimates import estimate_constants, FittedConstants
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
@@ -118,11 +118,11 @@ def test_an_uncertainty_that_model_errors_increase_is_explained():
     for uncertainty, text in ((1.0, ''),
                               (2.0, '0.80 deg, including a factor of 2 for model errors; the '
                                'limit is 0.5 deg. ')):
-        _, reasons = estimate_constants(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(),
-                                        uncertainty)
-        said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
-        assert len(said) == bool(text)
-        assert all(text in one for one in said)
+        _, reasons = estimate_constants(
+            FittedConstants(np.zeros(M), sigma, np.zeros(M), uncertainty), '1', 1.0, Config())
+        texts = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
+        assert len(texts) == bool(text)
+        assert all(text in one for one in texts)
 
 
 def test_an_even_drive_straight_on_tells_no_yaw():

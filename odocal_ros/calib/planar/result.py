@@ -69,18 +69,32 @@ def _mean_scale(c: Constants) -> float:
     return len(scales) / sum(1 / value for value in scales)
 
 
-def _quantities(names: tuple[str, ...], config: Config) -> dict[str, Quantity]:
+def _select_quantities(constants: tuple[str, ...], config: Config) -> dict[str, Quantity]:
     """Return the quantities that the constants of a fit give, with one for each wheel."""
     # omni and mecanum wheels have half of the width: the lever
-    without = 'track_width' if 'wheel_1' in names else 'rotation_lever'
-    found = {name: one for name, one in QUANTITIES.items() if one.needs in names
-             and name != without}
-    wheels = [name for name in names if name.startswith('wheel_')]
-    for name, value_unit in zip(wheels, config.odometer.names(len(wheels)), strict=False):
-        found[f'scale_factor_{value_unit}'] = Quantity(
-            name, lambda c, name=name: c[name], SCALE_SIGMA_LIMIT,  # type: ignore[misc]
-            Code.PARAMETER_NOT_DETERMINED, 'straights, turns and sideways motion')
+    other_width = 'track_width' if 'wheel_1' in constants else 'rotation_lever'
+    found = {name: quantity for name, quantity in QUANTITIES.items()
+             if quantity.needs in constants and name != other_width}
+    wheels = [name for name in constants if name.startswith('wheel_')]
+    for constant, wheel in zip(wheels, config.odometer.names(len(wheels)), strict=False):
+        found[f'scale_factor_{wheel}'] = Quantity(
+            constant, lambda c, constant=constant: c[constant],  # type: ignore[misc]
+            SCALE_SIGMA_LIMIT, Code.PARAMETER_NOT_DETERMINED,
+            'straights, turns and sideways motion')
     return found
+
+
+class Value(NamedTuple):
+    """A quantity by a fit: its value, and effects of one sigma of the constants and of the law."""
+
+    value: float
+    effects: Floats      # (m,) of independent errors of the constants
+    law_sigma: float     # by the assumed law of the width, or by slopes
+
+    @property
+    def sigma(self) -> float:
+        """Return the sigma of the value."""
+        return float(np.hypot(np.linalg.norm(self.effects), self.law_sigma))
 
 
 def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
@@ -90,45 +104,63 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
 
     unit, nominal : of the scale factor.   slopes : relative shortening of the path by slopes.
     """
-    c = dict(zip(fit.names, fit.value.tolist(), strict=True))
-    estimates, effects, law_sigmas, reasons = unknown_values(unit), {}, {}, _fit_reasons(fit)
-    # a fit that has not converged has twice the sigma
-    root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
-    quantities = _quantities(fit.names, config)
+    quantities = _select_quantities(fit.names, config)
+    values = _compute_values(fit, quantities, slopes)
+    estimates, reasons = unknown_values(unit), _fit_reasons(fit)
     for name, quantity in quantities.items():
-        value, effect = quantity.value(c), _gradient(quantity, fit) @ root
-        value_unit = unit if 'scale' in name else 'm'
-        law_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
-            value - 1 / c['inverse_track_width']) * (quantity.needs == 'arc')
-        sigma = float(np.hypot(np.linalg.norm(effect), law_sigma))
+        value, sigma, value_unit = values[name].value, values[name].sigma, (
+            unit if 'scale' in name else 'm')
         if value > 0 and sigma < quantity.limit * value:
             estimates[name] = Estimate(value, sigma, value_unit)
-            effect_scale = value if name.startswith('scale_factor') else 1.0
-            effects[name], law_sigmas[name] = effect / effect_scale, law_sigma / effect_scale
         else:
             estimates[name] = Estimate(None, None, value_unit)
             reasons.append(Reason(
                 quantity.code, f'{name.replace("_", " ")}: the uncertainty is '
                 f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.limit:.0f} %',
                 f'Repeat the run with {quantity.required_motion}.'))
+    sources = _error_sources(values, estimates)
     scale = estimates['scale_factor']
-    if scale.value and slopes > np.linalg.norm(effects['scale_factor']):
+    if scale.value and slopes > np.linalg.norm(values['scale_factor'].effects / scale.value):
         reasons.append(Reason(
             Code.MODEL_MISMATCH, f'the ground is not level: slopes shorten the path by '
             f'{100 * slopes:.2g} %, which is added to the uncertainty of the scale',
             'Drive on level ground, or record an IMU.'))
     if scale.value is not None and scale.sigma is not None and nominal:
         estimates['scale_ratio'] = Estimate(scale.value / nominal, scale.sigma / nominal, '1')
-    names = tuple(quantities)
-    sources = [Source(FIT_SOURCE, np.array([effects.get(name, 0 * root[0]) for name in names]))]
-    for source, scales in ((LAW_SOURCE, False), (SLOPES, True)):
-        source_sigmas = [law_sigmas.get(name, 0.0) * (('scale' in name) == scales)
-                         for name in names]
-        if any(source_sigmas):
-            sources.append(Source(source, np.array(source_sigmas)[:, None], True))
     reasons += check_limits(estimates, nominal, config)
-    return MethodResult(PLANAR, tuple(reasons), estimates, names, tuple(sources),
-                        _details(fit, estimates, names, sources))
+    return MethodResult(PLANAR, tuple(reasons), estimates, tuple(quantities), tuple(sources),
+                        _details(fit, estimates, tuple(quantities), sources))
+
+
+def _compute_values(fit: Fit, quantities: dict[str, Quantity],
+                    slopes: float) -> dict[str, Value]:
+    """Return the quantities of a fit by name."""
+    constants = dict(zip(fit.names, fit.value.tolist(), strict=True))
+    # a fit that has not converged has twice the sigma
+    root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
+    values = {}
+    for name, quantity in quantities.items():
+        value = quantity.value(constants)
+        law_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
+            value - 1 / constants['inverse_track_width']) * (quantity.needs == 'arc')
+        values[name] = Value(value, _gradient(quantity, fit) @ root, law_sigma)
+    return values
+
+
+def _error_sources(values: dict[str, Value], estimates: dict[str, Estimate]) -> list[Source]:
+    """Return the error sources of the quantities, of ln K for scale factors; 0 of unknown ones."""
+    known = {name: one for name, one in values.items() if estimates[name].value is not None}
+    divisors = {name: one.value if name.startswith('scale_factor') else 1.0
+                for name, one in known.items()}
+    sources = [Source(FIT_SOURCE, np.array([
+        known[name].effects / divisors[name] if name in known else 0 * one.effects
+        for name, one in values.items()]))]
+    for source, of_scales in ((LAW_SOURCE, False), (SLOPES, True)):
+        sigmas = [known[name].law_sigma / divisors[name]
+                  if name in known and ('scale' in name) == of_scales else 0.0 for name in values]
+        if any(sigmas):
+            sources.append(Source(source, np.array(sigmas)[:, None], True))
+    return sources
 
 
 def refused_planar_result(reasons: Iterable[Reason], unit: str) -> MethodResult:

@@ -4,6 +4,7 @@
 """Estimates of the constants: values that the drive determines, refusals, and their reasons."""
 
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,8 +37,9 @@ OPTIONAL = range(layout.ODO_ARM.start, layout.HEADING)
 def refused_result(reasons: Iterable[Reason], scale_unit: str,
                    wheels: Iterable[Travel] = ()) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    found = without_values(scale_unit) | unknown_wheels((one.name for one in wheels), scale_unit)
-    return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
+    of_wheels = unknown_wheels((one.name for one in wheels), scale_unit)
+    return MethodResult('smoother', tuple(reasons), unknown_estimates(scale_unit) | of_wheels,
+                        PARAMETERS)
 
 
 def implausible_imu_reasons(fit: Fit) -> list[Reason]:
@@ -51,7 +53,7 @@ def implausible_imu_reasons(fit: Fit) -> list[Reason]:
                    'impossible for an IMU: a local minimum, or wrong units, axes or time offsets')]
 
 
-def without_values(scale_unit: str) -> dict[str, Estimate]:
+def unknown_estimates(scale_unit: str) -> dict[str, Estimate]:
     """Return the estimates of a leg, each without a value."""
     units = {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
         layout.CONSTANTS[i]: UNITS[layout.CONSTANTS[i]] for i in OPTIONAL}
@@ -59,39 +61,48 @@ def without_values(scale_unit: str) -> dict[str, Estimate]:
         name: Estimate(None, None, unit) for name, unit in units.items()}
 
 
-def estimate_constants(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str,
-                       nominal: float, config: Config, factor: float = 1.0,
-                       changed_angles: Collection[str] = (),
-                       ) -> tuple[dict[str, Estimate], list[Reason]]:
+@dataclass(frozen=True, eq=False)
+class FittedConstants:
+    """Constants by one or several legs: (M,) each."""
+
+    value: Floats           # ln K first, whole lever arms
+    sigma: Floats
+    sigma_ratio: Floats     # sigma of the fit over that of the prior
+    factor: float = 1.0     # on the sigmas, by model errors; angles must be determined with it
+    changed_angles: Collection[str] = ()    # names of angles that change in the leg
+
+
+def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
+                       config: Config) -> tuple[dict[str, Estimate], list[Reason]]:
     """
     Return the estimates of the constants, and the reasons for those that are not determined.
 
-    value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
-    sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :
-    limits.   factor : on the sigmas, by model errors; angles must be determined with it.
-    changed_angles : names of angles that change in the leg.
+    scale_unit, nominal : of the scale; K0, 0 unknown.   config : limits.
     """
-    K, yaw = float(np.exp(value[layout.LN_K])), float(wrap(value[layout.YAW]))
-    pitch = float(value[layout.PITCH])
-    found = without_values(scale_unit)
-    if sigma[layout.LN_K] <= SCALE_LIMIT:
-        found['scale_factor'] = Estimate(K, float(K * sigma[layout.LN_K]), scale_unit)
+    value, sigma = fitted.value, fitted.sigma
+    is_informed = fitted.sigma_ratio < INFORMED_SHARE
+    K, relative = float(np.exp(value[layout.LN_K])), float(sigma[layout.LN_K])
+    found, reasons = unknown_estimates(scale_unit), list[Reason]()
+    if relative <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, K * relative, scale_unit)
         if nominal:
-            found['scale_ratio'] = Estimate(K / nominal,
-                                            float(K / nominal * sigma[layout.LN_K]), '1')
+            found['scale_ratio'] = Estimate(K / nominal, K / nominal * relative, '1')
+    else:
+        reasons.append(Reason(
+            Code.SCALE_NOT_DETERMINED, f'scale uncertainty is {100 * relative:.0f} %, too large '
+            f'to state a value; the limit is {100 * SCALE_LIMIT:g} %'))
     # an angle with a larger sigma than half a degree and the limit is not determined
     limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
-    for name, i, angle in (('yaw_mounting_angle', layout.YAW, yaw),
-                           ('pitch_mounting_angle', layout.PITCH, pitch)):
+    for name, i, angle in (('yaw_mounting_angle', layout.YAW, wrap(value[layout.YAW])),
+                           ('pitch_mounting_angle', layout.PITCH, value[layout.PITCH])):
         # a configured mounting angle is not determined by the drive
-        if factor * sigma[i] <= limit and ratio[i] < INFORMED_SHARE:
-            found[name] = Estimate(angle, float(sigma[i]), 'rad')
+        if fitted.factor * sigma[i] <= limit and is_informed[i]:
+            found[name] = Estimate(float(angle), float(sigma[i]), 'rad')
     for i in OPTIONAL:
-        if ratio[i] < INFORMED_SHARE:
+        if is_informed[i]:
             name = layout.CONSTANTS[i]
             found[name] = Estimate(float(value[i]), float(sigma[i]), UNITS[name])
-    reasons = _scale_reasons(float(sigma[layout.LN_K]))
-    return found, reasons + _angle_reasons(sigma, limit, factor, config, yaw, changed_angles)
+    return found, reasons + _angle_reasons(fitted, limit, config)
 
 
 def configured_constants(leg: SmootherLeg) -> Floats:
@@ -128,35 +139,27 @@ def join_names(names: Iterable[str]) -> str:
     return texts[0] if len(texts) == 1 else f'{", ".join(texts[:-1])} and {texts[-1]}'
 
 
-def _scale_reasons(sigma: float) -> list[Reason]:
-    """Return the reason for a scale that is not determined; sigma : relative."""
-    if sigma <= SCALE_LIMIT:
-        return []
-    return [Reason(Code.SCALE_NOT_DETERMINED, f'scale uncertainty is {100 * sigma:.0f} %, too '
-                   f'large to state a value; the limit is {100 * SCALE_LIMIT:g} %')]
-
-
-def _angle_reasons(sigma: Floats, limit: float, factor: float, config: Config, yaw: float,
-                   changed_angles: Collection[str]) -> list[Reason]:
+def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> list[Reason]:
     """Return the reasons for mounting angles that are not determined, or far from nominal."""
-    reasons = []
+    sigma, factor, changed_angles = fitted.sigma, fitted.factor, fitted.changed_angles
+    yaw, reasons = float(wrap(fitted.value[layout.YAW])), list[Reason]()
     limit_text = (f', including a factor of {factor:.2g} for model errors' * (factor > 1)
                   + f'; the limit is {np.rad2deg(limit):.2g} deg')
-    off = abs(float(wrap(yaw - nominal_yaw(config))))
+    deviation = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[layout.YAW] > limit / factor:
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (
             'too little acceleration, or too few turns')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
                               f'{np.rad2deg(factor * sigma[layout.YAW]):.2f} deg{limit_text}. '
                               f'Likely cause: {cause}'))
-    elif off > REVERSED_YAW:
+    elif deviation > REVERSED_YAW:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
                               'directions: positive counts mean backwards, or the IMU x axis '
                               f'points backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'))
-    elif off > FAR_YAW:
+    elif deviation > FAR_YAW:
         reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+z.1f} '
-                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value; '
-                              f'the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
+                              f'deg differs by {np.rad2deg(deviation):.1f} deg from its nominal '
+                              f'value; the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
     if sigma[layout.PITCH] > limit / factor:
         reasons.append(Reason(
             Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '

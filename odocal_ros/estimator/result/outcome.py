@@ -36,6 +36,7 @@ from odocal_ros.estimator.result import odometry_output, remarks
 from odocal_ros.estimator.result.estimates import (
     configured_constants,
     estimate_constants,
+    FittedConstants,
     not_observable_reason,
     OPTIONAL,
 )
@@ -68,7 +69,7 @@ class _Posterior:
     factor: float        # on the sigmas of the fit, by contradictions of the noise model
     covariance: Floats   # (M, M)
     sigma: Floats        # (M,)
-    ratio: Floats        # (M,) sigma of the fit over that of the prior
+    sigma_ratio: Floats  # (M,) sigma of the fit over that of the prior
     beyond_fit: list[remarks.ErrorBeyondFit]
 
 
@@ -80,13 +81,13 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     sigma, grade = posterior.sigma, problem.grade if leg.has_accelerometer else None
     slips, slip_reasons = _find_slips(leg, fit, marginals, sigma)
     reasons += slip_reasons
-    reasons += remarks.remarks(problem, fit, sigma, posterior.ratio, config)
+    reasons += remarks.remarks(problem, fit, sigma, posterior.sigma_ratio, config)
     estimates, refusals = _estimate(leg, fit, posterior, config)
     wheels, of_wheels, wheel_reasons = _estimate_wheels(
         problem, fit, marginals, posterior, estimates['scale_factor'], config)
     gyro_bias, bias_ratio = _estimate_gyro_bias(fit, marginals, factor)
     estimates |= of_wheels | gyro_bias
-    ratio = {layout.CONSTANTS[i]: float(posterior.ratio[i])
+    ratio = {layout.CONSTANTS[i]: float(posterior.sigma_ratio[i])
              for i in (*OPTIONAL, *SCALES)} | bias_ratio
     reasons += [*refusals, *wheel_reasons,
                 *_without_estimate(problem, fit, sigma, ratio, estimates)]
@@ -121,9 +122,9 @@ def _estimate(leg: SmootherLeg, fit: Fit, posterior: _Posterior,
     """Return the estimates of the constants, and the reasons for those not determined."""
     changed_angles = {layout.CONSTANTS[error.constant] for error in posterior.beyond_fit
                       if error.constant != layout.LN_K}
-    estimates, reasons = estimate_constants(
-        fit.state.constants + configured_constants(leg), posterior.sigma, posterior.ratio,
-        leg.scale_unit, leg.nominal_scale, config, posterior.factor, changed_angles)
+    fitted = FittedConstants(fit.state.constants + configured_constants(leg), posterior.sigma,
+                             posterior.sigma_ratio, posterior.factor, changed_angles)
+    estimates, reasons = estimate_constants(fitted, leg.scale_unit, leg.nominal_scale, config)
     if estimates['scale_factor'].value is not None:
         estimates |= odometry_output.as_sent(leg, fit.state, posterior.covariance)
     return estimates, reasons
