@@ -81,8 +81,9 @@ class Code(Enum):
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
                                    'down in reverse and set odometer.signed.')
     ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true, or to false if it is true. If '
-                                 'the IMU x axis points backwards, set imu.mounting_rpy to [0, 0, '
-                                 '3.141592654] or imu.nominal_yaw instead.')
+                                 'the IMU x axis points backwards, change the yaw of '
+                                 'imu.mounting_rpy by 3.141592654 rad instead, or set '
+                                 'imu.nominal_yaw.')
     ODOMETER_STILL = REJECT, ('Check the wheel sensor and the odometer topic: the fixes move, '
                               'but the counter does not.')
     SEVERAL_IMUS = REJECT, ('Set imu.frame_id to the IMU to calibrate, or publish each IMU on '

@@ -37,7 +37,7 @@ GALLERY_HEAD = """# Gallery of real drives
 
 The first answer of `odocal try BAG`, without options, for each public drive of
 [recordings.md](recordings.md), which has the references, the sources and the licences. The printed
-result continues with warnings, budget and files; the report shows more curves.
+result continues with check, warnings and files; the report adds budget and curves.
 `python -m tools.real_drives --write` generates this page.
 """
 DEG = math.degrees(1.0)    # definition

@@ -108,8 +108,8 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
     if wheels_move:
         return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move',
-                       'If the vehicle moved, check the receiver: latitude and longitude in '
-                       'degrees, static hold off.'),)
+                       'If the vehicle moved, check the unit of latitude and longitude '
+                       '(degrees), and switch off static hold in the receiver.'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the vehicle did not move'),)
 
 

@@ -158,7 +158,7 @@ def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) ->
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
         raise BadData(f'{bag.name}: the recording ended at the start mark or right after it, so '
-                      'the leg is empty; drive it again (--leg : uses the data before the mark)')
+                      'the leg is empty; drive it again, or use the whole recording with --leg :')
     return legs
 
 

@@ -45,9 +45,12 @@ def _screen(found: 'Comparison') -> list[str]:
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '
              f'{counted(len(s.legs), "leg")}' for i, s in enumerate(stored, 1)]
     for change in found.changes:
-        rows = [(f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
-                 _cell(change, e.to_previous, stored)) for e in change.entries]
+        rows: list[tuple[str, ...]] = [
+            (f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
+             _cell(change, e.to_previous, stored)) for e in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
+        if len(stored) == 2:       # both are the same
+            rows = [row[:3] for row in rows]
         lines += ['', label(change.parameter), *columns(rows, ' ')]
     # a line for each value that changed
     change_texts = re.split('; (?=[a-z ]+ changed by )', found.sentence)

@@ -229,7 +229,7 @@ def _findings(found: dict[str, Any]) -> list[str]:
         return ['all data for a calibration is available'] if found['command'] else []
     lines = []
     for only, title in ((None, 'before calibrating (counts of the whole recording)'), (
-            'two_point', 'affects the two-point method only; the smoother needs none of it')):
+            'two_point', 'for the two-point method only; the smoother is not affected')):
         reasons = [reason for reason in found['findings'] if reason['only'] == only]
         lines += [title] * bool(reasons)
         for reason in reasons:

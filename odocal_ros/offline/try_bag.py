@@ -176,8 +176,11 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
                f'{", ".join(choice.other_candidates)} ({topic_option(choice.slot)})'
                for choice in choices}
     lines = ['topics']
-    for slot, topic in found['mapping'].items():
-        lines += wrapped(f'{INPUTS[slot].label}: {topic}{because.get(slot, "")}')
+    mapping = found['mapping']
+    wheels = {'odometer': 0, 'odometer_right': 1}
+    for slot in sorted(mapping, key=lambda slot: wheels.get(slot, 2)):
+        left = 'left ' * (slot == 'odometer' and 'odometer_right' in mapping)
+        lines += wrapped(f'{left}{INPUTS[slot].label}: {mapping[slot]}{because.get(slot, "")}')
     pairs = list(zip(options, options[1:], strict=False))
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)

@@ -72,8 +72,8 @@ def with_assumed_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...
     gravity_i = np.tile(up_i * G / (scale if scale > 1e-12 else 1.0), (len(leg.imu.f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
         Code.NO_ACCELEROMETER, f'the IMU {why}. The scale is estimated from gyro, odometer and '
-        'fixes on assumed level ground; yaw and pitch mounting need an accelerometer (yaw: or an '
-        'external heading)'),)
+        'fixes; the ground is assumed to be level. Yaw and pitch mounting need an '
+        'accelerometer; for the yaw an external heading is also sufficient'),)
 
 
 def settings_by_frame(fix: samples.FixSamples, config: Config) -> Config:

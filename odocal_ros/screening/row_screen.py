@@ -181,8 +181,9 @@ def _spread_packets(imu: Any, found: list[Reason]) -> Any:
     took = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
     left = np.repeat(first + count - 1, count) - np.arange(len(stamp))      # to the last
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
-                        f'{LABEL["imu"]} messages repeat the previous stamp: packets with one '
-                        'stamp, spread evenly over the time since the packet before',
+                        f'{LABEL["imu"]} messages repeat the previous stamp: all messages of '
+                        'a packet have one stamp; they were spread evenly over the time since '
+                        'the previous packet',
                         'Stamp each message with the time of its measurement.'))
     return replace(imu, stamp_ns=stamp - left * np.repeat(took // count, count))
 

@@ -200,7 +200,7 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, 
 
 
 @pytest.mark.parametrize(('imu_arm', 'part'), [
-    ((0.0, 0.0, 0.0), 'imu.lever_arm is not set: '), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm ')])
+    ((0.0, 0.0, 0.0), 'imu.lever_arm is not set and'), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm')])
 def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[CONSTANTS.index('odometer_lever_arm_x')] = 1.0

@@ -101,7 +101,7 @@ def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
     assert len(inputs.t_imu) == len(alone.t_imu) == n
     # stamps of IMUs have microseconds
     np.testing.assert_allclose(inputs.t_imu, alone.t_imu, atol=1e-6)
-    assert 'packets with one stamp' in codes[Code.STAMPS_NOT_RISING]
+    assert 'all messages of a packet have one stamp' in codes[Code.STAMPS_NOT_RISING]
 
 
 def test_duplicates_are_used_once(leg):

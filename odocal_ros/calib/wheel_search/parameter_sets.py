@@ -213,7 +213,7 @@ def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Range
     else:
         heading_range = np.deg2rad(10.0)    # if no error is stated
         heading, reason = heading_range, ('heading and mounting angle rotate the track in the '
-                                          'same way, and the angle is unknown: 10 deg')
+                                          'same way, and no error of them is stated: 10 deg')
     # an odd number has zero among its levels
     n = wheels.levels if wheels.levels < 3 else next_prime_power(wheels.levels, odd=True)
     return Ranges(np.array([scale, scale, heading]), (why, why, reason), n)

@@ -163,8 +163,9 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
     if share < OUTLIER_TIME or outlier.sum() < FEWEST_OUTLIERS:
         return []
     return [Reason(
-        Code.IMU_WORSE_THAN_GRADE, f'accelerometer errors are outliers in {100 * share:.0f} % of '
-        f'the time, up to {size.max():.2f} m/s in a second; these seconds were down-weighted',
+        Code.IMU_WORSE_THAN_GRADE, f'the accelerometer has outliers in {100 * share:.0f} % of the '
+        f'time: velocity errors of up to {size.max():.2f} m/s per second; these seconds were '
+        'down-weighted',
         'Likely cause: vibration above half the rate of the IMU (aliasing), or shocks. Use the '
         'low-pass filter of the IMU or a higher rate, and mount it firmly.')]
 

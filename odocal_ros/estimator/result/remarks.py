@@ -53,12 +53,11 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_REMEDY = (
-    'Axes: from base_link, x forward, y left, z up. {} Slip in turns (skid steering, tracks) has '
-    'the same effect; then keep the setting.')
+    'Axes: from base_link, x forward, y left, z up. {} With skid steering or tracks, slip in '
+    'turns has this effect: then keep the setting.')
 # by whether imu.lever_arm is set
-IMU_ARM = {False: 'imu.lever_arm is not set: the distance of the IMU from base_link has the same '
-                  'effect, so set it first.',
-           True: 'A wrong imu.lever_arm has the same effect; check it too.'}
+IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it first.',
+           True: 'A wrong imu.lever_arm has the same effect: check it too.'}
 
 
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
