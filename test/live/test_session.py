@@ -158,7 +158,7 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest(town):
     later = replace(whole, start_ns=whole.stop_ns, stop_ns=2 * whole.stop_ns - whole.start_ns)
     full, both = (combine([first, later], config) for first in (whole, bare))
     assert both.estimates == full.estimates
-    content = [as_json(one, config, [], '') for one in (full, both)]
+    content = [as_json(one, config, [], '2026-01-02T03:04:05+00:00') for one in (full, both)]
     assert content[0] == content[1]
     assert 'of the newest legs only, none of leg 1.' in report_html(both, config, content[1])
     track, = geojson(both, config, content[1]).values()
