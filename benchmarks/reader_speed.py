@@ -134,17 +134,32 @@ def _bag(folder, kind, minutes, camera):
     return path
 
 
+def _camera(time_ns):
+    """Return a topic of sensor_msgs/CompressedImage with 200 kB of random bytes each, as CDR."""
+    import numpy as np
+
+    from odocal_ros.bagio.encode import Topic
+    size, rng = 200_000, np.random.default_rng(1)
+    # little-endian, stamp 0, frame_id, format, length of the data
+    head = b'\0\1\0\0' + bytes(8) + b'\7\0\0\0camera\0\0' + b'\5\0\0\0jpeg\0\0\0\0' \
+        + size.to_bytes(4, 'little')
+
+    def pack(rows):
+        messages = [head + rng.bytes(size) for _ in time_ns[rows]]
+        return np.array(messages, f'V{len(head) + size}')
+    return Topic('/camera', 'sensor_msgs/msg/CompressedImage', time_ns, pack)
+
+
 def _write(path, kind, minutes, camera):
     import numpy as np
 
-    from odocal_ros.bagio.encode import camera as camera_topic
     from odocal_ros.bagio.write import drive_topics, write_bag
     from odocal_ros.sim.scenarios import SimOptions, simulate
     drive = simulate(SimOptions(scenario='town', duration=60.0 * minutes, imu_rate=200.0))
     topics = drive_topics(drive)
     if camera:
         times = np.linspace(*drive.imu.stamp_ns[[0, -1]], 5000).astype(np.int64)
-        topics.append(camera_topic('/camera', times, 200_000, np.random.default_rng(1)))
+        topics.append(_camera(times))
     path.parent.mkdir(parents=True, exist_ok=True)
     storage, compression = ('mcap', 'storage') if kind == 'zstd' else (kind, 'none')
     write_bag(path, topics, storage=storage, compression=compression)

@@ -8,7 +8,7 @@ Messages of one topic all have the same length (one frame_id, one set of joint n
 of them is one structured array; no message objects are created.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import struct
 from typing import Any
@@ -23,8 +23,7 @@ from odocal_ros.messages import cdr
 # types that are written, but not read as columns
 SCHEMAS = cdr.SCHEMAS | {
     'sensor_msgs/msg/FluidPressure': (
-        *cdr.HEADER, 'float64 fluid_pressure', 'float64 variance'),
-    'sensor_msgs/msg/CompressedImage': (*cdr.HEADER, 'string format', 'uint8[] data')}
+        *cdr.HEADER, 'float64 fluid_pressure', 'float64 variance')}
 # a column of all messages, or a function that returns the values of a slice of them
 Values = Mapping[str, NDArray[Any] | Callable[[slice], Any]]
 
@@ -125,9 +124,9 @@ def imu(name: str, samples: data.ImuSamples, frame: str = 'imu_link',
         'linear_acceleration': samples.f_i, **known})
 
 
-def heading(name: str, samples: data.HeadingSamples, frame: str = 'imu_link') -> Topic:
+def heading(name: str, samples: data.HeadingSamples) -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
-    return _stamped_topic(name, 'sensor_msgs/msg/Imu', samples, frame, {
+    return _stamped_topic(name, 'sensor_msgs/msg/Imu', samples, 'imu_link', {
         **_orientation(samples), 'angular_velocity_covariance': _not_sent,
         'linear_acceleration_covariance': _not_sent})
 
@@ -159,15 +158,13 @@ def twist(name: str, samples: data.OdometerSamples, frame: str = 'base_link') ->
                           {'twist.linear.x': samples.value})
 
 
-def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '',
-           rates: bool = False) -> Topic:
-    """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
+def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '') -> Topic:
+    """Return sensor_msgs/JointState of OdometerSamples by joint: positions only."""
     first, *_ = columns = list(wheels.values())
-    quantity = 'velocity' if rates else 'position'
     return _stamped_topic(
         name, 'sensor_msgs/msg/JointState', first, frame,
-        {quantity: lambda rows: np.column_stack([one.value[rows] for one in columns])},
-        {'name': list(wheels), quantity: len(columns)})
+        {'position': lambda rows: np.column_stack([one.value[rows] for one in columns])},
+        {'name': list(wheels), 'position': len(columns)})
 
 
 def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:
@@ -209,14 +206,3 @@ def velocity(name: str, samples: data.VelocitySamples) -> Topic:
 def pressure(name: str, samples: data.ScalarSamples) -> Topic:
     return _stamped_topic(name, 'sensor_msgs/msg/FluidPressure', samples, 'imu', {
         'fluid_pressure': samples.value, 'variance': samples.variance})
-
-
-def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generator) -> Topic:
-    """Return sensor_msgs/CompressedImage of ``size`` random bytes each, for a large bag."""
-    time_ns = np.asarray(times_ns, dtype=np.int64)
-
-    def random(rows: slice) -> NDArray[np.uint8]:
-        n = len(time_ns[rows])
-        return np.frombuffer(rng.bytes(n * size), np.uint8).reshape(n, size)
-    return _stamped_topic(name, 'sensor_msgs/msg/CompressedImage', data.Samples(time_ns, time_ns),
-                          'camera', {'data': random}, {'format': 'jpeg', 'data': size})
