@@ -138,6 +138,9 @@ def _of_timing(topic: dict[str, Any], timing: dict[str, Any]) -> Iterator[str]:
         where = 'after' if delay > 0 else 'before'
         yield (f'messages are recorded {abs(delay):.3f} s {where} the time in their header '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
+    if timing['whole_seconds']:
+        yield ('warning: all stamps are whole seconds, without the fraction: correct the driver, '
+               'or use arrival times (such as odometer.arrival_time)')
     stamp_faults = [f'{timing[key]} {what}' for key, what in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
         ('backward_steps', 'with a stamp before the previous one')) if timing[key]]

@@ -27,6 +27,9 @@ AXES = 'xyz'
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
 RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; equal stamps have such rates
 FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
+# s, judgement: less than the spread of delays if stamps are rounded down to seconds, 0.24 s;
+# epochs of a receiver at whole seconds have one of some ms
+LOST_FRACTION = 0.15
 
 
 def rate_of(count: int, seconds: float) -> float | None:
@@ -42,7 +45,7 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
 
     ``at`` is in seconds from the bag's first message; ``header_to_bag`` is the median delay from
     header stamp to recording, s, None without a header; ``arrival_jitter`` is the standard
-    deviation of arrivals without a header, s.
+    deviation of arrivals without a header, s; ``whole_seconds``: the stamps lack the fraction.
     """
     stamped = samples.stamp_ns > 0
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
@@ -54,14 +57,17 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     gaps = np.flatnonzero(step > max(gap * median_step, least_gap))
     order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     delay: Floats = np.multiply(received - stamp, 1e-9)
+    spread = None if headerless or not len(delay) else float(
+        np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4)
     # mean between the gaps: bursts and gaps are no rate
     running = float(rising.sum() - step[gaps].sum())
     return {
         'rate_hz': rate_of(len(rising) - len(gaps), running),
         'headerless': headerless,
         'header_to_bag': None if headerless or not len(delay) else median(delay),
-        'header_to_bag_spread': None if headerless or not len(delay) else float(
-            np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4),
+        'header_to_bag_spread': spread,
+        'whole_seconds': bool(len(stamp) and (spread or 0.0) > LOST_FRACTION
+                              and (stamp % 10**9 == 0).all()),
         'arrival_jitter': arrival_jitter(
             np.maximum.accumulate(stamp - start_ns) * 1e-9) if headerless else None,
         'zero_stamps': int((~stamped).sum()), 'repeated_stamps': int((step == 0).sum()),

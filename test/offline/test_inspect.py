@@ -173,6 +173,23 @@ def test_topics_that_cannot_be_combined(inspect_drive):
     assert topic(seen, '/fix')['timing']['header_to_bag'] == pytest.approx(3.0, abs=1e-3)
 
 
+@pytest.mark.parametrize('name', ['/imu/data', '/fix'])
+def test_stamps_without_the_fraction_of_a_second_are_reported(inspect_drive, name):
+    """Those of a receiver with epochs at whole seconds are not."""
+    rows = drive()
+    at_seconds = [row for row in rows if row[0] != '/fix' or row[1] % 10**9 == 2]
+    seen, text = inspect_drive(at_seconds)
+    assert topic(seen, '/fix')['rate_hz'] == pytest.approx(1.0, rel=0.01)
+    assert 'whole seconds' not in text
+    for sent, _, message in rows:
+        if sent == name:
+            message.header.stamp.nanosec = 0
+    seen, text = inspect_drive(rows)
+    found = [t['name'] for t in seen['topics'] if t.get('timing', {}).get('whole_seconds')]
+    assert found == [name]
+    assert text.count('all stamps are whole seconds') == 1
+
+
 def test_odd_stamps_and_gaps(inspect_drive):
     rows = drive()
     imu = [i for i, row in enumerate(rows) if row[0] == '/imu/data']
