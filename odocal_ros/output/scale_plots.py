@@ -75,7 +75,7 @@ def by_window(found: Floats, name: str) -> style.Drawing:
     text = ('Displacement from the fixes divided by that of the calibrated track, in windows of '
             'seconds to minutes, ± their scatter over eight parts of the leg. A level line at 0 '
             'shows that fix errors do not depend on the motion. If short windows differ, the '
-            'fixes contain an odometer, the receiver filters, or the fixes are late.')
+            'fixes contain an odometer, or are filtered or late.')
     picture = style.svg(figure, f'{name}-by-window', text)
     return 'Scale against the length of the window', text, picture
 

@@ -63,13 +63,13 @@ def test_husky(data_dir, capsys):
     assert all(leg['chord'] > 0.9 * leg['distance'] for leg in seen['straight'])
     # the whole drive gives the smoother more than its straight sides: 1.7 % instead of 3.3 %
     assert '--leg' not in seen['command']
-    alone = text[text.index('affects the two-point method only'):]
+    alone = text[text.index('for the two-point method only'):]
     for code in ('NO_STANDSTILL', 'CHORD_TOO_SHORT', 'YAW_NOT_SEPARABLE'):
         assert text.count(f'{code}:') == alone.count(f'{code}:') == 1
     seen, text = inspect(path, capsys, '--set', 'method=two_point')
     assert '--leg' in seen['command']
     assert 'mounted on its side' in text
-    assert 'affects the two-point method only' not in text
+    assert 'for the two-point method only' not in text
 
 
 @pytest.mark.parametrize('name', ['talker_mcap', 'cdr_test_mcap', 'service_events_mcap',
