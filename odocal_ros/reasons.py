@@ -174,7 +174,8 @@ class Code(Enum):
                                     'longer standstill, or another heading source.')
     HEADING_UNAVAILABLE = CAUTION, ('Check the topic or setting of the heading source, or set '
                                      'alignment.heading_source to auto.')
-    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that publishes ellipsoidal height.'
+    PITCH_NOT_DETERMINED = NOTE, ('Use positions with height: ellipsoidal height of a receiver, '
+                                  'or z.')
     SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '

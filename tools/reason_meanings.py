@@ -214,7 +214,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.HEADING_UNAVAILABLE: 'The configured heading source has no usable data; the course '
         'over ground is used.',
         Code.PITCH_NOT_DETERMINED: 'The fixes have no height, or heights that are too '
-        'inaccurate: the pitch is not stated.',
+        'inaccurate: the pitch is not stated. A z of exactly 0, as from 2D SLAM, is no height.',
         Code.SCALE_FAR_FROM_NOMINAL: 'The scale differs from its nominal value by more than '
         '`odometer.max_scale_deviation`: a unit, a gear or a wheel size is not as configured.',
         Code.YAW_FAR_FROM_NOMINAL: 'The yaw mounting angle differs by more than 20 deg from its '

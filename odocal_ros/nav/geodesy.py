@@ -130,8 +130,8 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     """
     Return latitude, longitude, rad, and height, m, from (n, 3) m in a local frame: (n,) each.
 
-    NaN for positions beyond LARGEST_FRAME, and for the height if z is 0: the positions of 2D SLAM
-    and AMCL have none.   latitude_deg : NaN for USUAL_LATITUDE_DEG.
+    NaN for positions beyond LARGEST_FRAME, and for the height if z is 0: 2D SLAM and AMCL do not
+    measure it (decision 21).   latitude_deg : NaN for USUAL_LATITUDE_DEG.
     """
     latitude = math.radians(USUAL_LATITUDE_DEG if math.isnan(latitude_deg) else latitude_deg)
     with np.errstate(invalid='ignore'):      # a signalling NaN
@@ -141,7 +141,8 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     # no matrix product: its last bits depend on the number of rows, so replay would differ
     r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
         own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
-    return geodetic_from_ecef(r_e.T)
+    lat, longitude, height = geodetic_from_ecef(r_e.T)
+    return lat, longitude, np.where(z == 0, np.nan, height)
 
 
 def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:

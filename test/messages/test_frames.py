@@ -144,7 +144,8 @@ def local(block):
 def places(reach, n=200):
     """Return positions up to a distance, at all heights of a building or a hill: (n, 3) m."""
     rng = np.random.default_rng(3)
-    return np.vstack([np.zeros(3), rng.uniform(-1, 1, (n, 3)) * [reach / 1.5, reach / 1.5, 200.0]])
+    size = [reach / 1.5, reach / 1.5, 200.0]
+    return np.vstack([[0.0, 0.0, 1.0], rng.uniform(-1, 1, (n, 3)) * size])
 
 
 @pytest.mark.parametrize('latitude_deg', [-85.0, -33.0, 0.0, 48.0, 85.0])
@@ -166,6 +167,13 @@ def test_the_core_sees_every_distance_as_the_frame_has_it(latitude_deg):
     for row in (0, 5, 9):
         own, core = (np.linalg.norm(p - p[row], axis=1) for p in (position, position_n))
         assert np.abs(core - own).max() < TENTH_MM
+
+
+def test_a_z_of_zero_is_no_height():
+    """2D SLAM and AMCL do not measure it."""
+    _, _, height = geodetic_of(np.array([[3.0, 4.0, 0.0], [3.0, 4.0, 1e-3]]), math.nan)
+    assert np.isnan(height[0])
+    assert height[1] == pytest.approx(1e-3, abs=1e-5)    # 5 m from the origin: 2 um above it
 
 
 def test_a_frame_at_the_equator_has_an_origin_too():

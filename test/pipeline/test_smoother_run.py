@@ -226,6 +226,15 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
                'scale_factor_left', 'scale_factor_right') < 3
 
 
+def test_a_robot_that_stands_for_minutes_converges():
+    """The zero z of SLAM as a height: noise of the IMU looked like a delay that grows."""
+    made = simulate(SimOptions(scenario='square', duration=600.0, imu_rate=100.0, seed=2,
+                               imu_grade='consumer', fix_noise='rtk', odometer='angle'))
+    smoother = calibrate(made.leg(), drives.configured(made)).methods['smoother']
+    assert smoother.details['iterations'] < 20
+    assert off(smoother.estimates, made, 'scale_factor', 'yaw_mounting_angle') < 3
+
+
 def test_limits_are_those_of_the_frame_the_smaller_of_both():
     config = with_settings(Config(), {'leg.min_distance': 50.0, 'reference.min_speed': 5.0})
     local = config.in_local_frame()

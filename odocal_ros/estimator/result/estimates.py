@@ -165,5 +165,5 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
             Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
             f'{np.rad2deg(factor * sigma[layout.PITCH]):.2f} deg{limit_text}',
             'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in changed_angles else
-            'Drive longer, with stops and starts. Accurate ellipsoidal heights also help.'))
+            'Drive longer, with stops and starts. Accurate heights, or z of poses, also help.'))
     return reasons
