@@ -203,6 +203,15 @@ def test_the_path_runs_on_for_the_delay_beyond_the_data():
     assert path(np.array(12.0))[0] == pytest.approx(103.0), 'no farther than the delay'
 
 
+def test_noise_within_a_second_does_not_determine_accelerometer_errors():
+    """With motion capture, derivatives of its positions by these errors contained noise."""
+    made = simulate(SimOptions(scenario='square', duration=600.0, imu_rate=100.0, seed=4,
+                               imu_grade='consumer', reference='mocap', odometer='angle'))
+    smoother = calibrate(made.leg(), drives.configured(made)).methods['smoother']
+    assert smoother.details['iterations'] < 20
+    assert off(smoother.estimates, made, 'scale_factor', 'yaw_mounting_angle') < 3
+
+
 @pytest.mark.parametrize(('reference', 'limit', 'noise'), [
     ('mocap', 1e-3, 1e-3), ('total_station', 1e-3, 2e-3), ('slam', 5e-3, None),
     ('amcl', 1e-2, None)])

@@ -65,6 +65,10 @@ class Fixes(PointRows):
             self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
+        # noise in these derivatives would determine accelerometer errors: decision 9
+        fitted = rotate(transpose(self.C), np.diff(state.v_n, axis=0)[k] / T[:, None] - g)
+        measured = point.intervals.dv[k] / T[:, None]
+        self.signal_noise = force_signals(fitted - measured) * point.fitted
         # of a receiver that smooths the mean age is a delay
         track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
@@ -107,7 +111,7 @@ class Fixes(PointRows):
         c[:, :, layout.BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
         c[:, :, layout.FIX_LAG2] = -self.by_lag
         c[:, :, layout.FIX_BY_MOTION], c[:, :, layout.FIX_TIME] = -self.by_motion, -self.by_time
-        c[:, :, layout.ACCEL] = self.C @ self.points.FF
+        c[:, :, layout.ACCEL] = self.C @ (self.points.FF + self.signal_noise * tau**2 / 2)
         return J, c
 
     @classmethod
@@ -130,6 +134,13 @@ class Fixes(PointRows):
         known = np.ones((len(self.k), 3), bool)
         known[:, 2] = self.root[:, 2, 2] > 1e-5
         return known
+
+
+def force_signals(force: Floats) -> Floats:
+    """Return derivatives of a force (m, 3) by the accelerometer constants: (m, 3, a) m/s^2."""
+    out = np.zeros((*force.shape, len(layout.ACCEL_AXIS)))
+    out[:, layout.ACCEL_AXIS, range(out.shape[2])] = force[:, layout.ACCEL_SIGNAL]
+    return out
 
 
 def antenna(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
@@ -215,11 +226,7 @@ class VelocityRows(ExternalRows):
         c[:, :, layout.YAW], c[:, :, layout.PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
         c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
         c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = faster, -by_lag
-        force, signals = rotate(transpose(C), faster - g), np.zeros((m, 3, len(layout.ACCEL_AXIS)))
-        # fitted force, (m, 3) m/s^2, by its axes
-        columns = range(len(layout.ACCEL_AXIS))
-        signals[:, layout.ACCEL_AXIS, columns] = force[:, layout.ACCEL_SIGNAL]
-        c[:, :, layout.ACCEL] = C @ signals * t
+        c[:, :, layout.ACCEL] = C @ force_signals(rotate(transpose(C), faster - g)) * t
         J, c = J[:, :2] * times, c[:, :2] * times
         c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
         return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
