@@ -82,66 +82,70 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
     lists = {name: topic_samples.values.facts(turn_rate, fixes)
              for name, topic_samples in samples_by_topic.items() if topic_samples.values}
-    if fixes and config.odometer.quantity == 'auto':
-        _set_forms(bag, samples_by_topic, lists, fixes)
-    matches = _matches(samples_by_topic, lists, fixes) if fixes else {}
+    matches = _matches(bag, samples_by_topic, lists, fixes, config) if fixes else {}
     not_following = odometer_search.topics_not_following(matches)
-    no_topic_follows = 'odometer' not in overrides and matches and not any(
-        match.follows for match in matches.values())
-    mapping, config = likely_mapping(bag.topics, config, overrides, not_following)
+    mapping, initial_config = likely_mapping(bag.topics, config, overrides, not_following)
     topics = [_topic(bag, info, samples_by_topic.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
-    found: dict[str, Any] = {
-        'bag': bag.name, 'path': path, 'files': [str(f) for f in bag.files],
-        'start': bag.start_ns * 1e-9, 'duration': (bag.end_ns - bag.start_ns) * 1e-9,
-        'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
-        'messages': sum(info.count for info in bag.topics.values()),
-        'notes': [note for note in bag.notes if isinstance(note, str)],
-        'topics': topics, 'mapping': mapping, 'still': sorted(not_following),
-        'mounting': None, 'drive': None,
-        'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
-    findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
     for facts in topics:
         if 'odometer' in facts:
             facts['odometer']['still'] = facts['name'] in not_following
         if fixes and (fields := search.get(facts['name'])) and not fields.trouble:
             facts['fields'] = fields.facts(fixes)
     odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
-    initial_config = config
+    found = _bag_facts(bag, path) | {
+        'topics': topics, 'mapping': mapping, 'still': sorted(not_following), 'mounting': None,
+        'drive': None, 'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
+    findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
+    no_topic_follows = 'odometer' not in overrides and matches and not any(
+        match.follows for match in matches.values())
     if (mapping.get('odometer') not in samples_by_topic or no_topic_follows) and (
             best := odometer_search.best_topic(topics, overrides.get('odometer', ''))):
         mapping.pop('odometer_right', None)
         mapping['odometer'] = best['name']
-        extra = search[best['name']].settings(best['fields']['found'], turn_rate)
+        options = search[best['name']].settings(best['fields']['found'], turn_rate)
     else:
-        extra = _wheel_options(samples_by_topic, mapping, config, topics, lists)
-        odometer = samples_by_topic.get(mapping.get('odometer', ''))
-        if odometer and odometer.form_by_fixes:
-            extra.append(f'odometer.quantity={odometer.form_by_fixes.quantity}')
-    if extra:
-        config = with_settings(config, dict(map(parse_set, extra)))
+        options = _wheel_options(samples_by_topic, mapping, initial_config, topics, lists)
+    config = with_settings(initial_config, dict(map(parse_set, options)))
+    if options:
         _read_again(bag, samples_by_topic, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
-        extra += inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config, found,
-                               findings)
+        options += inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config,
+                                 found, findings)
     if 'fix' in mapping:
         config = settings_by_frame(samples_by_topic[mapping['fix']].recorder.rows('fix'), config)
     findings += missing_input_reasons(found, mapping, config)
-    wheels = config.odometer.keys or any(
-        option.startswith(('odometer.left=', 'odometer.wheels=')) for option in extra)
-    ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
-    found['findings'] = [reason.as_dict() | {'only': 'two_point' if (
-        config.method != 'two_point' and reason.code in ends) else None}
-        for reason in dict.fromkeys(findings)]
+    found['findings'] = _finding_facts(findings, config, options)
     found['open'] = replay_refusal(bag.topics, initial_config, overrides)
-    found['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping, extra)
+    found['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping,
+                                      options)
     content: dict[str, Any] = plain(found)
     return content
 
 
+def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
+    return {
+        'bag': bag.name, 'path': path, 'files': [str(f) for f in bag.files],
+        'start': bag.start_ns * 1e-9, 'duration': (bag.end_ns - bag.start_ns) * 1e-9,
+        'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
+        'messages': sum(info.count for info in bag.topics.values()),
+        'notes': [note for note in bag.notes if isinstance(note, str)]}
+
+
+def _finding_facts(findings: list[Reason], config: Config,
+                   options: list[str]) -> list[dict[str, Any]]:
+    """Return findings as facts; ``only`` : the method that they affect, None: all."""
+    wheels = config.odometer.keys or any(
+        option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
+    ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
+    return [reason.as_dict() | {'only': 'two_point' if (
+        config.method != 'two_point' and reason.code in ends) else None}
+        for reason in dict.fromkeys(findings)]
+
+
 def _make_samples(bag: Bag, config: Config,
                   overrides: dict[str, str]) -> tuple[dict[str, _TopicSamples], dict[Any, Any]]:
-    """Return topic -> tap of every possible input, and topic -> error of unreadable ones."""
+    """Return topic -> samples of every possible input, and topic -> error of unusable ones."""
     slot_by_topic = {topic: slot for slot, topic in overrides.items()}
     samples_by_topic: dict[str, _TopicSamples] = {}
     refused: dict[str, str] = {}
@@ -160,7 +164,7 @@ def _make_samples(bag: Bag, config: Config,
 
 
 def _static(samples_by_topic: dict[str, _TopicSamples], bag: Bag) -> dict[str, _TopicSamples]:
-    """Return the taps of static transforms; they share the recorder of their TF topic."""
+    """Return the readers of static transforms; they share the recorder of their TF topic."""
     found = {}
     readers = {name: topic_samples.reader for name, topic_samples in samples_by_topic.items()}
     for name, reader in add_static_readers(readers, bag.topics).items():
@@ -204,32 +208,31 @@ def _topic(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
     return facts
 
 
-def _set_forms(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
-               lists: dict[str, list[dict[str, Any]]], fixes: FixPath) -> None:
-    """Set the meaning of topics of one number that follow the fixes with another one only."""
+def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
+             lists: dict[str, list[dict[str, Any]]], fixes: FixPath,
+             config: Config) -> dict[str, Match]:
+    """
+    Return the comparison of each odometer topic with the path of the fixes.
+
+    A topic of one number that follows it only with another meaning gets this meaning.
+    """
+    matches = {name: Match(float(any(one['scale'] for one in motions)), 0.0,
+                           any(one['scale'] for one in motions))
+               for name, motions in lists.items() if motions}
     for name, topic_samples in samples_by_topic.items():
-        if topic_samples.reader.form and not lists.get(name):
-            found = odometer_search.form_by_fixes(bag.topics[name],
-                                                  topic_samples.recorder.rows('odometer'),
-                                                  topic_samples.reader.form, fixes)
-            topic_samples.form_by_fixes = found if found is not topic_samples.reader.form else None
-
-
-def _matches(samples_by_topic: dict[str, _TopicSamples], lists: dict[str, list[dict[str, Any]]],
-             fixes: FixPath) -> dict[str, Match]:
-    """Return the comparison of each odometer topic with the path of the fixes."""
-    found = {name: odometer_search.match_of(topic_samples.recorder.rows('odometer'),
-                                            topic_samples.form, fixes)
-             for name, topic_samples in samples_by_topic.items()
-             if topic_samples.form and not lists.get(name)}
-    grows = {name: any(one['scale'] for one in some) for name, some in lists.items() if some}
-    return found | {name: Match(float(some), 0.0, some) for name, some in grows.items()}
+        form, rows = topic_samples.reader.form, topic_samples.recorder.rows('odometer')
+        if form and name not in matches:
+            if config.odometer.quantity == 'auto':
+                other = odometer_search.form_by_fixes(bag.topics[name], rows, form, fixes)
+                topic_samples.form_by_fixes = other if other is not form else None
+            matches[name] = odometer_search.match_of(rows, topic_samples.form or form, fixes)
+    return matches
 
 
 def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str, str],
                    config: Config, topics: list[dict[str, Any]],
                    lists: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """Return the settings for the wheels; add the travel of each joint or entry to ``topics``."""
+    """Return the settings for the odometer; add the travel of each joint to ``topics``."""
     options: list[str] = []
     is_unconfigured = not (config.odometer.keys or config.odometer.field)
     for facts in topics:
@@ -253,6 +256,9 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
                 options += (wheel_survey.wheel_settings(motions)
                             or wheel_survey.single_wheel_setting(motions,
                                                                  topic_samples.reader.wheels))
+    odometer = samples_by_topic.get(mapping.get('odometer', ''))
+    if odometer and odometer.form_by_fixes:
+        options.append(f'odometer.quantity={odometer.form_by_fixes.quantity}')
     return options
 
 
