@@ -203,10 +203,11 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, 
     ((0.0, 0.0, 0.0), 'imu.lever_arm is not set and'), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm')])
 def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
-    value[CONSTANTS.index('odometer_lever_arm_x')] = 1.0
+    value[[CONSTANTS.index(f'odometer_lever_arm_{axis}') for axis in 'xy']] = 1.0
     reason, = remarks._lever_arm_reasons(value, sigma, np.zeros(len(CONSTANTS)), with_settings(
         Config(), {'imu.lever_arm': imu_arm}))
     assert 'odometer.lever_arm x: not set, estimated +1.00' in reason.text
+    assert reason.remedy.startswith('Measure odometer.lever_arm x, y and set it. Axes: ')
     assert part in reason.remedy
 
 

@@ -7,6 +7,7 @@ Diagnostics of a fit: noise, outliers, clocks and filters, a scale that varies, 
 Also the errors of the result that the fit does not contain, and the model's floor.
 """
 
+from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
@@ -206,7 +207,7 @@ def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
 
 def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
-    texts, actions = [], []
+    texts, axes_of = [], defaultdict[tuple[str, str], list[str]](list)
     off = deviating_lever_arms(c, sigma)
     for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
                              ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
@@ -220,13 +221,16 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
             rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
             if abs(found) > most:
                 texts.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
-                actions.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
+                action = 'Ignore the estimate of {}: another error causes it.'
             elif any(arm):
                 texts.append(f'{name} {axis}: set to {value:+z.2f} m, estimated {text}{rough}')
-                actions.append(f'Measure {name} {axis} again.')
+                action = 'Measure {} again.'
             else:
                 texts.append(f'{name} {axis}: not set, estimated {text}{rough}')
-                actions.append(f'Measure {name} {axis} and set it.')
+                action = 'Measure {} and set it.'
+            axes_of[action, name].append(axis)
+    actions = [action.format(f'{name} {", ".join(axes)}')
+               for (action, name), axes in axes_of.items()]
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for', ' '.join(
         [*actions, LEVER_ARM_REMEDY.format(IMU_ARM[any(config.imu.lever_arm)])]
         if any('easure' in x for x in actions) else actions))] if texts else []
