@@ -150,8 +150,12 @@ class Comparison:
     stored: tuple[Stored, ...]       # compared calibrations
     changes: tuple[Change, ...]      # of each parameter
     notes: tuple[str, ...]           # on calibrations
-    sentence: str                    # summary
+    sentences: tuple[str, ...]       # summary: one for each value that changed, or one of all
     changed: bool | None             # any change is significant; None: nothing to compare
+
+    @property
+    def sentence(self) -> str:
+        return '; '.join(self.sentences)
 
     def to_dict(self) -> dict[str, Any]:
         names = [s.name for s in self.stored]
@@ -187,11 +191,11 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
     return Comparison(tuple(stored), tuple(found), tuple(notes(stored)), *_verdict(found, stored))
 
 
-def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | None]:
-    """Return a summary sentence, and whether any change is significant; None: not comparable."""
+def _verdict(found: list[Change], stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
+    """Return summary sentences, and whether any change is significant; None: not comparable."""
     if not found:
         return ('nothing to compare: no value exists in two calibrations that are not '
-                'rejected', None)
+                'rejected',), None
     compared = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
                 for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
     significant: dict[str, tuple[float, Change, Difference]] = {}
@@ -199,12 +203,12 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
         if difference.is_significant and size > significant.get(change.parameter, (0.0,))[0]:
             significant[change.parameter] = size, change, difference
     if significant:
-        return '; '.join(_cause(c, d, stored) for _, c, d in significant.values()), True
+        return tuple(_cause(c, d, stored) for _, c, d in significant.values()), True
     if not compared:
-        return 'nothing to compare: no sigma is known', None
+        return ('nothing to compare: no sigma is known',), None
     size, change, _ = max(compared, key=lambda one: one[0])
     return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label(change.parameter)}, '
-            f'{size:.1f} sigma'), False
+            f'{size:.1f} sigma',), False
 
 
 def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:

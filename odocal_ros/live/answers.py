@@ -94,149 +94,149 @@ def error_line(error: BaseException) -> str:
     return f'internal error, please report it: {type(error).__name__}: {text}'
 
 
-def hint(now: SessionView) -> str:
+def hint(view: SessionView) -> str:
     """Return the action: provide missing inputs, or the next step."""
-    session, state = now.session, now.session.state
+    session, state = view.session, view.session.state
     if state is State.COMPUTING:
-        return f'computing: {now.computed.words() or "started"}; the result follows on ~/status'
+        return f'computing: {view.computed.words() or "started"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.has_open_leg else 'call ~/reset')
-    if now.is_rejected_so_far:
-        return '; '.join([_fault_text(now), *now.missing[:1]])
-    if now.missing:
-        return now.missing[0]
-    if now.clocks:
-        return clock_difference_text(now.clocks)
+    if view.is_rejected_so_far:
+        return '; '.join([_fault_text(view), *view.missing[:1]])
+    if view.missing:
+        return view.missing[0]
+    if view.clocks:
+        return clock_difference_text(view.clocks)
     if state is State.RECORDING:
-        actions, facts = _recording_hint(now)
+        actions, facts = _recording_hint(view)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
-        if now.config.leg.automatic and now.imu:
+        if view.config.leg.automatic and view.imu:
             return 'start driving: a leg starts automatically'
-        if now.still_s < PREDICTED_REST_S:
+        if view.still_s < PREDICTED_REST_S:
             return (f'stand still {PREDICTED_REST_S:.0f} s before ~/start_leg '
-                    f'({now.still_s:.0f} s so far)')
+                    f'({view.still_s:.0f} s so far)')
         return 'call ~/start_leg'
-    return advice_after_result(now)
+    return advice_after_result(view)
 
 
-def hint_action_first(now: SessionView) -> str:
+def hint_action_first(view: SessionView) -> str:
     """Return the hint for a single line: in a leg the action comes before the estimate."""
-    fine = not (now.is_rejected_so_far or now.missing or now.clocks)
-    if now.session.state is State.RECORDING and fine:
-        actions, facts = _recording_hint(now)
+    fine = not (view.is_rejected_so_far or view.missing or view.clocks)
+    if view.session.state is State.RECORDING and fine:
+        actions, facts = _recording_hint(view)
         return '; '.join([*(actions or ['drive on']), *facts])
-    return hint(now)
+    return hint(view)
 
 
-def quantities_ok(now: SessionView) -> dict[str, str]:
+def quantities_ok(view: SessionView) -> dict[str, str]:
     """Return the quantities that meet their limits: of the current leg, else of the result."""
-    session = now.session
+    session = view.session
     if session.state is State.RECORDING:
-        return quantities.check_forecast(now.forecast, now.config, now.two_wheels,
-                                         now.is_rejected_so_far)
+        return quantities.check_forecast(view.forecast, view.config, view.two_wheels,
+                                         view.is_rejected_so_far)
     if session.state is not State.COMPUTING and session.calibration is not None:
-        return quantities.check_calibration(session.calibration, now.config, now.two_wheels)
+        return quantities.check_calibration(session.calibration, view.config, view.two_wheels)
     if session.state is not State.COMPUTING and session.restored is not None:
-        return quantities.check_estimates(session.restored.estimates, now.config,
-                                          now.two_wheels, session.restored.valid)
+        return quantities.check_estimates(session.restored.estimates, view.config,
+                                          view.two_wheels, session.restored.valid)
     return quantities.all_unknown()
 
 
-def metres_to_go(now: SessionView) -> float:
+def metres_to_go(view: SessionView) -> float:
     """Return the distance that the leg lacks to leg.min_distance, m; 0 without a leg."""
-    if now.session.state is not State.RECORDING:
+    if view.session.state is not State.RECORDING:
         return 0.0
-    return max(0.0, now.leg.min_distance - now.distance_m)
+    return max(0.0, view.leg.min_distance - view.distance_m)
 
 
-def seconds_to_stand(now: SessionView) -> float:
+def seconds_to_stand(view: SessionView) -> float:
     """Return the seconds of standstill still required, before the start or at the end of a leg."""
-    if now.session.state is State.RECORDING or not now.session.is_busy:
-        return max(0.0, PREDICTED_REST_S - now.still_s)
+    if view.session.state is State.RECORDING or not view.session.is_busy:
+        return max(0.0, PREDICTED_REST_S - view.still_s)
     return 0.0
 
 
-def manoeuvres(now: SessionView) -> list[str]:
+def manoeuvres(view: SessionView) -> list[str]:
     """Return the missing manoeuvres of the leg, besides metres and standstill."""
-    if now.session.state is not State.RECORDING:
+    if view.session.state is not State.RECORDING:
         return []
-    required, least = [], now.leg.min_speed
-    if now.max_speed < least:
+    required, least = [], view.leg.min_speed
+    if view.max_speed < least:
         required.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
                         f'({KMH * least:.0f} km/h)')
-    if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
+    if view.config.reference.points and len(view.session.marks_of_leg()) < FEWEST_MARKS:
         required.append('call ~/mark at rest on each point')
-    if now.two_wheels and 'smoother' in deciding_methods(now.session.config.method):
-        required += _wheel_manoeuvres(now)
-    return required + (now.forecast.manoeuvres if now.forecast else [])
+    if view.two_wheels and 'smoother' in deciding_methods(view.session.config.method):
+        required += _wheel_manoeuvres(view)
+    return required + (view.forecast.manoeuvres if view.forecast else [])
 
 
-def _wheel_manoeuvres(now: SessionView) -> list[str]:
+def _wheel_manoeuvres(view: SessionView) -> list[str]:
     """Return the manoeuvres for the wheels; before the first update only for the track width."""
-    config = now.session.config
-    wheels = None if now.forecast is None else now.forecast.wheels
+    config = view.session.config
+    wheels = None if view.forecast is None else view.forecast.wheels
     limit = quantities.QUANTITIES['left_right'].limit(config)
     required = []
     if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= limit):
         required.append(STRAIGHT)
     if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
-        required.append(TURNS if now.imu else SPOT_TURNS)
+        required.append(TURNS if view.imu else SPOT_TURNS)
     return required
 
 
-def _recording_hint(now: SessionView) -> tuple[list[str], list[str]]:
+def _recording_hint(view: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint as two lists: actions, then facts."""
-    metres, required = metres_to_go(now), manoeuvres(now)
-    facts = list(map(str, now.faults[:1]))     # a caution, or a gap
-    slow = now.max_speed < now.leg.min_speed
+    metres, required = metres_to_go(view), manoeuvres(view)
+    facts = list(map(str, view.faults[:1]))     # a caution, or a gap
+    slow = view.max_speed < view.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
             required = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in required)]
-        end = _end_text(now) if now.session.is_automatic else DRIVE_ON
+        end = _end_text(view) if view.session.is_automatic else DRIVE_ON
         return [', '.join(required), end], facts
-    if now.forecast is None:
-        return [*required, _end_text(now)], facts
-    facts.append(now.forecast.as_text(now.distance_m))
-    if now.forecast_age_s > FORECAST_OLD_S:
-        facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
-    is_last_step = now.forecast.complete or now.session.is_automatic
-    return required + ([_end_text(now)] if is_last_step else []), facts
+    if view.forecast is None:
+        return [*required, _end_text(view)], facts
+    facts.append(view.forecast.as_text(view.distance_m))
+    if view.forecast_age_s > FORECAST_OLD_S:
+        facts.append(f'estimate is {view.forecast_age_s:.0f} s old')
+    is_last_step = view.forecast.complete or view.session.is_automatic
+    return required + ([_end_text(view)] if is_last_step else []), facts
 
 
-def _fault_text(now: SessionView) -> str:
-    text = f'{now.faults[0]}. {now.faults[0].remedy.rstrip(".")}'
-    if now.session.is_automatic:
+def _fault_text(view: SessionView) -> str:
+    text = f'{view.faults[0]}. {view.faults[0].remedy.rstrip(".")}'
+    if view.session.is_automatic:
         return f'the leg will not be used: {text}; the next leg starts automatically'
     return f'call ~/cancel_leg and start again: the leg would be rejected: {text}'
 
 
-def _end_text(now: SessionView) -> str:
-    if now.session.is_automatic:
-        remaining = now.session.config.leg.automatic_minutes - now.duration_s / 60
+def _end_text(view: SessionView) -> str:
+    if view.session.is_automatic:
+        remaining = view.session.config.leg.automatic_minutes - view.duration_s / 60
         return ('the leg ends automatically at a standstill, or within '
                 f'{max(1, round(remaining))} min')
-    if now.still_s < now.session.config.leg.standstill:
+    if view.still_s < view.session.config.leg.standstill:
         return f'stand still {PREDICTED_REST_S:.0f} s at the end point, then call ~/stop_leg'
-    remaining = seconds_to_stand(now)
+    remaining = seconds_to_stand(view)
     return (f'stand still {remaining:.0f} s more, then ' if remaining >= 1
             else '') + 'call ~/stop_leg'
 
 
-def advice_after_result(now: SessionView) -> str:
+def advice_after_result(view: SessionView) -> str:
     """Return the advice after a result: the largest improvement, then the other quantities."""
-    reasons = now.session.calibration.reasons if now.session.calibration else ()
-    config = now.config
-    lacking = config.verdict.min_legs - len(now.session.legs)
+    reasons = view.session.calibration.reasons if view.session.calibration else ()
+    config = view.config
+    lacking = config.verdict.min_legs - len(view.session.legs)
     if lacking > 0:
         return f'drive {counted(lacking, "more leg")}'
     if grave := cautions(reasons):
         return grave[0].remedy
-    save = '' if config.output.autosave or now.saved else 'call ~/save, or '
+    save = '' if config.output.autosave or view.saved else 'call ~/save, or '
     text = ('drive on: legs start and end automatically' if config.leg.automatic else
             f'{save}drive another leg for a smaller sigma')
-    return '; '.join([text, *_remedies(reasons, quantities_ok(now))])
+    return '; '.join([text, *_remedies(reasons, quantities_ok(view))])
 
 
 def _remedies(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:

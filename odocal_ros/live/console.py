@@ -93,17 +93,17 @@ class Console:
         self._reported: set[Code] = set()      # logged faults of this leg
         self._withdrawn: set[Code] = set()     # logged as no longer valid
 
-    def report(self, now: SessionView, steady_ns: int) -> None:
-        self._log_faults(now)
-        for text in self._topics.new_texts(now.lost_messages, now.duplicate_publishers):
+    def report(self, view: SessionView, steady_ns: int) -> None:
+        self._log_faults(view)
+        for text in self._topics.new_texts(view.lost_messages, view.duplicate_publishers):
             self._log.warning(text)
-        if now.missing:
-            self._log_missing(now, steady_ns)
+        if view.missing:
+            self._log_missing(view, steady_ns)
         else:
-            self._log_complete(now)
+            self._log_complete(view)
 
-    def _log_missing(self, now: SessionView, steady_ns: int) -> None:
-        text = NUMBER.sub('', '; '.join(now.missing))
+    def _log_missing(self, view: SessionView, steady_ns: int) -> None:
+        text = NUMBER.sub('', '; '.join(view.missing))
         if self._missing_logged and text != self._missing_text:    # other publishers, other inputs
             self._pause_ns = SILENCE_FIRST_NS
             self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
@@ -111,34 +111,34 @@ class Console:
         if not self._due_ns:     # an input lost after the start is logged at once
             self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:
-            self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(now.missing))
+            self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(view.missing))
             self._missing_logged = True
             self._pause_ns = min(2 * self._pause_ns, SILENCE_SELDOM_NS)
             self._due_ns = steady_ns + self._pause_ns
 
-    def _log_complete(self, now: SessionView) -> None:
+    def _log_complete(self, view: SessionView) -> None:
         self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         if not self._ready:
-            rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
-            action = ('legs start and end automatically' if now.config.leg.automatic else
+            rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in view.rates_hz.items() if hz)
+            action = ('legs start and end automatically' if view.config.leg.automatic else
                     'stand still for 10 s, then call ~/start_leg')
             self._log.info(f'ready ({rates}): {action}' if rates else f'ready: {action}')
         elif self._missing_logged:
             self._log.info('all inputs are available again')
         self._ready, self._missing_logged = True, False
 
-    def _log_faults(self, now: SessionView) -> None:
+    def _log_faults(self, view: SessionView) -> None:
         """Log the problems of the current leg, each once."""
-        leg_id = now.session.leg_id
+        leg_id = view.session.leg_id
         if self._leg_id != leg_id:
             self._leg_id, self._reported, self._withdrawn = leg_id, set(), set()
-        for fault in now.faults:
+        for fault in view.faults:
             if fault.code not in self._reported:
                 self._reported.add(fault.code)
                 self._log.warning(f'leg {leg_id}: {fault}. {fault.remedy}')
-        if now.session.state is not State.RECORDING:
+        if view.session.state is not State.RECORDING:
             return
-        withdrawn = self._reported - self._withdrawn - {fault.code for fault in now.faults}
+        withdrawn = self._reported - self._withdrawn - {fault.code for fault in view.faults}
         for code in sorted(withdrawn, key=lambda code: code.name):
             self._withdrawn.add(code)
             self._log.info(f'leg {leg_id}: {code.name} no longer applies: later messages '

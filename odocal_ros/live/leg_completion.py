@@ -155,9 +155,9 @@ class LegCompletion:
             local=recording.local, imu=not inputs.without_imu)
 
     def show_status(self) -> None:
-        now = self.view()
-        self._console.report(now, time.monotonic_ns())
-        self._journal.receive(self.session, self._publishing.show_status(now))
+        view = self.view()
+        self._console.report(view, time.monotonic_ns())
+        self._journal.receive(self.session, self._publishing.show_status(view))
 
     # the processing of a leg
 
@@ -204,8 +204,8 @@ class LegCompletion:
         self._end_leg(self._mark_ns())
 
     def _end_leg(self, mark_ns: int) -> None:
-        now = self.view()
-        self._view_at_stop = replace(now, forecast=now.forecast and now.forecast.ended())
+        view = self.view()
+        self._view_at_stop = replace(view, forecast=view.forecast and view.forecast.ended())
         self.session.stop(mark_ns)
         self._running_estimate.end()
         self._close_by_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)
@@ -258,10 +258,10 @@ class LegCompletion:
                         parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)
-        now = self.view()
+        view = self.view()
         success, text = answers.result_answer(calibration, parts, self.session.leg_id,
-                                              quantities_text(answers.quantities_ok(now)),
-                                              answers.advice_after_result(now))
+                                              quantities_text(answers.quantities_ok(view)),
+                                              answers.advice_after_result(view))
         self._log.info(text)
         self._computing.answer(success, text)
         return success, text

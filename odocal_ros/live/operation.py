@@ -180,13 +180,13 @@ class Operation(AutomaticLegs):
         return self._computing.create_future(worker.PATIENCE_S)
 
     def _last_result(self) -> tuple[bool, str]:
-        session, now = self.session, self.view()
-        if now.lost:
-            raise Refused(now.lost)
-        good = quantities_text(answers.quantities_ok(now))
+        session, view = self.session, self.view()
+        if view.lost:
+            raise Refused(view.lost)
+        good = quantities_text(answers.quantities_ok(view))
         if session.calibration is not None:
             success, text = answers.result_answer(session.calibration, good=good,
-                                                  advice=answers.advice_after_result(now))
+                                                  advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
             form = self._recording.inputs.form

@@ -51,107 +51,108 @@ PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_moun
 PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 
-def calibration_status(now: SessionView) -> DiagnosticStatus:
-    session, results = now.session, now.results
-    text, ok = answers.hint(now), answers.quantities_ok(now)
+def calibration_status(view: SessionView) -> DiagnosticStatus:
+    session, results = view.session, view.results
+    text, ok = answers.hint(view), answers.quantities_ok(view)
     keys = {
-        'state': now.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
+        'state': view.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
         'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
         'marks': ','.join(map(str, session.marks)),
-        'distance_m': now.distance_m, 'duration_s': now.duration_s,
-        'imu_rate_hz': now.rates_hz.get('imu', 0.0),
-        'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
-        'fix_rate_hz': now.rates_hz.get('fix', 0.0),
-    } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(now) | {
+        'distance_m': view.distance_m, 'duration_s': view.duration_s,
+        'imu_rate_hz': view.rates_hz.get('imu', 0.0),
+        'odometer_rate_hz': view.rates_hz.get('odometer', 0.0),
+        'fix_rate_hz': view.rates_hz.get('fix', 0.0),
+    } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(view) | {
         'verdict': session.verdict(), 'hint': text,
-        'legs': results['result.legs'] if now.restored else len(session.legs),
+        'legs': results['result.legs'] if view.restored else len(session.legs),
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
-        'restored': now.restored, 'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
-        'distance_to_minimum_m': answers.metres_to_go(now),
-        'seconds_to_stand': answers.seconds_to_stand(now),
-        'required_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
-        'required_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
-        'manoeuvres': '; '.join(answers.manoeuvres(now)),
-        'observable': ', '.join(now.ability.can) if now.ability else '',
-        'not_observable': '; '.join(now.ability.cannot) if now.ability else '',
-        'messages_lost': sum(now.lost_messages.values()),
-        'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
-        'save_trouble': now.save_trouble, 'lost': now.lost,
-        'automatic': _automatic(now), 'unused': _unused(session),
+        'restored': view.restored, 'standstill_s': view.still_s, 'max_speed_mps': view.max_speed,
+        'distance_to_minimum_m': answers.metres_to_go(view),
+        'seconds_to_stand': answers.seconds_to_stand(view),
+        'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
+        'required_yaw_sigma_deg': math.degrees(view.config.verdict.max_yaw_sigma),
+        'manoeuvres': '; '.join(answers.manoeuvres(view)),
+        'observable': ', '.join(view.ability.can) if view.ability else '',
+        'not_observable': '; '.join(view.ability.cannot) if view.ability else '',
+        'messages_lost': sum(view.lost_messages.values()),
+        'missing': '; '.join(view.missing), 'reasons': _reason_codes(view), 'saved': view.saved,
+        'save_trouble': view.save_trouble, 'lost': view.lost,
+        'automatic': _automatic(view), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
-        'journal': now.journal, 'journal_trouble': now.journal_trouble,
-    } | _computing(now) | quantities.status_keys(ok) | status_keys(now.forecast,
-                                                                   now.forecast_age_s)
+        'journal': view.journal, 'journal_trouble': view.journal_trouble,
+    } | _computing(view) | quantities.status_keys(ok) | status_keys(view.forecast,
+                                                                   view.forecast_age_s)
     return DiagnosticStatus(
-        level=level(now), name=STATUS_NAME, message=sentence(now, text, ok), hardware_id='odocal',
+        level=level(view), name=STATUS_NAME, message=sentence(view, text, ok),
+        hardware_id='odocal',
         values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
 
 
-def _wheel_factors(now: SessionView) -> dict[str, object]:
+def _wheel_factors(view: SessionView) -> dict[str, object]:
     """Return the keys of more than two wheels: factor and sigma of each by its name."""
-    calibration = now.session.calibration
+    calibration = view.session.calibration
     estimates = calibration.estimates if calibration else {}
     return {f'{name}{end}': math.nan if value is None else value
             for name in wheel_factors(estimates) if name not in VALUES
             for end, value in (('', estimates[name].value), ('_sigma', estimates[name].sigma))}
 
 
-def current_value(now: SessionView, name: str) -> float:
+def current_value(view: SessionView, name: str) -> float:
     """Return a value or sigma of the result, or of the running estimate until the leg has one."""
-    if now.session.state is not State.RECORDING and now.forecast is None:
-        return float(now.results[f'result.{name}'])
-    estimate = (now.forecast.estimates if now.forecast else {}).get(name.removesuffix('_sigma'))
+    if view.session.state is not State.RECORDING and view.forecast is None:
+        return float(view.results[f'result.{name}'])
+    estimate = (view.forecast.estimates if view.forecast else {}).get(name.removesuffix('_sigma'))
     if estimate is None or estimate.value is None:
         return math.nan
     found = estimate.sigma if name.endswith('_sigma') else estimate.value
     return math.nan if found is None else float(found)
 
 
-def level(now: SessionView) -> Any:
+def level(view: SessionView) -> Any:
     """Return STALE before any message, ERROR if action is required, WARN for cautions."""
-    state = now.session.state
-    if state in (State.FAILED, State.REJECTED) or now.is_rejected_so_far:
+    state = view.session.state
+    if state in (State.FAILED, State.REJECTED) or view.is_rejected_so_far:
         return DiagnosticStatus.ERROR
-    if state is State.IDLE and not now.received:
+    if state is State.IDLE and not view.received:
         return DiagnosticStatus.STALE
-    unused = now.session.unused
+    unused = view.session.unused
     has_warning = (
-        state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
-        or now.missing or now.clocks or now.journal_trouble or now.save_trouble or now.lost
-        or now.faults or now.duplicate_publishers or _changes(now.session)
+        state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
+        or view.missing or view.clocks or view.journal_trouble or view.save_trouble or view.lost
+        or view.faults or view.duplicate_publishers or _changes(view.session)
         or unused and unused.code not in SHORT)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
-def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
+def sentence(view: SessionView, text: str, ok: dict[str, str]) -> str:
     """Return one sentence: the state, the accuracy, and the next action."""
-    session = now.session
+    session = view.session
     legs = counted(len(session.legs), 'leg')
     if session.carried:
         legs += f' and {session.carried.legs} before'
     state_text = {
         'waiting': 'Waiting',
         'idle': 'Ready',
-        'recording': f'Recording leg {session.leg_id}: {now.distance_m:.0f} m in '
-                     f'{now.duration_s:.0f} s',
+        'recording': f'Recording leg {session.leg_id}: {view.distance_m:.0f} m in '
+                     f'{view.duration_s:.0f} s',
         'computing': f'Computing leg {session.leg_id}',
         'calibrated': f'Calibrated from {legs}, {session.verdict()}',
         'rejected': 'Rejected',
         'failed': f'Failed: {session.trouble}',
-    }[now.state]
-    if now.restored and session.state is State.IDLE:
-        state_text += f', including the result restored from {now.restored}'
+    }[view.state]
+    if view.restored and session.state is State.IDLE:
+        state_text += f', including the result restored from {view.restored}'
     good = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
     troubles = [f'{statement}: {trouble}' for statement, trouble in (
-        ('the result is not saved', now.save_trouble),
-        ('the journal cannot be written', now.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (state_text, *_changes(session), good, now.lost, text,
-                                   _unused(session), *now.duplicate_publishers,
-                                   losses_text(now.lost_messages), *troubles)))
+        ('the result is not saved', view.save_trouble),
+        ('the journal cannot be written', view.journal_trouble)) if trouble]
+    return '; '.join(filter(None, (state_text, *_changes(session), good, view.lost, text,
+                                   _unused(session), *view.duplicate_publishers,
+                                   losses_text(view.lost_messages), *troubles)))
 
 
-def _computing(now: SessionView) -> dict[str, object]:
-    stage = now.computed if now.session.state is State.COMPUTING else Stage()
+def _computing(view: SessionView) -> dict[str, object]:
+    stage = view.computed if view.session.state is State.COMPUTING else Stage()
     return {'computing_stage': stage.name, 'computing_passes': stage.passes,
             'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}
 
@@ -166,18 +167,18 @@ def _unused(session: Session) -> str:
     return f'a leg was not used: {reason}' if reason else ''
 
 
-def _automatic(now: SessionView) -> str:
-    if not now.config.leg.automatic:
+def _automatic(view: SessionView) -> str:
+    if not view.config.leg.automatic:
         return ''
-    if now.session.state is not State.RECORDING:
+    if view.session.state is not State.RECORDING:
         return 'waiting'
-    return 'leg' if now.session.is_automatic else 'started by the operator'
+    return 'leg' if view.session.is_automatic else 'started by the operator'
 
 
-def _reason_codes(now: SessionView) -> str:
-    if now.session.state is State.RECORDING:
-        return ','.join(r.code.name for r in now.faults)
-    calibration = now.session.calibration
+def _reason_codes(view: SessionView) -> str:
+    if view.session.state is State.RECORDING:
+        return ','.join(r.code.name for r in view.faults)
+    calibration = view.session.calibration
     return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
 
@@ -266,13 +267,13 @@ class Publishing:
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)
 
-    def show_status(self, now: SessionView) -> DiagnosticArray:
-        array = self._array([calibration_status(now)])
+    def show_status(self, view: SessionView) -> DiagnosticArray:
+        array = self._array([calibration_status(view)])
         # the hint first: receivers of the status then have it
-        self._show(self._hint, String(data=hint_action_first(now)))
+        self._show(self._hint, String(data=hint_action_first(view)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():
-            self._show(publisher, Float64(data=current_value(now, name)))
+            self._show(publisher, Float64(data=current_value(view, name)))
         return array
 
     def _show(self, publisher: Publisher, message: Float64 | String) -> None:

@@ -4,7 +4,6 @@
 """odocal compare: changes of the vehicle since earlier calibrations."""
 
 import argparse
-import re
 from typing import TYPE_CHECKING
 
 from odocal_ros.offline.cli import print_json, print_text
@@ -52,9 +51,7 @@ def _screen(found: 'Comparison') -> list[str]:
         if len(stored) == 2:       # both are the same
             rows = [row[:3] for row in rows]
         lines += ['', label(change.parameter), *columns(rows, ' ')]
-    # a line for each value that changed
-    change_texts = re.split('; (?=[a-z ]+ changed by )', found.sentence)
-    return [*lines, '', *(f'note: {note}' for note in found.notes), *change_texts,
+    return [*lines, '', *(f'note: {note}' for note in found.notes), *found.sentences,
             *hints(found.changes, stored)]
 
 

@@ -53,8 +53,8 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
     return f'{math.degrees(sigma):.2g} deg' if head == 'yaw' else f'{100 * sigma:.2g} %'
 
 
-def _head(before: Planned) -> list[str]:
-    sigmas, two_point, a = before.sigmas, before.two_point, before.two_point.alignment
+def _head(plan: Planned) -> list[str]:
+    sigmas, two_point, a = plan.sigmas, plan.two_point, plan.two_point.alignment
     stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
     tau = sigmas.correlation_time
     noise = f'correlation time {tau:g} s' if tau else 'white'
@@ -63,7 +63,7 @@ def _head(before: Planned) -> list[str]:
              f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
              f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m at '
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
-    if 'smoother' in before.methods:
+    if 'smoother' in plan.methods:
         slip = 1000 * sigmas.slip
         no_heading_text = ' needs no heading;' if a.heading_source in ('course',
                                                                        'gyrocompass') else ''
@@ -73,18 +73,18 @@ def _head(before: Planned) -> list[str]:
     return lines
 
 
-def _methods(before: Plan) -> list[str]:
+def _methods(plan: Plan) -> list[str]:
     rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
         (name, *(_shown(p, method.estimates[p].sigma) for p in PARAMETERS))
-        for name, method in before.methods.items())]
-    return [*(table_row(row, (20, 14, 16, 16)) for row in rows), f'  (result: {_result(before)})']
+        for name, method in plan.methods.items())]
+    return [*(table_row(row, (20, 14, 16, 16)) for row in rows), f'  (result: {_result(plan)})']
 
 
-def _result(before: Plan) -> str:
+def _result(plan: Plan) -> str:
     """Return the line that names the method of each value."""
     by: dict[str | None, list[str]] = {}
     for parameter in PARAMETERS:
-        by.setdefault(before.method_of(parameter), []).append(WORDS[parameter])
+        by.setdefault(plan.method_of(parameter), []).append(WORDS[parameter])
     return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all values"} '
                      f'{"from " + method if method else "unknown"}'
                      for method, names in by.items())
@@ -100,34 +100,34 @@ def _shown(parameter: str, sigma: float | None) -> str:
     return f'{math.degrees(sigma):#.3g} deg'
 
 
-def _budgets(before: Plan) -> list[str]:
+def _budgets(plan: Plan) -> list[str]:
     """Return the main error sources of each method that will provide a value."""
     out = []
     shown = 0.01    # share of the variance from which a source has its row
-    for name in before.methods_used:
-        method = before.methods[name]
+    for name in plan.methods_used:
+        method = plan.methods[name]
         hidden = [p for p in PARAMETERS if method.estimates[p].sigma is None]
         lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
-        if lines and len(before.methods) > 1:
+        if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
         out += [*lines, ''] if lines else []
     return out
 
 
-def _improvements(before: Planned) -> list[str]:
+def _improvements(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(before.improvements, before, parameter), WORDS[parameter]
+        best, word = ranked(plan.improvements, plan, parameter), WORDS[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
-        lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
+        lines += [f'    {c.text:<58}{_shown(parameter, plan.sigma(parameter)):>10} -> '
                   f'{_shown(parameter, c.sigmas[parameter])}' for c in best[:4]]
     return lines
 
 
-def _reasons(before: Plan) -> list[str]:
+def _reasons(plan: Plan) -> list[str]:
     lines = []
-    for reason in before.reasons:
+    for reason in plan.reasons:
         lines += textwrap.wrap(f'{reason}. {reason.remedy}', 96,
                                initial_indent='  ', subsequent_indent='     ')
     return ['', *lines] if lines else []
