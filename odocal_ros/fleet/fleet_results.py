@@ -96,17 +96,15 @@ def compute_group(group: GroupJob) -> list[dict[str, Any]]:
     """Compute vehicles one after the other; write their legs as a part, return their rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
-    rows = []
-    with pq.ParquetWriter(group.part, tables.leg_schema(), compression='zstd') as writer:
-        legs: list[dict[str, Any]] = []
-        for job in group.vehicles:
-            vehicle = vehicle_of(job)
-            rows.append(vehicle.row)
-            legs += vehicle.legs
-            if group.files and vehicle.calibration is not None:
-                _write_files(vehicle, Path(group.files))
-        if legs:
-            writer.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()))
+    rows, legs = [], []
+    for job in group.vehicles:
+        vehicle = vehicle_of(job)
+        rows.append(vehicle.row)
+        legs += vehicle.legs
+        if group.files and vehicle.calibration is not None:
+            _write_files(vehicle, Path(group.files))
+    pq.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()), group.part,
+                   compression='zstd')
     return rows
 
 
