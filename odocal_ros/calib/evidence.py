@@ -20,7 +20,7 @@ from odocal_ros.calib.scale_variation import (
     SpeedScale,
     window_scale,
 )
-from odocal_ros.data.arrays import Bools, by_row, chunks, Complexes, Floats, Ints
+from odocal_ros.data.arrays import Bools, by_row, chunks, Complexes, Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import yaw_from_quat
@@ -89,7 +89,7 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     after_n, fixed_n = after(t), after(t_fix)
     yaw = np.unwrap(by_row(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
-    distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
+    distance = running_sum(np.hypot(*np.diff(after_n[:, :2], axis=0).T))[:len(t)]
     forward = _forward_directions(t_fix, t, after_n, sign)
     fix_distance = np.interp(t_fix, t, distance)
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)

@@ -23,7 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Bools, by_row, Floats, Ints
+from odocal_ros.data.arrays import Bools, by_row, Floats, Ints, running_sum
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel
@@ -139,9 +139,9 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
     means over the same few steps, so that a jump of acceleration there has no effect.
     """
-    u = np.concatenate([[0.0], np.cumsum(a) * SPIN_GRID])        # speed up to a constant
-    x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * SPIN_GRID])
-    ahead = path - x                 # its slope is odometer speed minus speed by acceleration
+    speed = running_sum(a) * SPIN_GRID        # up to a constant
+    ahead = path - running_sum((speed[:-1] + speed[1:]) / 2) * SPIN_GRID
+    # its slope is odometer speed minus speed by acceleration
     lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
     ahead = ahead[PIN_STEPS:-PIN_STEPS]
     lacked = (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID

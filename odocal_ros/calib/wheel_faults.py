@@ -36,7 +36,7 @@ from odocal_ros.calib.wheel_pair_regression import (
     WHOLE_DRIVE_SIGMAS,
     without_gyro_drift,
 )
-from odocal_ros.data.arrays import Bools, Floats, runs
+from odocal_ros.data.arrays import Bools, Floats, running_sum, runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import robust_sigma
@@ -127,9 +127,9 @@ def _events(two: WheelPair, residual: Floats, quantum_m: float,
             width: float) -> tuple[list[Event], list[Event]]:
     """Return the jumps of the difference that end, and those that may change the ratio."""
     residual = _without_slope(two, residual, quantum_m)
-    total = np.append(0.0, np.cumsum(residual))
+    total = running_sum(residual)
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
-    unknown = np.append(0, np.cumsum(~two.known))
+    unknown = running_sum(~two.known)
     hits = np.zeros(len(two.t), bool)
     windows = []
     for span in (gap + MEAN_STEPS for gap in SLIP_SPANS):
@@ -172,7 +172,7 @@ def _slope(two: WheelPair, event: Event) -> float:
 
 
 def _mean_path(two: WheelPair) -> Floats:
-    return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
+    return running_sum(np.abs(np.diff(two.left + two.right)) / 2)
 
 
 def _jump_limits(two: WheelPair, jump: Floats, span: int, quantum_m: float,
@@ -180,7 +180,7 @@ def _jump_limits(two: WheelPair, jump: Floats, span: int, quantum_m: float,
     """Return the limit of jumps between two means that occur by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     path = _mean_path(two)
-    turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
+    turned = running_sum(np.abs(np.diff(two.turn)))
     run = path[ends:][:n] - path[:n]
     spread = np.zeros(n)
     if (run > 0).any():

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, runs
+from odocal_ros.data.arrays import Floats, running_sum, runs
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import robust_fit, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH
@@ -41,7 +41,7 @@ def without_gyro_drift(two: WheelPair) -> WheelPair:
     rate = (two.turn[b] - two.turn[a]) / (two.t[b] - two.t[a])
     own = np.abs(rate - np.median(rate)) < MOST_DRIFT
     bias = np.interp(two.t[:-1], ((two.t[a] + two.t[b]) / 2)[own], rate[own])
-    return replace(two, turn=two.turn - np.append(0.0, np.cumsum(bias * two.step)))
+    return replace(two, turn=two.turn - running_sum(bias * two.step))
 
 
 def regressors(two: WheelPair, metres_per_unit: float) -> Floats:
@@ -55,7 +55,7 @@ def regressors(two: WheelPair, metres_per_unit: float) -> Floats:
     mean = (two.left + two.right) / 2
     speed = _smooth(np.gradient(mean, two.step), half)
     rate = _smooth(np.gradient(two.turn, two.step), half)
-    load = np.append(0.0, np.cumsum(metres_per_unit * (speed**2 * rate)[1:] * two.step))
+    load = running_sum(metres_per_unit * (speed**2 * rate)[1:] * two.step)
     return np.stack([two.left, two.turn, two.t - two.t[0], speed, rate, load], -1)
 
 
@@ -108,7 +108,7 @@ def find_ratio_change(two: WheelPair, signals: Floats, metres_per_unit: float,
     The change at half the path, that sigmas must include, 0 for none.   count : number of wheels
     in the mean.
     """
-    path = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
+    path = running_sum(np.abs(np.diff(two.left)))
     best = (0.0, 0.0, 0.0, 0)
     for share in np.arange(1, 8) / 8:       # of the path
         at = int(np.searchsorted(path, share * path[-1]))

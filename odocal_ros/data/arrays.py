@@ -129,6 +129,12 @@ def thinned(x: Array, rows: int) -> Array:
                           or [x])
 
 
+def running_sum(steps: Array) -> Array:
+    """Return the sums of the steps before each row, 0 first: (n, ...) to (n + 1, ...)."""
+    total = np.cumsum(steps, axis=0)
+    return np.concatenate([np.zeros((1, *total.shape[1:]), total.dtype), total])
+
+
 def reduce_columns(ufunc: np.ufunc, x: Array) -> Array:
     """Return ``ufunc.reduce(x, axis=1)``, (n, k) to (n,); numpy's own takes ten times as long."""
     return reduce(ufunc, x.T)

@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import ImuSamples
 from odocal_ros.errors import BadData
@@ -147,7 +147,7 @@ def _within(t: Floats, spans: Floats) -> Bools:
 def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n: Floats) -> float:
     """Return the angle that rotates the track of speed and yaw onto the fixes, rad."""
     step = speed[:-1] * np.diff(t)
-    track = np.concatenate([[0.0], np.cumsum(step * np.exp(1j * yaw[:-1]))])
+    track = running_sum(step * np.exp(1j * yaw[:-1]))
     inside = (t_fix >= t[0]) & (t_fix <= t[-1])
     if inside.sum() < 2:
         return 0.0

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats, runs
+from odocal_ros.data.arrays import Floats, running_sum, runs
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import running_integral
@@ -205,7 +205,7 @@ def _middle_row(drive: PlannedDrive) -> int:
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
     near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
     fast = np.flatnonzero(speed >= near_top * speed.max())
-    path_length = np.cumsum(np.abs(np.diff(drive.travel, prepend=drive.travel[0])))
+    path_length = running_sum(np.abs(np.diff(drive.travel)))
     return int(fast[np.argmin(np.abs(path_length[fast] - path_length[-1] / 2))])
 
 

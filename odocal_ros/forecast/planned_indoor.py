@@ -17,7 +17,7 @@ from odocal_ros.calib.planar.fit import fit_at, LEAST, LEVELS, priors
 from odocal_ros.calib.planar.result import make_planar_result
 from odocal_ros.calib.planar.run import make_side_wheels, Run, wheel_rows, Wheels
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints, running_sum
 from odocal_ros.errors import BadUsage
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.outcome import make_result
@@ -156,9 +156,9 @@ def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Fl
     d = motion.increments
     wheels, more = _wheels(d, robot)
     own = [*np.ones(wheels.count.shape[1]), 1 / robot.width, *more]
-    heading = np.append(0.0, np.cumsum(d[:, 2]))
+    heading = running_sum(d[:, 2])
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
-    z = np.append(0.0, np.cumsum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2)))
+    z = running_sum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2))
     state = np.column_stack([z.real, z.imag, heading, 0 * heading, 0 * heading])
     node = _position_nodes(motion, robot)
     gyro = d[:, 2] if robot.imu else np.empty(0)

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.nav.time_series import MISSING_INTERVALS
 
 LEAST_CROSSING = 0.02      # judgement: of a cell, minimum sigma of a crossing
@@ -73,7 +73,7 @@ class CoarseSpeed:
     def time_in_motion(self, t: Floats) -> Floats:
         """Return the time in motion between n times, s, negative backwards: (n - 1,)."""
         sign = np.sign(self.value)
-        total = np.append(0.0, np.cumsum((sign[1:] + sign[:-1]) / 2 * np.diff(self.t)))
+        total = running_sum((sign[1:] + sign[:-1]) / 2 * np.diff(self.t))
         return np.diff(np.interp(t, self.t, total))
 
     @cached_property
@@ -94,7 +94,7 @@ class CoarseSpeed:
         lasts = np.diff(begin, append=self.t[-1])
         power = self.step**2 / 12 * lasts * (self.value[first] != 0)
         total = np.interp(t, np.append(begin, self.t[-1]),
-                          np.append(0.0, np.cumsum(power * lasts)))
+                          running_sum(power * lasts))
         # before and after a motion the speed is within a step of zero, for an unknown time
         moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
         hidden = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from odocal_ros.data.arrays import chunks, Floats, work_array
+from odocal_ros.data.arrays import chunks, Floats, running_sum, work_array
 from odocal_ros.nav import geodesy
 from odocal_ros.nav.geodesy import C_en, GNSS_MOVES, gravity
 from odocal_ros.nav.odometer import Travel
@@ -146,7 +146,7 @@ def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | N
     s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
     sections are equal in travel, as short as possible with a median of ``least`` m between fixes.
     """
-    path_length = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
+    path_length = running_sum(np.abs(np.diff(s)))
     pieces = len(s) // 2
     while pieces and path_length[-1] > 0:
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
@@ -163,7 +163,7 @@ def level_track(travel: Floats, turned: Floats) -> Floats:
     """Return the level path of travel, (n, 2) in its units; turned : (n,) rad about up."""
     middle = (turned[1:] + turned[:-1]) / 2
     step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    return running_sum(step)
 
 
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats, runs, Values
+from odocal_ros.data.arrays import Bools, Floats, running_sum, runs, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import CoarseSpeed, find_coarse_speed, find_held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason
@@ -86,7 +86,7 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
         step = value[1:].astype(float)
     else:
         step, reasons = _counter_steps(t, value, form.modulus, name)
-    s = np.concatenate([[0.0], np.cumsum(step)]) if len(value) else np.empty(0)
+    s = running_sum(step) if len(value) else np.empty(0)
     quantum = _quantum(step) if whole and form.quantity != 'rate' else 0.0
     return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
 

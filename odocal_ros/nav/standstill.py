@@ -7,7 +7,7 @@ from functools import reduce
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, by_step, Floats, reduce_columns, runs
+from odocal_ros.data.arrays import Bools, by_step, Floats, reduce_columns, running_sum, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import integral_at
 
@@ -78,7 +78,7 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     seen = np.ones(len(rate), bool)
     if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
         dt = np.diff(t_imu)
-        unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
+        unseen = running_sum(np.where(dt > REST_WINDOW, dt, 0.0))
         seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # no data within a gap
     return mean, reduce_columns(np.logical_and, spread < REST_TURN) & seen
 

@@ -21,7 +21,7 @@ from odocal_ros.calib.planar.run import (
     Wheels,
 )
 from odocal_ros.calib.result import failed, LegResult, MethodResult, raise_on_overflow
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
 from odocal_ros.nav.time_series import integral_at
@@ -135,7 +135,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
         return 0.0
     place = median_origin(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
     variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(place[:, :2], axis=0).T)))
+    path = running_sum(np.hypot(*np.diff(place[:, :2], axis=0).T))
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
     ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
     run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
@@ -151,10 +151,10 @@ def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
     used = np.flatnonzero(np.diff(np.floor((t_fix - t_fix[0]) / gap + 1e-6), prepend=-1.0) > 0)
     kept = t_fix[used]
     parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * gap)), 1).astype(np.int64)
-    first = np.repeat(np.append(0, np.cumsum(parts)[:-1]), parts)
-    share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
+    node = running_sum(parts)
+    share = (np.arange(parts.sum()) - np.repeat(node[:-1], parts)) / np.repeat(parts, parts)
     t = np.append(np.repeat(kept[:-1], parts) + share * np.repeat(np.diff(kept), parts), kept[-1])
-    return t, np.append(0, np.cumsum(parts)), used
+    return t, node, used
 
 
 def _gyro_turns(inputs: Inputs, t: Floats) -> Floats:

@@ -18,7 +18,7 @@ from odocal_ros.calib.drive import (
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
-from odocal_ros.data.arrays import release_mapped_memory
+from odocal_ros.data.arrays import release_mapped_memory, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
@@ -143,5 +143,5 @@ def _time_of_four_fifths(track: Track, t_stop: float) -> float:
     """Return the time at which four fifths of the distance are driven, s."""
     inside = (track.t >= 0) & (track.t <= t_stop)
     s = track.s[inside]
-    path_length = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
+    path_length = running_sum(np.abs(np.diff(s)))
     return float(track.t[inside][np.searchsorted(path_length, 0.8 * path_length[-1])])

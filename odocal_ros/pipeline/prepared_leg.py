@@ -23,7 +23,7 @@ from odocal_ros.calib.track_check import (
     track_statistics,
     worse_check_reasons,
 )
-from odocal_ros.data.arrays import Bools, by_row, Floats
+from odocal_ros.data.arrays import Bools, by_row, Floats, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import (
@@ -283,7 +283,7 @@ def _compared_section(prepared: PreparedLeg, path: Path,
 
 def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
     """Return times of the track, s, and the path length up to them, m."""
-    path_length = np.append(0.0, np.cumsum(np.abs(np.diff(prepared.track.s))))
+    path_length = running_sum(np.abs(np.diff(prepared.track.s)))
     return prepared.track.t, path_length * prepared.metres_per_unit
 
 

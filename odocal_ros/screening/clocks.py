@@ -24,6 +24,7 @@ from odocal_ros.data.arrays import (
     Floats,
     Ints,
     median,
+    running_sum,
 )
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
@@ -138,7 +139,7 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
             continue
         piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # ends at a step
         lag = [abs(np.median(_lag(take(sent, piece == k)))) for k in range(len(at) + 1)]
-        shift = np.append(0, np.cumsum(np.round(moved * 1e9).astype(np.int64)))
+        shift = running_sum(np.round(moved * 1e9).astype(np.int64))
         shift -= shift[int(np.argmin(lag))]
         whole = leg.rows(slot)
         stamp_ns = whole.stamp_ns.copy()

@@ -12,7 +12,7 @@ contain no information on the scale.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Complexes, Floats
+from odocal_ros.data.arrays import Bools, Complexes, Floats, running_sum
 from odocal_ros.data.samples import FixSamples, LOCAL
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import ecef_from_geodetic, radii
@@ -189,7 +189,7 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
     path = running_integral(t, velocity_n[:, :2]) @ [1, 1j]
     V = np.diff(np.interp(t_fix[pick], t, path))
     # motion in a gap of the velocity, or of the fixes, is not measured
-    gaps, at = np.append(0, np.cumsum(np.diff(t) > VELOCITY_GAP)), t_fix[pick]
+    gaps, at = running_sum(np.diff(t) > VELOCITY_GAP), t_fix[pick]
     begin, end = np.searchsorted(t, at[:-1], side='right') - 1, np.searchsorted(t, at[1:])
     whole = (gaps[begin] == gaps[end]) & (np.diff(at) < 2 * DISPLACEMENT_WINDOW)
     V, D = V[whole], D[whole]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import bin_means, Bools, Complexes, Floats
+from odocal_ros.data.arrays import bin_means, Bools, Complexes, Floats, running_sum
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import G
 
@@ -95,7 +95,7 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
     def cut(x: NDArray[Any]) -> NDArray[Any]:
         k = len(x) // length
         return x[:k * length].reshape(k, length, *x.shape[1:])
-    psi = np.concatenate([[0.0], np.cumsum(w[:, 2]) * ROW_S])
+    psi = running_sum(w[:, 2]) * ROW_S
     turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
     tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in w.T]
     drift = _seconds(_integral(turned))         # of a bias of the gyro

@@ -12,7 +12,7 @@ rhythm. Rows of a burst that are not on it get times by their travel.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints, median, runs
+from odocal_ros.data.arrays import Bools, Floats, Ints, median, running_sum, runs
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.even_imu_times import LEAST_STEP, TESTED_ROWS
@@ -41,7 +41,7 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, foun
     else:
         step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
                 else samples.value[1:].astype(float))
-        travel = np.concatenate([[0.0], np.cumsum(step)])
+        travel = running_sum(step)
         true = _correct_bursts(t, travel, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
     named_late, named_late_share = 0.02, 0.3    # s, of an interval: larger delays are reported
@@ -80,7 +80,7 @@ def intervals(t: Floats) -> list[float]:
     # if more than half are lost, the median is not the interval
     if not even or usual < mean / 2:
         return [mean]
-    sent = np.append(0.0, np.cumsum(np.round(step / usual)))    # with the lost rows
+    sent = running_sum(np.round(step / usual))    # with the lost rows
     return [median((t[n:] - t[:-n]) / np.maximum(sent[n:] - sent[:-n], 1.0)), mean]
 
 

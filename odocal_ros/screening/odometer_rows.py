@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats, Ints, Values
+from odocal_ros.data.arrays import Bools, Floats, Ints, running_sum, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel, without_rollover
 from odocal_ros.nav.time_series import MISSING_INTERVALS
@@ -148,7 +148,7 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     if form.quantity == 'increment' and len(odd):
         step = step.copy()
         step[odd] += (before + after) / 2 * missing
-        travel = Travel(travel.t, np.concatenate([[0.0], np.cumsum(step)]), travel.quantum)
+        travel = Travel(travel.t, running_sum(step), travel.quantum)
     # speeds within a gap: uniform between adjacent ones, plus a part that grows with its length
     spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
         np.abs(before), np.abs(after)) / np.sqrt(3)
@@ -156,7 +156,7 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     if form.quantity == 'rate':
         hidden = np.copysign(_travel_below_threshold(travel, value), step)
         at = np.flatnonzero(hidden)
-        travel = replace(travel, s=travel.s + np.concatenate([[0.0], np.cumsum(hidden)]))
+        travel = replace(travel, s=travel.s + running_sum(hidden))
         lost, sigma = np.r_[lost, travel.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
     return travel, lost, sigma
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, running_sum
 from odocal_ros.nav import geodesy
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.profile import Hills, Profile
@@ -108,18 +108,18 @@ class Motion:
         nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
         self._nodes = nodes = nodes[nodes <= self.duration]
         east, north, up, turned = self._section(nodes[:-1], np.diff(nodes))
-        self._height = _running(self.start.height, up)
+        self._height = self.start.height + running_sum(up)
         middle = (self._height[1:] + self._height[:-1]) / 2
         latitude = np.full(len(nodes), self.start.latitude)
         # each round gains four digits: the radii change by 1 % per rad of latitude
         for _ in range(5):
             step, longitude = _walk_about((latitude[1:] + latitude[:-1]) / 2, middle, east, north)
-            latitude = _running(self.start.latitude, step)
+            latitude = self.start.latitude + running_sum(step)
         self._latitude = latitude
-        self._longitude = _running(self.start.longitude, longitude)
+        self._longitude = self.start.longitude + running_sum(longitude)
         # moving east turns the local level relative to the Earth by dlon * sin(lat)
-        self._turned = _running(
-            0.0, turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
+        self._turned = running_sum(
+            turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
 
     def _section(self, t: Floats, h: Floats) -> list[Floats]:
         """Return m east, north, up and rad of rotation relative to the level, from t to t + h."""
@@ -136,10 +136,6 @@ class Motion:
                     w * h * self.yaw_rate(at) * np.cos(slope)), strict=True):
                 total += part
         return sums
-
-
-def _running(first: float, steps: Floats) -> Floats:
-    return first + np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _walk_about(latitude: Floats, height: Floats, east: Floats,

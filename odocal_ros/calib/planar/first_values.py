@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.planar.run import Run
-from odocal_ros.data.arrays import Complexes, Floats, Ints
+from odocal_ros.data.arrays import Complexes, Floats, Ints, running_sum
 
 # track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
@@ -44,7 +44,7 @@ def first_values(run: Run, width: float) -> First:
     # imported here: the start of a node does not need it
     from scipy.optimize import minimize
     z = run.position[:, 0] + 1j * run.position[:, 1]
-    s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
+    s = running_sum(run.wheels.path)[run.node]
     rough = _rough(z, s)
     windows = _windows(s * rough)
     aligned = _Alignment(run, z, windows, rough)

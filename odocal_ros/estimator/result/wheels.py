@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from odocal_ros.data.arrays import by_row, Floats, Ints
+from odocal_ros.data.arrays import by_row, Floats, Ints, running_sum
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -145,11 +145,11 @@ class _Common:
         self.path = np.diff(self.mean)
         up = state.C_bv[:, 2]
         turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
-        self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
+        self.turn = np.diff(running_sum(turn)[at])
         signals = np.concatenate([motion.sums.mean_rate, motion.sums.mean_force], axis=1)
         errors = signals[:, layout.GYRO_SIGNAL] * up[list(layout.GYRO_AXIS)] * motion.T
-        ends = np.concatenate([np.zeros((1, errors.shape[1])), np.cumsum(errors, axis=0)])
-        self.turn_errors = np.diff(ends[at], axis=0)     # by units of the gyro's errors
+        # by units of the gyro's errors
+        self.turn_errors = np.diff(running_sum(errors)[at], axis=0)
         rate = (problem.rate_b - state.gyro_bias) @ up
         speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
         self.faster, self.turning = np.diff(speed[at]), np.diff(rate[at])
