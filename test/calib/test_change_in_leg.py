@@ -130,10 +130,10 @@ def test_nothing_is_said_of_a_drive_without_a_change(fitted):
 
 @pytest.mark.parametrize('deg', [1.0, -1.0])
 def test_the_sigma_of_an_imu_that_was_turned_a_little_covers_both_angles(deg):
-    truth, found, said = changed(turn=(0.0, 0.0, np.deg2rad(deg)),
+    truth, found, texts = changed(turn=(0.0, 0.0, np.deg2rad(deg)),
                                  **{'verdict.max_yaw_sigma': 0.05})
     yaw = found['yaw_mounting_angle']
-    assert 'yaw mounting angle changes by about' in said[Code.CHANGE_IN_LEG]
+    assert 'yaw mounting angle changes by about' in texts[Code.CHANGE_IN_LEG]
     for true in (truth.yaw, truth.yaw + np.deg2rad(deg)):
         assert abs(yaw.value - true) < 2 * yaw.sigma
     assert np.deg2rad(abs(deg)) / 2 < yaw.sigma < np.deg2rad(2 * abs(deg))
@@ -141,17 +141,17 @@ def test_the_sigma_of_an_imu_that_was_turned_a_little_covers_both_angles(deg):
 
 @pytest.mark.parametrize(('axis', 'name'), [(2, 'yaw'), (1, 'pitch')])
 def test_an_imu_that_was_turned_by_degrees_has_no_angle_and_the_cause(axis, name):
-    _, found, said = changed(turn=np.deg2rad(3.0) * np.eye(3)[axis])
+    _, found, texts = changed(turn=np.deg2rad(3.0) * np.eye(3)[axis])
     assert found[f'{name}_mounting_angle'].value is None
-    assert f'the {name} mounting angle changes by about' in said[Code.CHANGE_IN_LEG]
+    assert f'the {name} mounting angle changes by about' in texts[Code.CHANGE_IN_LEG]
     if name == 'yaw':
-        assert 'see CHANGE_IN_LEG' in said[Code.YAW_NOT_DETERMINED]
+        assert 'see CHANGE_IN_LEG' in texts[Code.YAW_NOT_DETERMINED]
 
 
 def test_a_scale_that_changes_is_said_with_size_and_time():
-    _, _, said = changed(scale=0.02)
-    assert 'the scale factor changes by about -1.' in said[Code.CHANGE_IN_LEG]
-    near = float(said[Code.CHANGE_IN_LEG].split('near t = ')[1].split(' s')[0])
+    _, _, texts = changed(scale=0.02)
+    assert 'the scale factor changes by about -1.' in texts[Code.CHANGE_IN_LEG]
+    near = float(texts[Code.CHANGE_IN_LEG].split('near t = ')[1].split(' s')[0])
     assert abs(near - (AFTER * DRIVE['duration'] - 20.0)) < DRIVE['duration'] / 8
 
 
@@ -160,9 +160,9 @@ def test_a_scale_that_changes_gradually_has_no_step():
     drive, config, _ = made(imu_grade='tactical', duration=400.0, fix_sigma=0.02)
     leg = drive.leg()
     arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(leg.odometer.value) - 1))
-    said = reason_texts(smooth(leg_of(recounted(leg, 1 + arch), config), config))
-    assert 'from start to end' in said[Code.SCALE_VARIES]
-    assert Code.CHANGE_IN_LEG not in said
+    texts = reason_texts(smooth(leg_of(recounted(leg, 1 + arch), config), config))
+    assert 'from start to end' in texts[Code.SCALE_VARIES]
+    assert Code.CHANGE_IN_LEG not in texts
 
 
 @pytest.mark.parametrize('constant', [LN_K, YAW])
@@ -203,8 +203,8 @@ def test_a_driver_that_decodes_each_edge_from_the_middle_of_the_drive_on(town, f
     late = leg.odometer.stamp_ns[1:] > (leg.start_ns + leg.stop_ns) // 2
     result = calibrate(recounted(leg, np.where(late, factor, 1)),
                        with_settings(Config(), {'imu.grade': town.options.imu_grade}))
-    said = [r.text for r in result.reasons if f'{factor:.2f} times as much' in r.text]
-    assert len(said) == (factor > 1)
+    texts = [r.text for r in result.reasons if f'{factor:.2f} times as much' in r.text]
+    assert len(texts) == (factor > 1)
     assert (result.verdict is Verdict.REJECTED) == (factor > 1)
 
 
@@ -216,8 +216,8 @@ def test_an_accelerometer_changes_its_unit_or_range_but_not_in_a_bend_at_one_g(t
     late = leg.imu.stamp_ns > (leg.start_ns + 2 * leg.stop_ns) // 3
     force[late] = force[late] * size + more
     result = calibrate(replace(leg, imu=replace(leg.imu, f_i=force)), Config())
-    said = [r.text[:9] for r in result.reasons if r.code is Code.IMU_UNITS]
-    assert said == ['from t = '] * (size != 1.0)
+    texts = [r.text[:9] for r in result.reasons if r.code is Code.IMU_UNITS]
+    assert texts == ['from t = '] * (size != 1.0)
     assert result.verdict is Verdict.REJECTED or size == 1.0
 
 
@@ -240,12 +240,12 @@ def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
         assert off(method, drive, name) < 3.3
         # one interval without the continuity of the bias, of 200
         assert method.estimates[name].sigma < 1.3 * plain.estimates[name].sigma
-    said = reason_texts(method)
+    texts = reason_texts(method)
     assert not {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.WHEEL_SLIP,
-                Code.CHANGE_IN_LEG} & set(said)
+                Code.CHANGE_IN_LEG} & set(texts)
     assert Code.IMU_BIAS_STEP not in reason_texts(plain)
     found = re.fullmatch(f'the {SENSORS[stepping]} bias changes by ([0-9.]+) (deg/s|m/s\\^2) near '
-                         't = ([0-9]+) s; estimated before and after', said[Code.IMU_BIAS_STEP])
+                         't = ([0-9]+) s; estimated before and after', texts[Code.IMU_BIAS_STEP])
     unit = {'deg/s': np.deg2rad(1.0), 'm/s^2': 1.0}[found[2]]
     # two digits; a step within an interval of a second
     assert float(found[1]) * unit == pytest.approx(np.linalg.norm(STEPS[stepping]), rel=0.1)

@@ -42,9 +42,9 @@ def several(*methods):
     return {m.name: m for m in methods}
 
 
-def chosen(methods, asked, name='scale_factor'):
+def chosen(methods, setting, name='scale_factor'):
     """Return the value chosen, and the methods that gave one."""
-    estimates, giving = choose(methods, asked)
+    estimates, giving = choose(methods, setting)
     return estimates[name].value, giving
 
 
@@ -70,12 +70,12 @@ def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
     assert chosen(methods, 'two_point', 'pitch_mounting_angle')[0] == 0.02
 
 
-@pytest.mark.parametrize(('asked', 'run'), [
+@pytest.mark.parametrize(('setting', 'run'), [
     ('two_point', ('two_point',)), ('wheels', ('smoother', 'two_point')),
     ('patent', ('smoother', 'two_point')), ('auto', ('smoother', 'two_point')),
     ('all', ('smoother', 'two_point'))])
-def test_the_operators_own_marks_are_always_computed(asked, run):
-    assert deciding_methods(asked, shown=True) == run
+def test_the_operators_own_marks_are_always_computed(setting, run):
+    assert deciding_methods(setting, shown=True) == run
 
 
 def test_reasons_about_a_value_that_another_method_gives_are_not_said():
@@ -164,11 +164,11 @@ def test_a_method_left_out_of_one_leg_of_two_is_said_once():
     fell = method('smoother', reasons=[REFUSED])
     one = leg(1, fell, method('two_point'),
               reasons=rejected_method_reasons(several(fell, method('two_point')), 'all'))
-    said = combine([one, leg(2, method('smoother'), method('two_point'))], ALL).reasons
-    assert [r.code for r in said if 'a loop' in r.text] == [Code.LEG_REJECTED]
-    said = combine([one], ALL)
-    assert [r.code for r in said.reasons if 'a loop' in r.text] == [Code.METHOD_REJECTED]
-    assert said.verdict is Verdict.CAUTION
+    combined = combine([one, leg(2, method('smoother'), method('two_point'))], ALL).reasons
+    assert [r.code for r in combined if 'a loop' in r.text] == [Code.LEG_REJECTED]
+    combined = combine([one], ALL)
+    assert [r.code for r in combined.reasons if 'a loop' in r.text] == [Code.METHOD_REJECTED]
+    assert combined.verdict is Verdict.CAUTION
 
 
 def driven(number, scale=0.02, sigma=2e-6, yaw=0.01, yaw_sigma=1e-4, unit='m/pulse'):
@@ -181,15 +181,15 @@ def driven(number, scale=0.02, sigma=2e-6, yaw=0.01, yaw_sigma=1e-4, unit='m/pul
         sources=(Source('fixes', np.diag([sigma, yaw_sigma])),)))
 
 
-def said(*legs):
+def inconsistencies(*legs):
     return [r.text for r in inconsistent_legs(list(enumerate(legs, 1)))]
 
 
 def test_legs_of_one_vehicle_are_fine():
     # worn and new tyres, a mounting given 4 deg of play: LEGS_DISAGREE says it and widens
-    assert said(driven(1), driven(2, scale=0.0206, yaw=0.01 + 4 * DEG)) == []
-    assert said(driven(1)) == said() == []
-    assert said(driven(1, yaw=179.9 * DEG), driven(2, yaw=-179.9 * DEG)) == []
+    assert inconsistencies(driven(1), driven(2, scale=0.0206, yaw=0.01 + 4 * DEG)) == []
+    assert inconsistencies(driven(1)) == inconsistencies() == []
+    assert inconsistencies(driven(1, yaw=179.9 * DEG), driven(2, yaw=-179.9 * DEG)) == []
 
 
 @pytest.mark.parametrize(('legs', 'text'), [
@@ -203,14 +203,14 @@ def test_legs_of_one_vehicle_are_fine():
     (({'yaw': 177 * DEG}, {'yaw': -177 * DEG}),
      'the yaw mounting of leg 2 is 6.0 deg above that of leg 1')])
 def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit(legs, text):
-    found, = said(*(driven(k, **leg) for k, leg in enumerate(legs, 1)))
+    found, = inconsistencies(*(driven(k, **leg) for k, leg in enumerate(legs, 1)))
     assert text in found
 
 
 @pytest.mark.parametrize('more', [
     {'scale': 0.03, 'sigma': 0.0021}, {'yaw': 0.5, 'yaw_sigma': 0.1}, {'yaw': None}])
 def test_what_sigmas_allow_is_no_other_vehicle(more):
-    assert said(driven(1), driven(2, **more)) == []
+    assert inconsistencies(driven(1), driven(2, **more)) == []
 
 
 def test_the_combination_is_rejected_or_its_sigma_judged():

@@ -84,11 +84,11 @@ def test_wrong_axes_that_flat_ground_does_not_show_are_a_skew_of_the_acceleromet
     made = drive(scenario='town', duration=400.0, imu_grade='industrial', slope=0.0, seed=5,
                  fix_rate=5.0, pitch=pitch * DEG)
     config = settings(made, method='smoother')
-    said = {}
+    found = {}
     for axes in (np.eye(3), AXES[name]):
         result = calibrate(with_imu(made, axes), config)
-        said[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in everything_said(result)
-    assert said == {False: (Verdict.ACCEPTED, False), True: (Verdict.CAUTION, True)}
+        found[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in everything_said(result)
+    assert found == {False: (Verdict.ACCEPTED, False), True: (Verdict.CAUTION, True)}
 
 
 @pytest.mark.parametrize('segments', [1.5, 3.0, 12.0])
@@ -153,10 +153,10 @@ def test_axes_are_those_of_the_messages_whatever_the_mounting():
     rpy = (np.pi / 2, 0.0, np.pi / 2)
     C = matrix_from_rpy(rpy).T
     for name in ('mirrored x', 'mirrored y'):
-        said = of_gyro(town(), AXES[name], C, **{'imu.mounting_rpy': rpy})
-        if Code.GYRO_SIGN in said:      # the one that turns with the course
+        reasons = of_gyro(town(), AXES[name], C, **{'imu.mounting_rpy': rpy})
+        if Code.GYRO_SIGN in reasons:      # the one that turns with the course
             continue
-        assert DO[name] in said[Code.GYRO_AXES].do, name
+        assert DO[name] in reasons[Code.GYRO_AXES].do, name
     assert not {Code.GYRO_SIGN, Code.GYRO_AXES} & set(
         of_gyro(town(), SAME, C, **{'imu.mounting_rpy': rpy}))
 

@@ -217,13 +217,13 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
                                     'gnss.lever_arm_sigma': 0.1})
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
-    said = reason_texts(found)
-    assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in said[Code.LEVER_ARM_OFF]
+    texts = reason_texts(found)
+    assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in texts[Code.LEVER_ARM_OFF]
     # the sigma of this axis is no smaller than that of its setting, but far from it
     arm = found.estimates['antenna_lever_arm_x']
     assert arm.sigma > 0.1 / 2
     assert abs(arm.value - 1.5) < 4 * arm.sigma
-    assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
+    assert 'the antenna lever arm (left, up)' in texts[Code.PARAMETER_NOT_DETERMINED]
 
     _, config, leg = made(**usual)
     found = smooth(leg, with_settings(config, {'odometer.time_sigma': 2e-3}))
@@ -239,12 +239,12 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
     leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))
     found = smooth(leg, moved)
-    said = reason_texts(found)
-    tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
+    texts = reason_texts(found)
+    tau = float(re.search(r'about (.*) s;', texts[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
-    assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in said[Code.LEVER_ARM_OFF]
-    assert ' 2.0 times as large' in said[Code.FIXES_NOISIER_THAN_SAID]
-    assert 'from low to high speed' in said[Code.SCALE_VARIES]
+    assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in texts[Code.LEVER_ARM_OFF]
+    assert ' 2.0 times as large' in texts[Code.FIXES_NOISIER_THAN_SAID]
+    assert 'from low to high speed' in texts[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']
     true = 2 * real.speed_law / 36.0**2 * FAST_SPEED
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']

@@ -132,9 +132,9 @@ def test_a_dispute_names_leg_and_parameter(legs):
     _, config, results = legs
     whole = combine_legs([results[0], moved(results[1], YAW, 0.01), results[2]],
                          [0, 1, 2], config, [4, 7, 9])
-    (said,) = disputes(whole)
-    assert said.startswith('yaw_mounting_angle: the scatter of 3 legs')
-    assert '; leg 7 differs most (+' in said
+    (text,) = disputes(whole)
+    assert text.startswith('yaw_mounting_angle: the scatter of 3 legs')
+    assert '; leg 7 differs most (+' in text
     assert whole.estimates[YAW].sigma > 0.002
     # and what is not disputed is as sharp as before
     assert whole.estimates[SCALE].sigma == pytest.approx(
@@ -159,8 +159,8 @@ def test_small_deviations_are_no_cause():
 def test_two_legs_whose_scales_differ_dispute_it(legs, off):
     _, config, (one, other, _) = legs
     whole = combine_legs([one, moved(other, SCALE, off)], [0, 1], config)
-    (said,) = disputes(whole)
-    assert said.startswith('scale_factor: the scatter of 2 legs')
+    (text,) = disputes(whole)
+    assert text.startswith('scale_factor: the scatter of 2 legs')
     e = whole.estimates[SCALE]
     assert 0.3 * abs(off) < e.sigma / e.value < 1.5 * abs(off)
     assert not disputes(combine_legs([one, other], [0, 1], config))

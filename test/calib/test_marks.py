@@ -82,11 +82,11 @@ def test_a_few_fixes_are_no_better_than_one(n, white):
     assert rms(z) < HIGH
 
 
-@pytest.mark.parametrize(('told', 'white', 'tau', 'stated'), [
+@pytest.mark.parametrize(('configured', 'white', 'tau', 'stated'), [
     (0.0, 1.0, 1.0, STATED), (30.0, 0.0, 30.0, STATED),
     (np.nan, 1.0, 1.0, STATED / 25)])       # five times too sure: the scatter widens
-def test_a_correlation_time_that_is_told_and_the_scatter_are_used(told, white, tau, stated):
-    z, _ = run(200, white, tau, told, stated)
+def test_a_correlation_time_that_is_told_and_the_scatter_are_used(configured, white, tau, stated):
+    z, _ = run(200, white, tau, configured, stated)
     assert LOW < rms(z[:, :2]) < HIGH
 
 

@@ -42,23 +42,23 @@ def received(**real):
 
 @pytest.mark.parametrize('share', [0.02, -0.003])
 def test_an_odometer_in_the_receiver_is_told_from_the_vehicles(share):
-    details, said = received(receiver_odometer=share)
+    details, texts = received(receiver_odometer=share)
     seen, time = (details[name] for name in ('fix_error_by_motion', 'fix_motion_time'))
     assert abs(seen['value'] - share) < 3 * seen['sigma'] < 0.3 * abs(share)
     assert abs(time['value'] - np.log(20.0)) < 3 * time['sigma']
-    assert f'{100 * seen["value"]:+.2f} %' in said[Code.FIXES_FOLLOW_ODOMETER]
+    assert f'{100 * seen["value"]:+.2f} %' in texts[Code.FIXES_FOLLOW_ODOMETER]
 
 
 def test_a_filter_of_position_and_velocity_is_said_with_its_time():
-    _, said = received(receiver_tracking=0.8)
-    text = said[Code.FIXES_SMOOTHED]
+    _, texts = received(receiver_tracking=0.8)
+    text = texts[Code.FIXES_SMOOTHED]
     assert 'position and velocity' in text
     assert float(re.search(r'about (.*) s;', text)[1]) == pytest.approx(0.8, rel=0.02)
 
 
 def test_of_a_plain_receiver_nothing_is_said():
-    _, said = received()
-    assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED, Code.CLOCKS_DRIFT} & said.keys()
+    _, texts = received()
+    assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED, Code.CLOCKS_DRIFT} & texts.keys()
 
 
 def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
@@ -120,16 +120,16 @@ def test_the_rate_of_a_fast_clock_is_stated_and_the_scale_is_that_of_the_wheel(n
     drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
                               duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
     result = smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
-    scale, said = result.estimates['scale_factor'], reason_texts(result)
+    scale, texts = result.estimates['scale_factor'], reason_texts(result)
     assert off(result, drive) < 3
     assert scale.sigma / scale.value < FAST / 3     # an error of FAST would show
-    text = said[Code.CLOCKS_DRIFT]
+    text = texts[Code.CLOCKS_DRIFT]
     ppm = int(text.split('clock is ')[1].split(' ppm')[0])
     sigma = int(text.split('(± ')[1].split(')')[0])
     assert text.startswith(f'{name} stamps')
     assert 'fast' in text
     assert abs(ppm - 1e6 * FAST) <= 3 * sigma + 1    # rounded to whole ppm
-    assert not {Code.WHEEL_SLIP, Code.SCALE_VARIES, Code.FIXES_NOISIER_THAN_SAID} & set(said)
+    assert not {Code.WHEEL_SLIP, Code.SCALE_VARIES, Code.FIXES_NOISIER_THAN_SAID} & set(texts)
 
 
 def test_heights_that_drift_are_found_and_the_pitch_is_within_its_sigma():
@@ -152,9 +152,9 @@ def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, 
     _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial',
                           fix_noise='rtk', slope=0.01, seed=5)
     found = smooth(replace(leg, fixes_n=leg.fixes_n * [1.0, 1.0, unit]), config)
-    said = [r for r in found.reasons if r.code is Code.MODEL_MISMATCH]
-    assert len(said) == implausible
-    for one in said:
+    texts = [r for r in found.reasons if r.code is Code.MODEL_MISMATCH]
+    assert len(texts) == implausible
+    for one in texts:
         assert 'height error of the fixes is ' in one.text
         assert one.text.endswith('(limit 50 m)')
         assert one.remedy == 'Check the unit of heights in the fix driver.'

@@ -263,8 +263,8 @@ def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
     for name in ('scale_factor', *ANGLES):
         assert kneels.estimates[name].sigma < more * stands.estimates[name].sigma
     assert off(kneels, bus) < 4
-    said = {reason.code for reason in kneels.reasons}
-    assert not said & {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.LEVER_ARM_OFF}
+    codes = {reason.code for reason in kneels.reasons}
+    assert not codes & {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.LEVER_ARM_OFF}
 
 
 @pytest.mark.core

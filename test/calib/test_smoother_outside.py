@@ -64,15 +64,15 @@ def test_a_velocity_helps_and_its_size_is_found():
     drive, without = smoothed(**SHORT)
     config = made(**SHORT)[1]
     pure = with_settings(config, {'gnss.velocity_scale_sigma': 1e-5})
-    said = fitted(with_velocity(drive, lambda e: SIGMA * e), pure)
+    measured = fitted(with_velocity(drive, lambda e: SIGMA * e), pure)
     silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), pure)
-    assert off(said, drive, *BOTH) < 3.3
-    assert sigma_of(said) < 0.9 * sigma_of(without)
+    assert off(measured, drive, *BOTH) < 3.3
+    assert sigma_of(measured) < 0.9 * sigma_of(without)
     # 1.5 thousand draws of each: 2 % of a sigma
-    assert said.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
+    assert measured.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
     assert silent.details['noise']['velocity'] == pytest.approx(0.5, abs=0.04)
-    assert sigma_of(silent) == pytest.approx(sigma_of(said), rel=0.02)
-    assert any(s.name == 'fix_velocity' for s in said.sources)
+    assert sigma_of(silent) == pytest.approx(sigma_of(measured), rel=0.02)
+    assert any(s.name == 'fix_velocity' for s in measured.sources)
     assert not {'fix_velocity', 'heading'} & {s.name for s in without.sources}
 
 

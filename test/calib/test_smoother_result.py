@@ -168,8 +168,8 @@ def test_an_imu_worse_than_its_grade_is_said():
     rng = np.random.default_rng(5)
     shaking = changed(drive.imu, f_i=lambda f: f + 0.1 * rng.standard_normal(f.shape))
     method = smooth(leg_of(replace(drive.leg(), imu=shaking), config), config)
-    said = next(r for r in method.reasons if r.code is Code.IMU_WORSE_THAN_GRADE)
-    assert 'gyro' not in said.text + said.remedy      # which is not what shakes
+    reason = next(r for r in method.reasons if r.code is Code.IMU_WORSE_THAN_GRADE)
+    assert 'gyro' not in reason.text + reason.remedy      # which is not what shakes
     assert off(method, drive, *BOTH) < 3.3
 
 
@@ -218,12 +218,12 @@ def test_equations_without_a_solution_say_the_time(monkeypatch):
             in reason.text)
 
 
-@pytest.mark.parametrize(('times', 'said'), [(30.0, False), (200.0, True)])
-def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, said):
+@pytest.mark.parametrize(('times', 'is_reported'), [(30.0, False), (200.0, True)])
+def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, is_reported):
     drive, config, _ = made(**SHORT)
     config = with_settings(config, {'imu.grade': 'industrial'})
     bias = times * np.radians(20.0) / 3600.0        # rad/s: of the grade's; sold with 0.1 deg/s
     turning = changed(drive.imu, w_i=lambda w: w + [0.0, bias, 0.0])
     method = smooth(leg_of(replace(drive.leg(), imu=turning), config), config)
-    assert (Code.IMU_WORSE_THAN_GRADE in reason_texts(method)) == said
+    assert (Code.IMU_WORSE_THAN_GRADE in reason_texts(method)) == is_reported
     assert off(method, drive, *BOTH) < 3.3

@@ -38,7 +38,7 @@ def slipping(leg, begin, length, share):
     return replace(leg, travel=travel), spun[-1]
 
 
-def said(method, code=Code.WHEEL_SLIP):
+def reason_text(method, code=Code.WHEEL_SLIP):
     return reason_texts(method).get(code, '')
 
 
@@ -56,14 +56,14 @@ def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share
     # knows a way of 10 s to some decimetres
     assert metres == pytest.approx(pulses * drive.truth.scale, rel=0.25, abs=0.3)
     assert begin - 2.0 <= slips[0]['t'] <= begin + length
-    assert f'{slips[0]["metres"]:+.2f} m at t = {slips[0]["t"]:.0f} s' in said(method)
+    assert f'{slips[0]["metres"]:+.2f} m at t = {slips[0]["t"]:.0f} s' in reason_text(method)
 
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
 def test_slip_at_starts_is_said(noise):
     drive, method = smoothed(**SHORT, fix_noise=noise, start_slip=0.005)
-    assert 'slip while accelerating or braking' in said(method)
-    assert not said(method, Code.SPEED_FILTERED)
+    assert 'slip while accelerating or braking' in reason_text(method)
+    assert not reason_text(method, Code.SPEED_FILTERED)
     assert off(method, drive) < 3.3
 
 
@@ -91,7 +91,7 @@ def shaken(leg):
 def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
     drive, config, leg = made(**SHORT, fix_noise=noise)
     method = smooth(shaken(leg), config)
-    assert not said(method)
+    assert not reason_text(method)
     assert 'aliasing' in ' '.join(r.remedy for r in method.reasons
                                   if r.code is Code.IMU_WORSE_THAN_GRADE)
     assert off(method, drive, 'scale_factor', 'yaw_mounting_angle') < 3.3
@@ -112,7 +112,7 @@ def test_a_level_that_no_row_determines_is_not_reported():
     config = settings(drive, None)
     method = smooth(leg_of(drive.leg(), config), config)
     assert method.details['noise']['along_hard'] == pytest.approx(0.01)     # where the fit began
-    assert not said(method)
+    assert not reason_text(method)
 
 
 def test_travel_that_a_counter_loses_without_braking_is_no_slip():
@@ -124,8 +124,8 @@ def test_travel_that_a_counter_loses_without_braking_is_no_slip():
     at = next(k for k in range(100) if least[k] > -0.1 and speed[k:k + 8].min() > 4.0)
     leg, _ = slipping(leg, t[at] + 3.0, 3.0, -0.1)
     method = smooth(leg, config)
-    assert not said(method)
-    assert 'without braking' in said(method, Code.TRAVEL_MISSING)
+    assert not reason_text(method)
+    assert 'without braking' in reason_text(method, Code.TRAVEL_MISSING)
 
 
 @pytest.mark.parametrize('forward', [1.0, -1.0])
@@ -152,8 +152,8 @@ def test_a_speed_that_is_held_before_stops_is_no_slip():
     leg = replace(drive, wheels=(replace(rows, value=value),)).leg()
     config = settings(drive, None)
     method = smooth(leg_of(leg, config), config)
-    assert not said(method)
-    assert 'while it brakes to a stop' in said(method, Code.TRAVEL_EXCESS)
+    assert not reason_text(method)
+    assert 'while it brakes to a stop' in reason_text(method, Code.TRAVEL_EXCESS)
     assert off(method, drive) < 3.3
 
 
@@ -171,11 +171,11 @@ def test_what_a_filter_leaves_when_the_speed_changes_is_no_slip():
     for _ in range(3):
         leg = low_passed(leg, 0.2)
     method = smooth(leg, config)
-    assert said(method, Code.SPEED_FILTERED)
+    assert reason_text(method, Code.SPEED_FILTERED)
     noise = method.details['noise']
     # m/sqrt(s), what changes of speed add
     assert np.sqrt(noise['along_hard']**2 - noise['along']**2) > 0.006
-    assert not said(method)
+    assert not reason_text(method)
 
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
@@ -183,9 +183,9 @@ def test_a_low_pass_filter_is_named_and_no_slip(noise):
     _, config, leg = made(**SHORT, fix_noise=noise)
     method = smooth(low_passed(leg, 0.4), config)
     # the fit's delay and noise take some of it
-    seconds = said(method, Code.SPEED_FILTERED).split('about ')[1].split(' s')[0]
+    seconds = reason_text(method, Code.SPEED_FILTERED).split('about ')[1].split(' s')[0]
     assert float(seconds) == pytest.approx(0.4, abs=0.04)
-    assert not said(method)
+    assert not reason_text(method)
     assert not method.details['slips']
 
 
@@ -193,7 +193,7 @@ def test_slip_of_a_filtered_odometer_is_said():
     drive, config, leg = made(**SHORT)
     slipped, pulses = slipping(leg, 100.0, 3.0, 0.2)
     method = smooth(low_passed(slipped, 0.4), config)
-    assert said(method, Code.SPEED_FILTERED)
+    assert reason_text(method, Code.SPEED_FILTERED)
     first = method.details['slips'][0]
     assert first['metres'] == pytest.approx(pulses * drive.truth.scale, rel=0.3)
     assert 98.0 <= first['t'] <= 103.0

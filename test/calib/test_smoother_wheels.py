@@ -142,14 +142,14 @@ def pair(delta=2e-3, sigma=1e-6, width=1.6, width_sigma=1e-3):
             for name, side in zip(SIDES, (1, -1), strict=True)}
 
 
-def said(wheels, scale=SCALE, **changed_settings):
+def estimate(wheels, scale=SCALE, **changed_settings):
     config = with_settings(Config(), {k.replace('__', '.'): v
                                       for k, v in changed_settings.items()})
     return wheel_result.wheel_estimates(SIDES, wheels, scale, config)
 
 
 def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
-    found, reasons = said(pair(sigma=2e-4))
+    found, reasons = estimate(pair(sigma=2e-4))
     assert reasons == []
     left = found['scale_factor_left']
     assert left.value == pytest.approx(0.02 / 1.002)
@@ -159,15 +159,16 @@ def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
 
 def test_wheels_that_are_not_known_are_not_stated_and_said():
     # right by left is off by twice what either is off: 2.5 % is half of 5 %
-    near, _ = said(pair(sigma=0.0124))
+    near, _ = estimate(pair(sigma=0.0124))
     assert near['scale_factor_left'].value is not None
     for wheels, text in ((pair(sigma=0.0126), '2.5 %'), ({}, 'is not known')):
-        found, (reason,) = said(wheels)
+        found, (reason,) = estimate(wheels)
         assert found == wheel_result.unknown_wheels(SIDES, 'm/pulse')
         assert reason.code is Code.WHEELS_NOT_SEPARABLE
         assert text in reason.text
     # why there is no scale the method says itself
-    assert said(pair(), Estimate(None, None, '1')) == (wheel_result.unknown_wheels(SIDES, '1'), [])
+    unknown = Estimate(None, None, '1')
+    assert estimate(pair(), unknown) == (wheel_result.unknown_wheels(SIDES, '1'), [])
 
 
 @pytest.mark.parametrize(('width', 'sigma', 'given', 'code'), [
@@ -176,18 +177,18 @@ def test_wheels_that_are_not_known_are_not_stated_and_said():
     (-1.6, 1e-3, 0.0, Code.TRACK_WIDTH_NOT_DETERMINED),
     (1.6, 0.017, 1.6, None)])                               # the tape knows it to 0.032 m
 def test_a_width_that_is_not_known_is_not_stated(width, sigma, given, code):
-    found, reasons = said(pair(width=width, width_sigma=sigma), odometer__track_width=given)
+    found, reasons = estimate(pair(width=width, width_sigma=sigma), odometer__track_width=given)
     assert found['track_width'].value is None
     assert found['scale_factor_left'].value is not None
     assert [r.code for r in reasons] == ([code] if code else [])
 
 
 def test_a_width_far_from_the_one_given_is_said():
-    found, (reason,) = said(pair(width=1.72), odometer__track_width=1.6)
+    found, (reason,) = estimate(pair(width=1.72), odometer__track_width=1.6)
     assert found['track_width'].value == pytest.approx(1.72)
     assert reason.code is Code.TRACK_WIDTH_FAR_FROM_GIVEN
     # 3 sigma of a tape of 2 %: 0.096 m
-    assert said(pair(width=1.69), odometer__track_width=1.6)[1] == []
+    assert estimate(pair(width=1.69), odometer__track_width=1.6)[1] == []
 
 
 def leg_of(wheels):

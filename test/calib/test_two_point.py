@@ -159,8 +159,8 @@ def test_heights_that_give_a_pitch_beyond_the_limit_reject_the_method():
 def test_a_closed_loop_is_refused_with_what_would_help():
     made = drives.drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
     result = calibrate(made.leg(), drives.settings(made))
-    said = drives.everything_said(result)
-    assert 'less than a fifth of the' in said[Code.CHORD_TOO_SHORT]
+    texts = drives.everything_said(result)
+    assert 'less than a fifth of the' in texts[Code.CHORD_TOO_SHORT]
     assert '--leg' in Code.CHORD_TOO_SHORT.remedy
     assert all(e.value is None for e in result.methods['two_point'].estimates.values())
     assert result.verdict.value == 'rejected'
@@ -176,8 +176,8 @@ def test_a_track_that_loops_where_the_fixes_do_not_is_refused():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
     spun = drives.changed(made.imu, w_i=lambda a: a + [0.0, 0.0, 0.5] * (
         drives.seconds(made.leg(), made.imu) > 5.0)[:, None])
-    said = drives.everything_said(calibrate(replace(made.leg(), imu=spun), drives.settings(made)))
-    assert 'dead-reckoned track' in said[Code.CHORD_TOO_SHORT]
+    texts = drives.everything_said(calibrate(replace(made.leg(), imu=spun), drives.settings(made)))
+    assert 'dead-reckoned track' in texts[Code.CHORD_TOO_SHORT]
 
 
 @pytest.mark.parametrize(('sigma', 'given'), [(0.05, False), (0.004, True)])

@@ -64,7 +64,7 @@ def assert_place(slips, begin, length, size, loose_s, loose_m):
     assert abs(slips.end[0] - begin - length) < loose_s
 
 
-def said(made, **wheels):
+def texts_of(made, **wheels):
     """Return what screening says of a leg whose counters are changed."""
     leg = made.leg()
     leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
@@ -75,13 +75,13 @@ def said(made, **wheels):
 @pytest.mark.parametrize('side', ['left', 'right'])
 def test_a_wheel_that_never_counts_or_counts_down_is_named(side):
     slot = 'odometer' if side == 'left' else 'odometer_right'
-    text = said(drive(**TOWN), **{slot: lambda a: a * 0})[Code.WHEEL_DEAD]
+    text = texts_of(drive(**TOWN), **{slot: lambda a: a * 0})[Code.WHEEL_DEAD]
     assert text.startswith(f'the {side} wheel does not count: its travel is 0 % of that of the ')
     assert '(limit 2 %)' in text
-    text = said(drive(**TOWN), **{slot: lambda a: -a})[Code.WHEEL_REVERSED]
+    text = texts_of(drive(**TOWN), **{slot: lambda a: -a})[Code.WHEEL_REVERSED]
     assert text.startswith(f'the {side} wheel counts down')
     # two reversed wheels are not for this check
-    both = said(drive(**TOWN), odometer=lambda a: -a, odometer_right=lambda a: -a)
+    both = texts_of(drive(**TOWN), odometer=lambda a: -a, odometer_right=lambda a: -a)
     assert not {Code.WHEEL_REVERSED, Code.WHEEL_DEAD} & set(both)
 
 
@@ -93,7 +93,7 @@ def test_a_wheel_that_dies_on_the_way_is_named_with_its_time():
     def dies(a):
         a[k:] = a[k]
     moves = np.flatnonzero(np.diff(made.odometer.value[k:]) > 0)[0]     # stands at a light?
-    text = said(made, odometer=dies)[Code.WHEEL_DEAD]
+    text = texts_of(made, odometer=dies)[Code.WHEEL_DEAD]
     at = float(text.removeprefix('the left wheel does not count from t = ').split()[0])
     # rows of 0.05 s, cells of 0.5 s, and the cell in which it dies holds counts still
     assert abs(at - t[k + moves]) < 1.1
@@ -111,7 +111,7 @@ def test_a_wheel_that_hangs_for_seconds_is_named_with_time_and_length():
     def hangs(value):
         value[b:] -= value[b] - value[a]
         value[a:b] = value[a]
-    text = said(made, odometer_right=hangs)[Code.WHEEL_DEAD]
+    text = texts_of(made, odometer_right=hangs)[Code.WHEEL_DEAD]
     assert 'right wheel does not count 1 time, first from t = ' in text
     begin, length = (float(text.split(x)[1].split()[0]) for x in ('t = ', ' s for '))
     assert abs(begin - t[a]) < 1.1
@@ -205,12 +205,13 @@ def test_a_gyro_that_warms_up_is_no_slip():
     assert not found.change
 
 
-@pytest.mark.parametrize(('length', 'told'), [(8.0, True), (18.0, False)])
-def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(length, told):
+@pytest.mark.parametrize(('length', 'certain'), [(8.0, True), (18.0, False)])
+def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(length, certain):
     """Acceleration tells of a slip's begin and end; over many seconds it drifts too far."""
     options = TOWN | {'seed': 3}
     (reason,), slips = faults(options, left=spun(options, 100.0, length, 0.5 * length))
-    assert reason.text.startswith('the left wheel spins' if told else 'one of the wheels deviates')
+    assert reason.text.startswith('the left wheel spins' if certain else
+                                  'one of the wheels deviates')
     # scrub in turns may be a hundredth of the track width times the turn of 90 deg: 3 cm
     assert_place(slips, 100.0, length, 0.5 * length, 0.2 * length, 0.1)
 
@@ -251,7 +252,7 @@ def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
 def test_one_counter_sent_twice_is_no_second_wheel():
     options = TOWN | {'seed': 3}
     left = drive(**options).odometer.value
-    assert 'one counter is sent twice' in said(
+    assert 'one counter is sent twice' in texts_of(
         drive(**options), odometer_right=lambda _: left)[Code.WHEEL_DEAD]
     inputs = prepared(**options)[0]
     copied = np.floor(inputs.travels[0].s / 2)      # in another resolution: not to the digit
@@ -290,9 +291,9 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w * [1, 1, 1e-3]))
     result = calibrate(leg, settings(made, method='smoother'))
     assert result.methods == {}
-    said = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
-    assert 'turns by the gyro are only' in said.text
-    assert 'gyro_scale' not in said.do
+    reason = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
+    assert 'turns by the gyro are only' in reason.text
+    assert 'gyro_scale' not in reason.do
 
 
 def with_gyro_noise(sigma, grade):

@@ -93,8 +93,8 @@ def test_a_heading_that_nobody_knows_is_found(heading):
 def test_a_search_without_end_ends_and_says_so():
     leg = on_a_plane()
     found = search(replace(leg, scale_left=0.4, scale_right=0.4), RANGES)
-    said = {r.code: r.text for r in found.reasons}
-    assert 'widest range' in said[Code.SEARCH_NOT_SETTLED]
+    texts = {r.code: r.text for r in found.reasons}
+    assert 'widest range' in texts[Code.SEARCH_NOT_SETTLED]
     assert found.refined.on_edge
     assert_allclose(found.refined.half[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)

@@ -218,7 +218,7 @@ def test_a_coarse_scale_is_said_in_per_cent():
         'OK: scale 9900 ppm (limit 1000)')
 
 
-def said(forecast, **more):
+def hint_text(forecast, **more):
     session = Session()
     session.start(1, Config())
     known = {'distance_m': 300.0, 'max_speed': 10.0, 'forecast': forecast}
@@ -243,19 +243,19 @@ def said(forecast, **more):
      'scale is not determined yet; drive 240 m more to reach the limit of 1000 ppm; yaw: '
      'limited by the heading uncertainty (1 deg)')])
 def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
-    assert said(forecast, still_s=still_s) == text
+    assert hint_text(forecast, still_s=still_s) == text
 
 
 def test_the_least_leg_comes_first():
-    assert said(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
+    assert hint_text(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
         'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then drive on, with '
         'stops and left and right turns, until this hint shows OK for scale and yaw')
 
 
 def test_the_distance_decreases_between_updates():
     forecast = Forecast(MORE, YAW, distance_m=300.0)
-    assert 'drive 140 m more' in said(forecast, distance_m=400.0)
-    assert 'drive on to reach the limit of 1000 ppm' in said(forecast, distance_m=600.0)
+    assert 'drive 140 m more' in hint_text(forecast, distance_m=400.0)
+    assert 'drive on to reach the limit of 1000 ppm' in hint_text(forecast, distance_m=600.0)
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():

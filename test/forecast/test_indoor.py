@@ -78,15 +78,15 @@ def test_marks_determine_the_width_by_squares_and_not_by_an_eight():
     assert eight.sigma('scale_factor') is None
 
 
-@pytest.mark.parametrize(('asked', 'said'), [
+@pytest.mark.parametrize(('options', 'message'), [
     ({'run': 'circle'}, '--indoor circle: required: one of all, straight'),
     ({'reference': 'gps'}, '--reference gps: required: one of mocap'),
     ({'size': 0.0}, '--size 0: required: a number above 0'),
     ({'size': 1e9}, 'more than ten hours'),
     ({'track_width': 0.0}, '--track-width')])
-def test_wrong_figures_are_refused(asked, said):
-    with pytest.raises(BadUsage, match=said):
-        plan_indoor(**asked)
+def test_wrong_figures_are_refused(options, message):
+    with pytest.raises(BadUsage, match=message):
+        plan_indoor(**options)
 
 
 @pytest.fixture(scope='module')

@@ -191,7 +191,7 @@ def test_seconds_to_stand():
 
 # what a drive can tell as configured
 
-@pytest.mark.parametrize(('settings', 'received', 'said'), [
+@pytest.mark.parametrize(('settings', 'received', 'expected'), [
     ({}, {}, 'observable: the scale and the pitch; not observable: the yaw (the only heading is '
      'the course over ground, which includes it: set alignment.heading_source)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {},
@@ -215,11 +215,11 @@ def test_seconds_to_stand():
      {'two_wheels': True}, 'observable: the scale, the yaw (from the configured heading, 0.11 '
      'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
      'their mean)')])
-def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, said):
+def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, expected):
     monkeypatch.setattr(quantities, 'METHODS', ('two_point',))
     known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
     text = find_observable(with_settings(CONFIG, settings), known).as_text()
-    assert text.startswith(said) if said.endswith(', ') else text == said
+    assert text.startswith(expected) if expected.endswith(', ') else text == expected
 
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):

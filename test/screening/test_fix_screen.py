@@ -122,8 +122,8 @@ def test_fixes_of_a_tunnel_are_not_used_and_said(scenario, noise):
                                real=real))
     inputs, reasons = screen(made.leg(), configured(made))
     off = (made.truth.start_ns - made.imu.stamp_ns[0]) * 1e-9
-    said = [r for r in reasons if r.code is Code.FIXES_DEAD_RECKONED]
-    assert len(said) == 1
+    texts = [r for r in reasons if r.code is Code.FIXES_DEAD_RECKONED]
+    assert len(texts) == 1
     inside = (inputs.t_fix > 115.0 - off) & (inputs.t_fix < 175.0 - off)
     assert not inside.any()
     assert inputs.fixes_rejected == len(made.fix.stamp_ns) - len(inputs.t_fix)
@@ -138,9 +138,9 @@ def drive(request):
 def screened(drive, change, **options):
     leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=change)
     inputs, found = screen(leg, settings(drive, None, **options))
-    said = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
-    assert len(said) == (not len(inputs.external['fix_velocity'].t))
-    return said
+    texts = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
+    assert len(texts) == (not len(inputs.external['fix_velocity'].t))
+    return texts
 
 
 @pytest.mark.parametrize('factor', [1.0, 1.05, 0.95])

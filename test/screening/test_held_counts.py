@@ -51,9 +51,9 @@ def test_a_counter_read_at_5_hz_and_published_at_50_hz_is_no_slip():
     slow = replace(leg, odometer=replace(leg.odometer, value=leg.odometer.value[read]))
     result, plain = (calibrate(one, settings(made, heading_sigma=None, method='smoother'))
                      for one in (slow, leg))
-    said = everything_said(result)
+    texts = everything_said(result)
     assert not {Code.WHEEL_SLIP, Code.TRAVEL_MISSING, Code.TOPIC_GAP, Code.ODOMETER_LATE} & set(
-        said)
+        texts)
     found, exact = (one.methods['smoother'].estimates['scale_factor'] for one in (result, plain))
     assert abs(found.value - exact.value) < exact.sigma
     assert found.sigma < 1.5 * exact.sigma      # with the repeated rows: 2.6 times

@@ -118,9 +118,9 @@ def test_a_leg_says_so_and_knows_of_no_slip(yaw, code):
 def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
     made = town(40.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto'))
-    said = everything_said(result)
-    assert Code.WHEEL_SLIP not in said
-    assert Code.YAW_FAR_FROM_NOMINAL in said
+    texts = everything_said(result)
+    assert Code.WHEEL_SLIP not in texts
+    assert Code.YAW_FAR_FROM_NOMINAL in texts
     assert off(result.methods['smoother'], made, 'yaw_mounting_angle') < 4
     # an IMU that faces backwards, and is said to
     made = town(180.0)
@@ -158,12 +158,12 @@ def test_a_moved_imu_rejects_the_leg_with_the_time(rpy_deg, text, share):
     leg = moved(made, rpy_deg, share)
     result = calibrate(leg, settings(made))
     assert rejecting(result) == {Code.IMU_AXES}
-    said = everything_said(result)[Code.IMU_AXES]
-    begin, end = (float(x) for x in said.split('t = ')[1].split(' s:')[0].split(' to '))
+    reason_text = everything_said(result)[Code.IMU_AXES]
+    begin, end = (float(x) for x in reason_text.split('t = ')[1].split(' s:')[0].split(' to '))
     at = (leg.imu.stamp_ns[int(share * len(leg.imu.stamp_ns))] - leg.start_ns) * 1e-9
-    angle = float(said.split('turns by ')[1].split()[0])
+    angle = float(reason_text.split('turns by ')[1].split()[0])
     assert abs(angle - float(text.split('turns by ')[1].split()[0])) < 10.0
-    assert said.startswith(text.split(' by ')[0])
+    assert reason_text.startswith(text.split(' by ')[0])
     tenth = (leg.stop_ns - leg.start_ns) * 1e-10
     assert begin - tenth < at < end + tenth
 

@@ -60,8 +60,8 @@ def test_rows_stamped_in_pairs_are_put_on_the_rhythm(rng):
 
 
 def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
-    asked = np.sort(np.arange(SECONDS * RATE) / RATE + JITTER * rng.standard_normal(12000))
-    assert even_imu_times(asked, *signals(asked, rng)) is asked
+    stamps = np.sort(np.arange(SECONDS * RATE) / RATE + JITTER * rng.standard_normal(12000))
+    assert even_imu_times(stamps, *signals(stamps, rng)) is stamps
 
 
 @pytest.mark.parametrize('t', [

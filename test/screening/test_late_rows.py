@@ -83,9 +83,9 @@ def test_late_rows_are_put_where_they_were_taken(made, true, how_long_s, drain_s
 
 def test_late_rows_are_no_slip(made, straight):
     late, _ = held_up(made.odometer)
-    method, said = of_smoother(made, late)
-    assert Code.ODOMETER_LATE in said
-    assert Code.WHEEL_SLIP not in said
+    method, texts = of_smoother(made, late)
+    assert Code.ODOMETER_LATE in texts
+    assert Code.WHEEL_SLIP not in texts
     found = method.estimates['scale_factor']
     assert abs(found.value - straight.value) < 0.1 * straight.sigma
     assert found.sigma == pytest.approx(straight.sigma, rel=0.05)
@@ -129,12 +129,12 @@ def test_rows_of_one_stamp_have_an_arrival_jitter():
 
 def test_arrival_jitter_is_no_slip(made, straight):
     """A jitter of 20 ms at 12 m/s is 0.24 m; the rest is as without it, a slip of 0.5 m too."""
-    method, said = of_smoother(made, arrivals(made.odometer, 0.02))
-    assert Code.WHEEL_SLIP not in said
+    method, texts = of_smoother(made, arrivals(made.odometer, 0.02))
+    assert Code.WHEEL_SLIP not in texts
     sigma = method.estimates['scale_factor'].sigma
     assert sigma == pytest.approx(straight.sigma, rel=0.1)
-    method, said = of_smoother(made, arrivals(spun(made, made.odometer), 0.02))
-    assert Code.WHEEL_SLIP in said
+    method, texts = of_smoother(made, arrivals(spun(made, made.odometer), 0.02))
+    assert Code.WHEEL_SLIP in texts
     assert method.details['slips'][0]['metres'] == pytest.approx(SLIP_M, rel=0.25)
 
 
@@ -247,9 +247,9 @@ def test_rows_that_come_at_once_are_spread(made):
 
 def test_a_slip_between_late_rows_is_found(made):
     late, _ = held_up(spun(made, made.odometer))
-    method, said = of_smoother(made, late)
-    assert Code.ODOMETER_LATE in said
-    assert Code.WHEEL_SLIP in said
+    method, texts = of_smoother(made, late)
+    assert Code.ODOMETER_LATE in texts
+    assert Code.WHEEL_SLIP in texts
     largest = method.details['slips'][0]
     assert largest['metres'] == pytest.approx(SLIP_M, rel=0.25)
     assert largest['t'] - 1.5 < SLIP_S < largest['t'] + largest['duration'] + 1.5

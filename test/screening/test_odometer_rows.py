@@ -8,7 +8,7 @@ from dataclasses import replace
 from drives import drive, kept, spoilt, STRAIGHT, with_increments
 import numpy as np
 import pytest
-from screened import said
+from screened import screen_with
 
 from odocal_ros.data.samples import join, take
 from odocal_ros.reasons import Code
@@ -21,14 +21,14 @@ pytestmark = pytest.mark.core
 @pytest.fixture
 def true(leg):
     """Return the travel of the counter as it is."""
-    return said(leg)[0].travel.s
+    return screen_with(leg)[0].travel.s
 
 
 @pytest.mark.parametrize(('span', 'scale'), [
     (2**12, 0.02), (2**16, 0.02), (10_000, 0.02), (2**21, 0.0005)])
 def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span, scale):
     made = drive(**STRAIGHT | {'duration': 900.0}, odometer='counts', scale=scale)
-    alone, _ = said(made.leg())
+    alone, _ = screen_with(made.leg())
     inputs, found = screen(spoilt(made.leg(), 'odometer', value=lambda v: v % span), Config())
     codes, remedies = {r.code: r.text for r in found}, [r.remedy for r in found]
     assert np.diff(made.odometer.value[[0, -1]]) > 3 * span
@@ -43,14 +43,14 @@ def test_jumps_between_values_farther_apart_than_a_span_are_no_rollover():
     leg = drive(**STRAIGHT, odometer='counts', scale=0.001).leg()
     again = replace(leg.odometer, stamp_ns=leg.odometer.stamp_ns + 400_000_001)
     both = join([leg.odometer, again])
-    _, codes = said(replace(leg, odometer=take(both, np.argsort(both.stamp_ns))))
+    _, codes = screen_with(replace(leg, odometer=take(both, np.argsort(both.stamp_ns))))
     assert Code.COUNTER_ROLLOVER not in codes
 
 
 @pytest.mark.parametrize('value', [0, -50_000, 2**62, 10**9])
 @pytest.mark.parametrize('length', [1, 20, 300])
 def test_a_counter_that_jumps_away_and_back_is_mended(leg, true, value, length):
-    inputs, codes = said(spoilt(leg, 'odometer', value=(slice(2000, 2000 + length), value)))
+    inputs, codes = screen_with(spoilt(leg, 'odometer', value=(slice(2000, 2000 + length), value)))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
     assert 'are frozen or isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
@@ -60,7 +60,7 @@ def test_a_counter_that_jumps_away_and_back_is_mended(leg, true, value, length):
 @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s
 def test_a_counter_that_hangs_and_catches_up_is_mended(leg, true, first):
     hung = (slice(first, first + 150), leg.odometer.value[first])
-    inputs, codes = said(spoilt(leg, 'odometer', value=hung))
+    inputs, codes = screen_with(spoilt(leg, 'odometer', value=hung))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
 
@@ -68,7 +68,7 @@ def test_a_counter_that_hangs_and_catches_up_is_mended(leg, true, first):
 def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(made, leg, true):
     after = slice(2000, None)     # 12 m/s
     count = leg.odometer.value[after]
-    inputs, codes = said(spoilt(leg, 'odometer', value=(after, count - count[0])))
+    inputs, codes = screen_with(spoilt(leg, 'odometer', value=(after, count - count[0])))
     assert 'a reset, not motion' in codes[Code.COUNTER_RESET]
     # one interval at the speed beside it, uniform between none and two of it
     speed = 12.0 / made.options.scale
@@ -79,8 +79,8 @@ def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(made, leg, true):
 def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
     whole = with_increments(leg)
     step = whole.odometer.value
-    inputs, _ = said(kept(whole, 'odometer', np.r_[:2000, 2040:len(step)]))
-    lost, end = step[2000:2040].sum(), said(whole)[0].travel.s[-1]
+    inputs, _ = screen_with(kept(whole, 'odometer', np.r_[:2000, 2040:len(step)]))
+    lost, end = step[2000:2040].sum(), screen_with(whole)[0].travel.s[-1]
     # the speed is even there: but for rounding of counts at each side, nothing is lost
     error = abs(inputs.travel.s[-1] - end)
     assert error < 0.01 * lost
@@ -90,6 +90,7 @@ def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
 
 def test_a_speed_that_jumps_is_left_out():
     made = drive(**STRAIGHT, odometer='speed')
-    inputs, codes = said(spoilt(made.leg(), 'odometer', value=([2500, 2900], [90.0, -40.0])))
+    leg = made.leg()
+    inputs, codes = screen_with(spoilt(leg, 'odometer', value=([2500, 2900], [90.0, -40.0])))
     assert codes[Code.BAD_ROWS_DROPPED].startswith('2 of')
-    np.testing.assert_allclose(inputs.travel.s[-1], said(made.leg())[0].travel.s[-1], rtol=1e-6)
+    np.testing.assert_allclose(inputs.travel.s[-1], screen_with(leg)[0].travel.s[-1], rtol=1e-6)

@@ -6,7 +6,7 @@
 from drives import drive, seconds, settings, spoilt, without
 import numpy as np
 import pytest
-from screened import said
+from screened import screen_with
 
 from odocal_ros.data.leg import Leg
 from odocal_ros.reasons import Code
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.core
 
 
 def test_a_clean_leg_is_used_to_the_last_row(leg):
-    inputs, codes = said(leg)
+    inputs, codes = screen_with(leg)
     assert codes == {}
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns)
     assert len(inputs.travel.t) == len(leg.odometer.stamp_ns)
@@ -45,14 +45,14 @@ def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, lab
 
 
 def test_an_empty_leg_screens_to_nothing_without_a_fault():
-    inputs, codes = said(Leg(start_ns=10**18, stop_ns=10**18 + 10**9))
+    inputs, codes = screen_with(Leg(start_ns=10**18, stop_ns=10**18 + 10**9))
     assert {Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX} <= set(codes)
     assert len(inputs.t_imu) == len(inputs.travel.t) == len(inputs.t_fix) == 0
 
 
 @pytest.mark.filterwarnings('error')
 def test_a_force_that_is_scaled_to_nothing_has_no_direction(leg):
-    assert not said(leg, imu__accel_scale=0.0)[0].up_b.any()
+    assert not screen_with(leg, imu__accel_scale=0.0)[0].up_b.any()
 
 
 def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
@@ -60,16 +60,16 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
         return spoilt(leg, 'fix', status=(rows, -1), latitude=(rows, np.nan),
                       longitude=(rows, np.nan))
     n = len(leg.fix.stamp_ns)
-    inputs, codes = said(lost(slice(0, 9)))
+    inputs, codes = screen_with(lost(slice(0, 9)))
     assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} fixes are not used: 9 with status below 0'}
     assert inputs.fixes_rejected == 9
-    inputs, codes = said(lost(slice(None)))
+    inputs, codes = screen_with(lost(slice(None)))
     assert codes == {
         Code.FIXES_UNUSABLE: f'{n} of {n} fixes are not used: {n} with status below 0'}
     assert 'gnss.min_status' in Code.FIXES_UNUSABLE.remedy
     assert len(inputs.t_fix) == 0
     # asked for, even a fix that is none is no position
-    inputs, _ = said(lost(slice(0, 9)), gnss__min_status=-1)
+    inputs, _ = screen_with(lost(slice(0, 9)), gnss__min_status=-1)
     assert len(inputs.t_fix) == n - 9
     assert np.isfinite(inputs.geodetic).all()
 
@@ -82,7 +82,8 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
     ({'height': 5e4}, 'altitude 50000 m)'),      # 50 m in mm
     ({'status': -1}, '4 with status below 0')])
 def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
-    inputs, codes = said(spoilt(leg, 'fix', **{k: (slice(70, 74), v) for k, v in columns.items()}))
+    inputs, codes = screen_with(spoilt(
+        leg, 'fix', **{k: (slice(70, 74), v) for k, v in columns.items()}))
     assert text in codes[Code.BAD_ROWS_DROPPED]
     assert inputs.fixes_rejected == 4
 
@@ -98,7 +99,7 @@ def test_fixes_that_other_reasons_name_are_not_counted_as_invalid(leg):
     *({'covariance_n': (slice(None), value)} for value in (0.0, np.nan, np.inf, -1.0)),
     {'covariance_type': (slice(None), 0)}])
 def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, column):
-    inputs, codes = said(spoilt(leg, 'fix', **column), gnss__default_sigma=4.0)
+    inputs, codes = screen_with(spoilt(leg, 'fix', **column), gnss__default_sigma=4.0)
     n = len(leg.fix.stamp_ns)
     assert codes[Code.COVARIANCE_UNKNOWN] == (
         f'{n} of {n} fixes have no usable covariance; 4 m (gnss.default_sigma) is used')
@@ -107,7 +108,7 @@ def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, column):
 
 
 def test_a_height_without_a_variance_leaves_the_level_part_standing(leg):
-    inputs, codes = said(spoilt(leg, 'fix', covariance_n=((slice(None), 2, 2), np.nan)))
+    inputs, codes = screen_with(spoilt(leg, 'fix', covariance_n=((slice(None), 2, 2), np.nan)))
     assert codes == {}
     np.testing.assert_array_equal(inputs.covariance_n[:, :2, :2], leg.fix.covariance_n[:, :2, :2])
     np.testing.assert_allclose(inputs.covariance_n[:, 2, 2], 4 * leg.fix.covariance_n[:, 0, 0])
@@ -116,8 +117,8 @@ def test_a_height_without_a_variance_leaves_the_level_part_standing(leg):
 def test_the_limit_of_poor_fixes_rises_with_the_median_of_the_leg(leg):
     usual = spoilt(leg, 'fix', covariance_n=(slice(None), np.eye(3) * 16.0))
     poor = spoilt(usual, 'fix', covariance_n=(slice(20, 26), np.eye(3) * 81.0))
-    assert said(poor)[1][Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 8 m')
-    _, codes = said(poor, gnss__max_sigma=3.0)
+    assert screen_with(poor)[1][Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 8 m')
+    _, codes = screen_with(poor, gnss__max_sigma=3.0)
     assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
 
 
@@ -128,7 +129,7 @@ def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
     assert reason.text.endswith('200 with sigma above 3 m')
     assert 'gnss.max_sigma' in reason.remedy
     assert inputs.fixes_rejected == 200
-    inputs, codes = said(poor, gnss__max_sigma=0)
+    inputs, codes = screen_with(poor, gnss__max_sigma=0)
     assert codes == {}
     assert inputs.fixes_rejected == 0
 
@@ -144,7 +145,7 @@ def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
 
 @pytest.mark.parametrize(('length', 'size'), [(1, 50.0), (2, 5.0), (5, 10.0), (15, 3.0)])
 def test_a_burst_of_false_rates_is_left_out(leg, length, size):
-    inputs, codes = said(spoilt(leg, 'imu', w_i=((slice(4000, 4000 + length), 2), size)))
+    inputs, codes = screen_with(spoilt(leg, 'imu', w_i=((slice(4000, 4000 + length), 2), size)))
     assert f'{length} of' in codes[Code.BAD_ROWS_DROPPED]
     assert 'isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
     assert np.abs(inputs.w_b).max() < 0.1
@@ -156,10 +157,10 @@ def test_one_row_off_by_what_a_sensor_might_say_is_left_out(leg, slot, name, axi
     """In 0.1 s, 0.4 rad/s turned a track by 2 deg: a scale 13 sigmas off was accepted."""
     rows = [4000, 5000, 6001]
     off = ((rows, axis), getattr(leg.imu, slot)[rows, axis] + size)
-    inputs, codes = said(spoilt(leg, 'imu', **{slot: off}))
+    inputs, codes = screen_with(spoilt(leg, 'imu', **{slot: off}))
     assert '3 of' in codes[Code.BAD_ROWS_DROPPED]
     assert np.array_equal(getattr(inputs, name),
-                          np.delete(getattr(said(leg)[0], name), rows, axis=0))
+                          np.delete(getattr(screen_with(leg)[0], name), rows, axis=0))
 
 
 def test_hard_driving_is_no_glitch():
@@ -171,7 +172,7 @@ def test_hard_driving_is_no_glitch():
     leg = drive(scenario='straight', duration=200.0, imu_grade='consumer', seed=6).leg()
     t = seconds(leg, leg.imu)
     spin = np.clip(10 * (t - 50.0), 0, 2) - np.clip(10 * (t - 50.3), 0, 2)
-    inputs, codes = said(spoilt(leg, 'imu', w_i=lambda w: w + np.outer(spin, [0, 0, 1])))
+    inputs, codes = screen_with(spoilt(leg, 'imu', w_i=lambda w: w + np.outer(spin, [0, 0, 1])))
     assert Code.BAD_ROWS_DROPPED not in codes
     assert len(inputs.t_imu) == len(t)
 
@@ -179,13 +180,13 @@ def test_hard_driving_is_no_glitch():
 def test_a_gyro_with_coarse_steps_does_not_hang(town):
     step = np.radians(0.25)
     coarse = spoilt(town.leg(), 'imu', w_i=lambda w: np.round(w / step) * step + step)
-    assert Code.IMU_GAP not in said(coarse)[1]
+    assert Code.IMU_GAP not in screen_with(coarse)[1]
 
 
 def test_a_gyro_that_hangs_while_the_wheels_roll_is_a_gap(leg):
     def hung(begin, end):
         first, last = np.searchsorted(seconds(leg, leg.imu), [begin, end])
-        return said(spoilt(leg, 'imu', w_i=(slice(first, last), leg.imu.w_i[first])))[1]
+        return screen_with(spoilt(leg, 'imu', w_i=(slice(first, last), leg.imu.w_i[first])))[1]
     assert hung(60.0, 64.0)[Code.IMU_GAP].startswith(
         'the gyro repeats one value for 3.98 s at t = 60.00 s')
     # at rest a quantised gyro may well repeat itself
@@ -198,7 +199,7 @@ def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
     rows = slice(40, 60)
     bad = spoilt(leg, 'imu', q_ni=(rows, q), yaw_variance=(rows, variance))
     with np.errstate(all='raise'):
-        inputs, _ = said(bad)
+        inputs, _ = screen_with(bad)
     assert not np.isfinite(inputs.yaw_variance[40:60]).any()
     assert np.abs(np.nan_to_num(inputs.q_ni)).max() <= 7.0
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from drives import changed, seconds, spoilt
 import numpy as np
 import pytest
-from screened import said
+from screened import screen_with
 
 from odocal_ros.data.samples import join, take
 from odocal_ros.reasons import Code
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.core
 
 
 def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
-    inputs, codes = said(spoilt(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
+    inputs, codes = screen_with(spoilt(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
     n, t = len(leg.odometer.stamp_ns), (leg.odometer.received_ns[100] - leg.start_ns) * 1e-9
     assert codes[Code.BAD_ROWS_DROPPED] == (
         f'5 of {n} odometer messages have no stamp (zero or negative), first at t = {t:.2f} s; '
@@ -29,7 +29,7 @@ def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
 
 
 def test_one_stamp_in_the_future_costs_one_row(leg):
-    inputs, codes = said(spoilt(
+    inputs, codes = screen_with(spoilt(
         leg, 'imu', stamp_ns=(500, leg.imu.stamp_ns[500] + 3600 * 10**9)))
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns) - 1
     assert '1 of' in codes[Code.STAMPS_NOT_RISING]
@@ -49,8 +49,8 @@ def test_a_clock_that_was_set_runs_on(leg, slot, by, wrong):
     other = spoilt(leg, slot, stamp_ns=(part, stamps[part] + moved))
     if slot == 'imu':       # which has its stamps
         other = replace(other, **{mark: getattr(leg, mark) + moved})
-    inputs, codes = said(other)
-    alone, _ = said(leg)
+    inputs, codes = screen_with(other)
+    alone, _ = screen_with(leg)
     assert f'set by {by:+.3f} s' in codes[Code.CLOCK_SET]
     assert Code.CLOCKS_DIFFER not in codes
     # arrivals of this leg are exact: what they show is
@@ -64,14 +64,15 @@ def test_stamps_in_disorder_are_no_clock_that_was_set(leg, rows):
     rng, order = np.random.default_rng(2), np.arange(len(leg.imu.stamp_ns) // rows * rows)
     order = rng.permuted(order.reshape(-1, rows), axis=1).ravel()
     mixed = replace(take(leg.imu, order), received_ns=leg.imu.received_ns[:len(order)])
-    assert Code.CLOCK_SET not in said(replace(leg, imu=mixed))[1]
+    assert Code.CLOCK_SET not in screen_with(replace(leg, imu=mixed))[1]
 
 
 def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
-    assert Code.CLOCK_SET not in said(spoilt(leg, 'imu', stamp_ns=(slice(3000, 3200), 0)))[1]
+    unstamped = spoilt(leg, 'imu', stamp_ns=(slice(3000, 3200), 0))
+    assert Code.CLOCK_SET not in screen_with(unstamped)[1]
     order = np.arange(len(leg.imu.stamp_ns))
     order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])
-    inputs, codes = said(replace(leg, imu=take(leg.imu, order)))
+    inputs, codes = screen_with(replace(leg, imu=take(leg.imu, order)))
     assert set(codes) == {Code.STAMPS_NOT_RISING}
     assert (np.diff(inputs.t_imu) > 0).all()
 
@@ -79,14 +80,14 @@ def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
 def test_the_clock_of_the_recorder_is_not_that_of_the_sender(leg):
     lost = take(leg.imu, np.arange(len(leg.imu.stamp_ns)) != 4000)
     set_by = changed(lost, received_ns=(slice(4000), lost.received_ns[:4000] - 10**18))
-    assert Code.CLOCK_SET not in said(replace(leg, imu=set_by))[1]
+    assert Code.CLOCK_SET not in screen_with(replace(leg, imu=set_by))[1]
 
 
 @pytest.mark.parametrize('late_s', [0.05, 0.3])
 def test_a_topic_that_arrives_again_later_is_no_clock_that_was_set(leg, late_s):
     again = replace(leg.fix, received_ns=leg.fix.received_ns + round(late_s * 1e9))
     both = join([leg.fix, again])
-    inputs, codes = said(replace(leg, fix=take(both, np.argsort(both.received_ns))))
+    inputs, codes = screen_with(replace(leg, fix=take(both, np.argsort(both.received_ns))))
     assert set(codes) == {Code.STAMPS_NOT_RISING}
     np.testing.assert_array_equal(inputs.geodetic[:, 0], leg.fix.latitude)
 
@@ -96,8 +97,8 @@ def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
     n = len(leg.imu.stamp_ns) // packet * packet
     imu = take(leg.imu, slice(0, n))
     stamp = np.repeat(imu.stamp_ns[packet - 1::packet], packet)
-    inputs, codes = said(replace(leg, imu=replace(imu, stamp_ns=stamp)))
-    alone, _ = said(replace(leg, imu=imu))
+    inputs, codes = screen_with(replace(leg, imu=replace(imu, stamp_ns=stamp)))
+    alone, _ = screen_with(replace(leg, imu=imu))
     assert len(inputs.t_imu) == len(alone.t_imu) == n
     # stamps of IMUs have microseconds
     np.testing.assert_allclose(inputs.t_imu, alone.t_imu, atol=1e-6)
@@ -108,9 +109,9 @@ def test_duplicates_are_used_once(leg):
     twice = join([take(leg.fix, slice(0, 200)), take(leg.fix, slice(150, None))])
     again = take(leg.fix, np.repeat(np.arange(len(leg.fix.stamp_ns)), 2))
     imu = take(leg.imu, np.repeat(np.arange(len(leg.imu.stamp_ns)), 2))
-    assert len(said(replace(leg, imu=imu))[0].t_imu) == len(leg.imu.stamp_ns)
+    assert len(screen_with(replace(leg, imu=imu))[0].t_imu) == len(leg.imu.stamp_ns)
     for fix, repeats in ((twice, 50), (again, len(leg.fix.stamp_ns))):
-        inputs, codes = said(replace(leg, fix=fix))
+        inputs, codes = screen_with(replace(leg, fix=fix))
         np.testing.assert_array_equal(inputs.geodetic[:, 0], leg.fix.latitude)
         assert f'{repeats} of {len(fix.stamp_ns)} messages dropped' in codes[
             Code.STAMPS_NOT_RISING]
@@ -123,9 +124,9 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
         late = np.where(t % 10 < 8, t - t % 10 + 8, t)
         return replace(samples, received_ns=leg.start_ns + np.round(late * 1e9).astype(np.int64))
     held = leg.with_rows(**{slot: queued(leg.rows(slot)) for slot in ('imu', 'odometer', 'fix')})
-    assert Code.CLOCKS_DIFFER not in said(held)[1]
+    assert Code.CLOCKS_DIFFER not in screen_with(held)[1]
     late = spoilt(held, 'fix', stamp_ns=lambda a: a + 700_000_000)
-    assert 'fix stamps differ by +0.7' in said(late)[1][Code.CLOCKS_DIFFER]
+    assert 'fix stamps differ by +0.7' in screen_with(late)[1][Code.CLOCKS_DIFFER]
 
 
 @pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
@@ -133,13 +134,13 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
 @pytest.mark.parametrize('late', [0.8, -0.8])
 def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, setting, late):
     moved = spoilt(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
-    _, codes = said(moved)
+    _, codes = screen_with(moved)
     seen = float(codes[Code.CLOCKS_DIFFER].split('differ by ')[1].split(' s')[0])
     assert abs(seen - late) < 0.055       # fixes take 0.05 s to arrive, which looks the same
     assert f'to {setting}' in codes[Code.CLOCKS_DIFFER]
     if slot == 'fix':       # positions of marks have IMU stamps
-        assert Code.CLOCKS_DIFFER not in said(moved, reference__points=[0.0, 0.0])[1]
-    inputs, codes = said(moved, **{setting: -late})
+        assert Code.CLOCKS_DIFFER not in screen_with(moved, reference__points=[0.0, 0.0])[1]
+    inputs, codes = screen_with(moved, **{setting: -late})
     assert Code.CLOCKS_DIFFER not in codes
     t = inputs.travel.t if slot == 'odometer' else inputs.t_fix
     np.testing.assert_allclose(t, seconds(leg, leg.rows(slot)), atol=1e-9)
@@ -154,7 +155,7 @@ def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
 
 
 def test_the_imus_own_offset_moves_the_others_since_marks_are_imu_stamps(leg):
-    inputs, _ = said(leg, imu__time_offset=0.25)
+    inputs, _ = screen_with(leg, imu__time_offset=0.25)
     np.testing.assert_allclose(inputs.travel.t, seconds(leg, leg.odometer) - 0.25, atol=1e-9)
     np.testing.assert_allclose(inputs.t_fix, seconds(leg, leg.fix) - 0.25, atol=1e-9)
     np.testing.assert_allclose(inputs.t_imu, seconds(leg, leg.imu), atol=1e-9)

@@ -22,10 +22,10 @@ def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
     options, there = draw_vehicle(7, 'town', 'industrial', ())
     assert options.real == Real()
     assert there == ()
-    told = settings(simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
-    assert told['imu']['grade'] == 'industrial'
+    configured = settings(simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
+    assert configured['imu']['grade'] == 'industrial'
     for group, name in (('imu', 'imu'), ('gnss', 'antenna'), ('odometer', 'odometer')):
-        assert told[group]['lever_arm'] == list(getattr(options, f'{name}_lever_arm'))
+        assert configured[group]['lever_arm'] == list(getattr(options, f'{name}_lever_arm'))
 
 
 @pytest.mark.parametrize('name', EFFECTS)
@@ -91,11 +91,11 @@ def test_what_is_given_is_what_effects_go_by():
     assert options.real.squat == 0
 
 
-@pytest.mark.parametrize(('change', 'told'), [
+@pytest.mark.parametrize(('change', 'message'), [
     ({'effects': ODOMETER_EFFECTS}, 'a vehicle has one odometer'),
     ({'effects': ('rust',)}, '--effect rust: required: one of triads'),
     ({'effects': ('coarse_sped',)}, '--effect coarse_sped: did you mean coarse_speed'),
     ({'grade': 'navigation'}, 'required: one of consumer')])
-def test_what_cannot_be_drawn_is_said(change, told):
-    with pytest.raises(BadUsage, match=told):
+def test_what_cannot_be_drawn_is_said(change, message):
+    with pytest.raises(BadUsage, match=message):
         draw_vehicle(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)

@@ -110,7 +110,7 @@ def test_late_stamps_move_no_true_mark():
     assert (late.imu.f_i == plain.imu.f_i).all()
 
 
-@pytest.mark.parametrize(('figures', 'told'), [
+@pytest.mark.parametrize(('figures', 'message'), [
     ({'gyro_matrix': (1, 2)}, 'required: 9 numbers'), ({'squat': (1, 2)}, 'required: one number'),
     ({'gyro_bias': 1.0}, 'required: 3 numbers'), ({'vibration': -1}, 'required: 0 or more'),
     ({'speed_rounding': 'up'}, 'required: one of floor, round'), ({'drops': 1.0}, 'below 1'),
@@ -119,9 +119,9 @@ def test_late_stamps_move_no_true_mark():
     ({'slow_errors': ((1, 0),)}, 'required: pairs'),
     ({'warm_time': 0.0}, 'required: above 0'), ({'squat': float('nan')}, 'required: finite'),
     ({'imu_batch': 1.5}, 'a whole number, 1 or more')])
-def test_figures_that_cannot_be_are_refused(figures, told):
+def test_figures_that_cannot_be_are_refused(figures, message):
     from odocal_ros.errors import BadUsage
-    with pytest.raises(BadUsage, match=told):
+    with pytest.raises(BadUsage, match=message):
         Real(**figures)
 
 

@@ -113,7 +113,7 @@ def test_every_choice_is_filled_in():
     assert resolved(SimOptions(fix_noise='rtk')).fix_sigma == 0.02
 
 
-@pytest.mark.parametrize(('change', 'told'), [
+@pytest.mark.parametrize(('change', 'message'), [
     ({'scenario': 'moon'}, '--scenario moon: required: one of paper, straight'),
     ({'scenario': 'twon'}, '--scenario twon: did you mean town'),
     ({'imu_grade': 'best'}, '--imu-grade best: required: one of consumer'),
@@ -140,8 +140,8 @@ def test_every_choice_is_filled_in():
     ({'scenario': 'out_and_back', 'duration': 200.0}, 'scenario out_and_back: .* too short'),
     ({'scenario': 'town', 'duration': 46.0}, 'scenario town: .* is too short for a stop-and-go '
      'cycle')])
-def test_what_cannot_be_driven_is_said(change, told):
-    with pytest.raises(BadUsage, match=told):
+def test_what_cannot_be_driven_is_said(change, message):
+    with pytest.raises(BadUsage, match=message):
         simulate(replace(SimOptions(), **change))
 
 
@@ -188,9 +188,9 @@ def test_a_yard_is_slow_and_winding_and_goes_backwards_too(seed):
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_a_drive_too_short_is_told_what_is_enough(name):
-    with pytest.raises(BadUsage, match='too short') as told:
+    with pytest.raises(BadUsage, match='too short') as error:
         states(name, duration=20.0)
-    enough = float(re.search(r'give (\d+) s', str(told.value))[1])
+    enough = float(re.search(r'give (\d+) s', str(error.value))[1])
     for seed in range(5):
         motion, state = states(name, duration=enough, seed=seed)
         assert abs(motion.distance) > 1
