@@ -52,7 +52,7 @@ def test_an_odometer_in_the_receiver_is_told_from_the_vehicles(share):
 def test_a_filter_of_position_and_velocity_is_said_with_its_time():
     _, texts = received(receiver_tracking=0.8)
     text = texts[Code.FIXES_SMOOTHED]
-    assert 'position and velocity' in text
+    assert 'positions and velocities' in text
     assert float(re.search(r'about (.*) s;', text)[1]) == pytest.approx(0.8, rel=0.02)
 
 
@@ -152,12 +152,12 @@ def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, 
     _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial',
                           fix_noise='rtk', slope=0.01, seed=5)
     found = smooth(replace(leg, fixes_n=leg.fixes_n * [1.0, 1.0, unit]), config)
-    texts = [r for r in found.reasons if r.code is Code.MODEL_MISMATCH]
-    assert len(texts) == implausible
-    for one in texts:
-        assert 'height error of the fixes is ' in one.text
-        assert one.text.endswith('(limit 50 m)')
-        assert one.remedy == 'Check the unit of heights in the fix driver.'
+    reasons = [r for r in found.reasons if r.code is Code.MODEL_MISMATCH]
+    assert len(reasons) == implausible
+    for reason in reasons:
+        assert 'height error of the fixes is ' in reason.text
+        assert reason.text.endswith('(limit 50 m)')
+        assert reason.remedy == 'Check the unit of heights in the fix driver.'
 
 
 def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
