@@ -15,7 +15,6 @@ import numpy as np
 from odocal_ros import __version__
 from odocal_ros.fleet.statistics import LEAST, Population, population
 from odocal_ros.fleet.tables import (
-    COMPARED,
     folder_name,
     group_by_model,
     LEGS,
@@ -35,7 +34,7 @@ from odocal_ros.output.plot_style import (
 )
 from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
-from odocal_ros.output.value_text import with_sigma
+from odocal_ros.output.value_text import MAIN_VALUES, with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
 MOST_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
@@ -47,9 +46,9 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[Drawin
     """Return each figure that has data."""
     drawn = []
     with apply_style():
-        for name in COMPARED:
+        for name in MAIN_VALUES:
             rows = [row for row in vehicles if row[name] is not None
-                    and row[f'{COMPARED[name]}_deviate'] is not None]
+                    and row[f'{MAIN_VALUES[name]}_deviate'] is not None]
             if rows:
                 drawn.append(_population_figure(name, rows))
         if chart := _history_figure(vehicles, legs):
@@ -66,7 +65,7 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
         same_model = [row for row in rows if row['model'] == model]
         x, sigma = (np.array([row[key] for row in same_model], float)
                     for key in (name, f'{name}_sigma'))
-        outlier = np.array([COMPARED[name] in row['outlier'].split() for row in same_model])
+        outlier = np.array([MAIN_VALUES[name] in row['outlier'].split() for row in same_model])
         median = np.median(x)
         deviation, error = ((x / median - 1) * 100, sigma / median * 100) if is_scale else (
             (x - median) * DEG, sigma * DEG)
@@ -83,7 +82,7 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
     title = f'{TITLES[name]} by model.'
     description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
                    'outside the plot.')
-    return title, description, svg(figure, f'population-{COMPARED[name]}',
+    return title, description, svg(figure, f'population-{MAIN_VALUES[name]}',
                                    f'{title} {description}')
 
 
@@ -182,7 +181,7 @@ def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
 
 def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     cells = []
-    for name in COMPARED:
+    for name in MAIN_VALUES:
         have = [row for row in rows if row[name] is not None]
         if not have:
             cells += ['-', '-']

@@ -17,13 +17,13 @@ from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from_text, Row
 from odocal_ros.fleet.statistics import FAR, population
+from odocal_ros.output.value_text import MAIN_VALUES
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file
 from odocal_ros.safe_io.text_formats import one_line
 
 LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
-COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WORST_FIRST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
 VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
@@ -131,7 +131,7 @@ def group_by_model(rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], list
 
 def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the rows with each vehicle's deviations from its model in sigmas, the worst first."""
-    for name, short in COMPARED.items():
+    for name, short in MAIN_VALUES.items():
         for row in rows:
             row[f'{short}_deviate'] = None
         for same_model in group_by_model(row for row in rows if row[name] is not None).values():
@@ -140,7 +140,7 @@ def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             for row, deviate in zip(same_model, found.deviates.tolist(), strict=True):
                 row[f'{short}_deviate'] = None if deviate != deviate else deviate
     for row in rows:
-        row['outlier'] = ' '.join(short for short in COMPARED.values()
+        row['outlier'] = ' '.join(short for short in MAIN_VALUES.values()
                                   if abs(row[f'{short}_deviate'] or 0.0) > FAR)
     return sorted(rows, key=_severity)
 
@@ -155,7 +155,7 @@ def needs_inspection(row: dict[str, Any]) -> bool:
 def _severity(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
     """Return the sorting key of a vehicle, the worst first."""
     verdict = row['decision'] or row['verdict']
-    largest_deviation = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
+    largest_deviation = max(abs(row[f'{short}_deviate'] or 0.0) for short in MAIN_VALUES.values())
     return (not row['legs'] and -1 or 0, WORST_FIRST.index(verdict), not row['outlier'],
             row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
             not row['rejected_for'], -largest_deviation, row['vehicle'])

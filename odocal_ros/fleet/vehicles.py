@@ -23,7 +23,7 @@ from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.stored import known_imu
-from odocal_ros.output.value_text import accept_line, iso
+from odocal_ros.output.value_text import accept_line, iso, MAIN_VALUES
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Reason, Verdict
@@ -164,8 +164,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
         limits = with_settings(Config(), job.settings).accept.limits
         return Vehicle(_row_without_legs(row, Decision.UNDECIDED.value if limits else ''), [])
     config = with_settings(done[-1].config(), job.settings)
-    histories = {name: history_of(name, driven, config) for name in (
-        'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
+    histories = {name: history_of(name, driven, config) for name in MAIN_VALUES}
     # first legs of the periods without changes
     starts = sorted({0}.union(*(past.first_after_change for past in histories.values())))
     current = driven[starts[-1]:]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast import planned_drive
@@ -24,10 +25,8 @@ from odocal_ros.output.value_text import length, time_span
 from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
 
-SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+SCALE, YAW, _ = PARAMETERS
 RTK = 0.02                        # m, physical: sigma of a fix, by receivers' data sheets
-PITCH = 'pitch_mounting_angle'
-PARAMETERS = (SCALE, YAW, PITCH)
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,17 @@ import textwrap
 
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
-from odocal_ros.library.plan import PARAMETERS, PITCH, Planned, ranked, SCALE, YAW
+from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.output.tables import budget_lines
-from odocal_ros.output.value_text import length, share, table_row, time_span, wrapped
-
-WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
+from odocal_ros.output.value_text import (
+    length,
+    MAIN_VALUES,
+    share,
+    table_row,
+    time_span,
+    wrapped,
+)
 
 
 def screen(planned: Planned) -> str:
@@ -75,7 +80,7 @@ def _head(plan: Planned) -> list[str]:
 
 def _methods(plan: Plan) -> list[str]:
     rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
-        (name, *(_shown(p, method.estimates[p].sigma) for p in PARAMETERS))
+        (name, *(_shown(p, method.estimates[p].sigma) for p in MAIN_VALUES))
         for name, method in plan.methods.items())]
     return [*(table_row(row, (20, 14, 16, 16)) for row in rows), f'  (result: {_result(plan)})']
 
@@ -83,8 +88,8 @@ def _methods(plan: Plan) -> list[str]:
 def _result(plan: Plan) -> str:
     """Return the line that names the method of each value."""
     by: dict[str | None, list[str]] = {}
-    for parameter in PARAMETERS:
-        by.setdefault(plan.method_of(parameter), []).append(WORDS[parameter])
+    for parameter in MAIN_VALUES:
+        by.setdefault(plan.method_of(parameter), []).append(MAIN_VALUES[parameter])
     return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all values"} '
                      f'{"from " + method if method else "unknown"}'
                      for method, names in by.items())
@@ -106,7 +111,7 @@ def _budgets(plan: Plan) -> list[str]:
     shown = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
         method = plan.methods[name]
-        hidden = [p for p in PARAMETERS if method.estimates[p].sigma is None]
+        hidden = [p for p in MAIN_VALUES if method.estimates[p].sigma is None]
         lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
         if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
@@ -117,7 +122,7 @@ def _budgets(plan: Plan) -> list[str]:
 def _improvements(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(plan.improvements, plan, parameter), WORDS[parameter]
+        best, word = ranked(plan.improvements, plan, parameter), MAIN_VALUES[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
         lines += [f'    {c.text:<58}{_shown(parameter, plan.sigma(parameter)):>10} -> '

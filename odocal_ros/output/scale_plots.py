@@ -12,8 +12,8 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.calib.scale_variation import SpeedScale
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import plot_style as style
-from odocal_ros.output.summary import ANGLES, DEG
-from odocal_ros.output.value_text import known, with_sigma
+from odocal_ros.output.summary import DEG
+from odocal_ros.output.value_text import ANGLES, known, with_sigma
 
 STYLES = (('o', style.BLUE), ('s', style.RED), ('^', style.GREEN), ('D', style.PINK),
           ('v', 'black'), ('P', style.GREY))

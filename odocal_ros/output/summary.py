@@ -13,6 +13,7 @@ from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, PLANAR
 from odocal_ros.output import tables
 from odocal_ros.output.value_text import (
+    ANGLES,
     beyond_one,
     columns,
     counted,
@@ -21,6 +22,7 @@ from odocal_ros.output.value_text import (
     known,
     length,
     lines_of_bags,
+    MAIN_VALUES,
     reason_lines,
     share,
     time_span,
@@ -31,7 +33,6 @@ from odocal_ros.output.value_text import (
 from odocal_ros.reasons import Verdict
 
 DEG = math.degrees(1.0)    # definition
-ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of a wheel: +, -
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
@@ -219,7 +220,7 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int)
 def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
     found = []
-    for name, word in {'scale_factor': 'scale', **ANGLES}.items():
+    for name, word in MAIN_VALUES.items():
         estimate = known(calibration.estimates, name)
         source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)

@@ -22,6 +22,7 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.value_text import (
+    ANGLES,
     columns,
     iso,
     known,
@@ -37,7 +38,6 @@ from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
 SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
-ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
           'fix_latency': 'fix delay', 'gnss_delay': 'fix delay',
@@ -78,7 +78,7 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
            'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
     wheels = dict.fromkeys(wheel_factors(calibration.estimates), '') | {
         name: 'm' for name in calibration.estimates if name.startswith('track_width')}
-    for name, unit in (SHOWN | wheels | ANGLES).items():
+    for name, unit in (SHOWN | wheels | dict.fromkeys(ANGLES, 'rad')).items():
         if name in calibration.estimates:
             unit = unit or calibration.estimates[name].unit
             found = _estimate(leg, calibration, name)

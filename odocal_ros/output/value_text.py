@@ -19,6 +19,9 @@ from odocal_ros.settings.config import Config
 
 WIDTH = 98    # judgement: columns
 NONE = Estimate(None, None, '')
+# short names of the main values, in the order of ``calib.budget.PARAMETERS``
+ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+MAIN_VALUES = {'scale_factor': 'scale', **ANGLES}
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
