@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of the smoother combined on their border: information, sources, disputes."""
+"""Legs of the smoother combined by marginal information: sources, disputes, refusals."""
 
 from dataclasses import replace
 import re
