@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of the smoother combined by marginal information: sources, disputes, refusals."""
+"""Legs of the smoother combined by marginal information: sources, disputes."""
 
 from dataclasses import replace
 import re
@@ -45,7 +45,7 @@ def by_border(one, i):
         found.covariance[i, i] + MODEL_FLOOR[i]**2 + of_sizes @ of_sizes)
 
 
-def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
+def test_marginal_information_and_beliefs_determine_a_leg_of_the_smoother(legs):
     for one in legs[2]:
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
             e, (found, sigma) = one.estimates[name], by_border(one, i)
@@ -114,7 +114,7 @@ def test_a_scale_that_walks_is_that_of_the_last_leg(legs):
     assert whole.estimates[YAW].sigma < 0.8 * last.estimates[YAW].sigma
 
 
-def test_a_wheel_that_changes_on_the_way_is_in_the_border_too(legs):
+def test_a_wheel_that_changes_on_the_way_is_in_the_marginal_information_too(legs):
     _, config, results = legs
     run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config,
                           wheel_slips=replace(NO_SLIPS, change=8e-4))
