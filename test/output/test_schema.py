@@ -80,7 +80,7 @@ def test_json_has_the_fixed_shape(good):
     assert content['verdict'] == 'accepted'
     assert content['reasons'][1] == {
         'code': 'PITCH_NOT_DETERMINED', 'text': 'the heights of the fixes are too inaccurate',
-        'remedy': 'Use a receiver that publishes ellipsoidal height.'}
+        'remedy': 'Use positions with height: ellipsoidal height of a receiver, or z.'}
     assert content['result']['scale_factor'] == {
         'value': 0.05, 'sigma': 1.2e-6, 'unit': 'm/pulse', 'method': 'two_point'}
     assert content['result']['imu_rotation'] == {

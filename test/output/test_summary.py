@@ -76,7 +76,7 @@ def test_the_screen_says_it_all_in_few_lines(good):
                  '-1.0000 ± 0.0029 deg   (-0.017453 ± 0.000050 rad)',
                  'pitch mounting      not determined', 'roll, pitch, yaw 0.000, 0.000, -1.000 deg',
                  '08-02 08:53:20', '1500 m', '0.10 m', 'TOPIC_GAP: odometer gap of 1.2 s',
-                 '-> Use a receiver that publishes ellipsoidal height.'):
+                 '-> Use positions with height: ellipsoidal height of a receiver, or z.'):
         assert part in text, part
     assert len(text.splitlines()) < 30
     assert max(len(line) for line in text.splitlines()) <= 98
