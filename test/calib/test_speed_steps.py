@@ -131,6 +131,18 @@ def test_steps_too_fine_for_crossings_have_an_offset():
     assert offset['value'] == pytest.approx(0.03 * KMH, abs=4 * offset['sigma'])
 
 
+@pytest.mark.parametrize('seed', [12, 15])
+def test_scales_of_imu_and_odometer_do_not_shrink_together(seed):
+    """Multipath leaves their common size to the steps: residuals in m/s shrank with it."""
+    real = Real(speed_step=KMH, slow_errors=((4.0, 40.0), (3.0, 300.0)), bursts=60.0,
+                burst_size=20.0)
+    drive = simulate(SimOptions(
+        scenario='town', duration=900.0, imu_grade='consumer', odometer='speed', odometer_rate=5.0,
+        odometer_delay=0.3, fix_rate=1.0, fix_sigma=2.0, seed=seed, real=real))
+    found = calibrate(drive.leg(), settings(drive, None, method='auto')).methods['smoother']
+    assert off(found.estimates, drive, 'scale_factor') < 3     # by published speeds: 6
+
+
 def test_what_a_robot_at_one_speed_rounds_is_in_its_sigma():
     errors = []
     for seed in range(4):

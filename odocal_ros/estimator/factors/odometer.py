@@ -176,8 +176,11 @@ class SpeedSteps(PointRows):
         ) - axle.means_by_path(point.intervals)
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         speed_by_wheel = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
-        self.speed_by_wheel = state.scale * self.scale_ratio * speed_by_wheel
-        self.raw = (self.speed_by_wheel - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
+        speed_by_wheel *= state.scale * self.scale_ratio
+        # the error is one of the published value, so it grows with K: with derivatives by that
+        # value all scales of IMU and odometer would shrink together
+        self.wheel = self.speed if point.fitted else speed_by_wheel
+        self.raw = (speed_by_wheel - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
     def is_present(cls, problem: Problem) -> bool:
@@ -213,9 +216,8 @@ class SpeedSteps(PointRows):
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.scale_ratio
-        # by the published value: the speed is anywhere in its step, so only the speed has an error
-        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_by_wheel, K * self.instants.side
-        c[:, layout.TYRES] = (self.speed_by_wheel / self.scale_ratio)[:, None] * self.tyre_signals
+        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.wheel, K * self.instants.side
+        c[:, layout.TYRES] = (self.wheel / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
