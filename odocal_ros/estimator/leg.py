@@ -20,6 +20,9 @@ from odocal_ros.screening.inputs import Inputs
 BEFORE_MARK = 30.0
 # Hz: physical, errors of velocity and heading last longer than a fifth of a second
 EXTERNAL_RATE = 5.0
+# Hz: judgement, measured in decision 21. The noise of the IMU between a fix and its keyframe is
+# not in the rows of fixes; denser ones, finer than this noise, make the fit oscillate
+FIX_RATE = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +39,10 @@ class ExternalSamples:
                                 if isinstance(column, np.ndarray)})
 
 
-def thinned(t: Floats) -> slice:
-    """Return an index that thins sorted times to about EXTERNAL_RATE."""
-    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-    return slice(None, None, max(1, round(rate / EXTERNAL_RATE)))
+def thinned(t: Floats, most: float = EXTERNAL_RATE) -> slice:
+    """Return an index that thins sorted times, s, to a rate of about ``most``, Hz."""
+    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9) if len(t) else 0.0
+    return slice(None, None, max(1, round(rate / most)))
 
 
 def from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:

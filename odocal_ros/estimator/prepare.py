@@ -21,7 +21,7 @@ from odocal_ros.estimator.imu import (
     white_noise_at_rest,
     without_accelerometer,
 )
-from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
+from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, FIX_RATE, SmootherLeg, thinned
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
@@ -62,10 +62,12 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(before[-1][0])) if before else 0.0
+    some = thinned(inputs.t_fix, FIX_RATE)
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
-        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix,
-        fixes_n=fixes_n, covariance_n=inputs.covariance_n, rounding_n=inputs.rounding_n,
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[some],
+        fixes_n=fixes_n[some], covariance_n=inputs.covariance_n[some],
+        rounding_n=inputs.rounding_n[some],
         standstills=np.asarray(spans), rough_scale=float(rough_scale),
         nominal_scale=nominal_scale(config, inputs.scale_unit),
         scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),

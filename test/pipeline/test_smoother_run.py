@@ -212,6 +212,14 @@ def test_noise_within_a_second_does_not_determine_accelerometer_errors():
     assert off(smoother.estimates, made, 'scale_factor', 'yaw_mounting_angle') < 3
 
 
+@pytest.mark.parametrize(('rate', 'used'), [(100.0, 20.0), (10.0, 10.0)])
+def test_positions_of_motion_capture_are_thinned_to_20_per_second(rate, used):
+    made = simulate(SimOptions(scenario='indoor', duration=60.0, seed=3, imu_rate=50.0,
+                               reference='mocap', fix_rate=rate))
+    smoother = calibrate(made.leg(), drives.configured(made)).methods['smoother']
+    assert smoother.details['residuals']['fixes'] == pytest.approx(60.0 * used, rel=0.1)
+
+
 @pytest.mark.parametrize(('reference', 'limit', 'noise'), [
     ('mocap', 1e-3, 1e-3), ('total_station', 1e-3, 2e-3), ('slam', 5e-3, None),
     ('amcl', 1e-2, None)])
