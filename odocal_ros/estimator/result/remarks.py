@@ -54,8 +54,8 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_REMEDY = (
-    'Axes: from base_link, x forward, y left, z up. {} With skid steering or tracks, slip in '
-    'turns has this effect: then keep the setting.')
+    'Axes: from base_link, x forward, y left, z up. {} Slip in turns (skid steering, '
+    'tracks) has this effect, and body roll on z: then keep the setting.')
 # by whether imu.lever_arm is set
 IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it first.',
            True: 'A wrong imu.lever_arm has the same effect: check it too.'}
