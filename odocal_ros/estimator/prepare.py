@@ -40,28 +40,29 @@ from odocal_ros.settings.nominal import (
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)
 SPACING = 1.0
-# m/rad, physical: a centre of 1.4 m times the roll of the ground in the mean of a leg, 1.4 %:
-# roads fall by 2 to 2.5 % to the side, for water to run off
+# m/rad, physical: a pitch centre 1.4 m ahead of the odometer times the mean crossfall of a leg,
+# 1.4 %: roads fall by 2 to 2.5 % to the side for drainage
 LIFT_SIGMA = 0.02
-HEIGHT_TIME = 900.0     # s, physical: in which ionosphere and orbits change by their size
+# s, physical: height errors by ionosphere and orbits change by one sigma in this time
+HEIGHT_TIME = 900.0
 
 
 def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats,
                       spans: Floats,
                       rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
     """
-    Return the smoother's view of screened inputs.
+    Return the input of the smoother from screened samples.
 
-    inputs : of ``screen``.   config : lever arms, nominal scale.   origin, fixes_n : Origin, (k,
-    3) where n is fixed and the fixes in it, m; NaN up where a fix has no height.   spans : (s, 2)
-    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of the used data, s
-    (the rest is held out); the stop mark by default.
+    inputs : result of ``screen``.   config : lever arms, nominal scale.   origin : of the frame n.
+    fixes_n : (k, 3) fixes in n, m; NaN up where a fix has no height.   spans : (s, 2) standstills,
+    s.   rough_scale : metres per unit of travel.   t_stop : end of the used data, s (the rest is
+    held out); the stop mark by default.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
     if not inputs.has_accelerometer:         # level ground is assumed: heights are not used
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
-    before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
-    t_begin = min(0.0, float(before[-1][0])) if before else 0.0
+    earlier = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
+    t_begin = min(0.0, float(earlier[-1][0])) if earlier else 0.0
     some = thinned(inputs.t_fix, FIX_RATE)
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
@@ -81,7 +82,7 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
 
 
 def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
-    """Return the problem of a leg; ``imu``: its steps, if keyframes are given."""
+    """Return the estimation problem of a leg; ``imu``: IMU steps with keyframes, else SPACING."""
     imu = ImuSteps.from_leg(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
     still = is_standing(leg, t)
@@ -90,39 +91,41 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
     config = replace(config, imu=with_grade_by_noise(config.imu, at_rest))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
-    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}
-    own = {part.source: part.constants for part in EXTERNAL_FACTORS
-           if part.name in leg.external and part.name not in SHARED}
-    root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
-    made = Problem(
-        leg, imu, grade, _priors(config, grade, leg), use, root, still,
-        {name: sent for name, sent in within.items() if len(sent.t)}, own, total_turn(leg, imu),
-        config.gnss.correlation_time, mean_rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
-        drift_time(leg, t), LEAST.fix if not leg.origin.local
-        or config.reference.points else LEAST.pose)     # a robot stands on marks
+    external = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}
+    own_constants = {part.source: part.constants for part in EXTERNAL_FACTORS
+                     if part.name in leg.external and part.name not in SHARED}
+    whitening = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
+    problem = Problem(
+        leg, imu, grade, _priors(config, grade, leg), use, whitening, still,
+        {name: sent for name, sent in external.items() if len(sent.t)}, own_constants,
+        total_turn(leg, imu), config.gnss.correlation_time,
+        mean_rates_at(leg.t_imu, leg.w_b, t), imu.swings(), drift_time(leg, t),
+        # poses can be from motion capture; fixes and points are less accurate
+        LEAST.fix if not leg.origin.local or config.reference.points else LEAST.pose)
     for part in FACTORS:
-        if part.is_present(made):
-            first, least = part.first_levels(made)
-            made.first_levels = made.first_levels.replaced(**first)
-            made.least |= least
-    # with vibration, most of which cancels within a second: initial levels that decrease
+        if part.is_present(problem):
+            first, least = part.first_levels(problem)
+            problem.first_levels = problem.first_levels.replaced(**first)
+            problem.least |= least
+    # initial levels include the vibration; most of it cancels within a second, so the fit then
+    # decreases them
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
-    made.vibrating = {name: max(sigma**2, made.first_levels[name])
-                      for name, sigma in sample_noise(leg, rows).items()}
-    return made
+    problem.vibrating = {name: max(sigma**2, problem.first_levels[name])
+                         for name, sigma in sample_noise(leg, rows).items()}
+    return problem
 
 
 def imperfection_sigmas(grade: Grade) -> Floats:
     """
-    Return the sigmas of IMPERFECT, 0 for none: (k,).
+    Return the usual sigmas of the constants IMPERFECT, 0 for an absent error: (k,).
 
-    Those of the IMU by its grade. A receiver that smooths does so over a second;
-    most have no odometer (SIZE_SPREADS). Clocks differ by 20 ppm.
-    Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
-    slip by 0.4 % for each m/s^2;
-    the path of an axle and that along its pitching body differ by half the square of the angle;
-    a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
-    Over a crest it pitches about the middle of its wheelbase.
+    Errors of the IMU are by its grade. Receivers that smooth do so over a second; most receivers
+    have no odometer, so theirs is a small error with a wide range (SIZE_SPREADS). Clocks differ by
+    20 ppm. The scale of tyres changes by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within
+    about ten minutes, and by slip of 0.4 % for each m/s^2. The path of an axle differs from that
+    along the pitching body by half the square of the pitch. A body pitches by 1.7 deg/g, the rear
+    axle of a car slides by 0.3 deg per m/s^2, both with a delay of 0.1 s. Over a crest the body
+    pitches about the middle of its wheelbase.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     usual = {
@@ -145,15 +148,16 @@ def imperfection_sigmas(grade: Grade) -> Floats:
 
 
 def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
+    """Return the priors of biases and constants; sigma is infinite without a prior."""
     sigma = np.full(layout.M, np.inf)
     sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[layout.ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[layout.GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[layout.IMPERFECT] = np.maximum(imperfection_sigmas(grade), layout.NO_ERROR)
-    # of IMUs as sold, also for a calibrated one: otherwise a bias would be estimated as an axis
-    # error, and change the yaw of a tilted IMU
+    # at least the biases of the grade, also for a calibrated IMU: otherwise a bias would be
+    # estimated as an axis error, and change the yaw of a tilted IMU
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
-    if leg.origin.local:     # an unknown Earth rate is a bias too
+    if leg.origin.local:     # without latitude or north, the unknown Earth rate is a bias too
         gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local.sigma_n)))
     # gravity times the scale error is a bias too
     up = np.hypot(accel, grade.accel_scale_error * G)
@@ -163,18 +167,18 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
-    # definition: of an error in sigmas; a constant one has no effect
+    # definition: the error is in stated sigmas, so 1; with constant sigmas it has no effect
     sigma[layout.BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[layout.FIX_TIME], sigma[layout.FIX_TIME] = np.log(20.0), 0.7
-    # of a coarse speed, 0 to half a step
+    # offset of a coarse speed: 0 (rounded) to half a step (truncated)
     half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
     centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
     for part in EXTERNAL_FACTORS:
         sent = leg.external.get(part.name)
         sigma[part.constants] = (
             layout.NO_ERROR if sent is None else part.prior_sigmas(sent, config))
-    if not leg.has_accelerometer:        # mounting and attitude are not separable: as configured
+    if not leg.has_accelerometer:        # mounting and attitude are not separable: configured
         sigma[layout.ACCEL] = sigma[layout.PITCH] = layout.NO_ERROR
         if 'heading' not in leg.external:
             centre[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR

@@ -27,13 +27,14 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw
 
-# rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
-# are tried for this number of passes
+# rad, passes, judgement: if the heading from accelerations has a larger sigma, it may be wrong:
+# the fit is then also started at the configured yaw, and each start has this number of passes
 AMBIGUOUS_HEADING, TRIAL_PASSES = 0.1, 3
-# initial size of a receiver's own odometer, and s of a leg from which on it is used: ten times the
-# time in which satellites correct it; shorter legs cannot separate it. Tuned: in yards of 300 s
-# with one 5 % off the fit from 0.5 finds a scale and an accelerometer 3 % off instead, 9 to 12
-# sigma in 6 of 6; from 50 so in 1 of 6 (docs/decisions/0019)
+# initial size (S28) of the scale error of an odometer inside the receiver, and s, shortest leg
+# with it: ten times the time constant with which satellites correct that odometer; shorter legs do
+# not determine its error. Tuned on six drives of 300 s in yards with an error of 5 %: from 0.5,
+# the usual size, all fits have scale and accelerometer 3 % off instead, 9 to 12 sigma; from 50,
+# one of six has (docs/decisions/0019)
 LARGE_SIZE, LARGE_SIZE_FROM = 50.0, 200.0
 
 
@@ -64,52 +65,60 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
     """
     Return the fit of a leg.
 
-    From one start, or from two if accelerations do not determine the heading: the likelier after
-    a few passes continues. The offset of a quantised speed is then tested for two usual values.
+    It has one start, or two if accelerations do not determine the heading: the one with the higher
+    likelihood after a few passes continues. The offset of a quantised speed is then compared with
+    those of rounding and of truncation.
     """
     # not stored in a variable: one fit in memory at a time
     return _fix_speed_offset(problem, _fit_from_starts(problem, config, trace), trace)
 
 
-def _fix_speed_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
-    """Return a fit with the offset of a coarse speed fixed to that of truncation or rounding."""
+def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fit:
+    """
+    Return the fit with the offset of a coarse speed fixed: 0 (rounding) or that of truncation.
+
+    It is unchanged if the data do not clearly select one of them.
+    """
     coarse = problem.leg.travel.coarse
     if coarse is None or not coarse.truncation:
-        return now
-    sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
-    found = float(now.state.constants[SPEED_OFFSET])
-    known = coarse.truncation if found > coarse.truncation / 2 else 0.0
-    off, other = (abs(found - x) / sigma for x in (known, coarse.truncation - known))
-    # one correct drive in 2000; a likelihood ratio of 1000 to 1
-    if off > 3.5 or other**2 - off**2 < 2 * np.log(1e3):
-        return now
-    constants = now.state.constants.copy()
-    constants[SPEED_OFFSET] = known
-    summary = now.summary()
-    del now             # the equations of one fit at a time
-    sure = 1e-3 * coarse.step       # practically fixed
-    warm_start = replace(summary, priors=_fix_offset_priors(summary.priors, known, sure),
-                         first=_fix_offset_priors(summary.first, known, sure))
+        return current
+    sigma = float(np.sqrt(current.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
+    estimated = float(current.state.constants[SPEED_OFFSET])
+    usual = coarse.truncation if estimated > coarse.truncation / 2 else 0.0
+    deviation, other_deviation = (
+        abs(estimated - x) / sigma for x in (usual, coarse.truncation - usual))
+    # 3.5 sigma: exceeded by one correct drive in 2000; likelihood ratio of 1000 to 1
+    if deviation > 3.5 or other_deviation**2 - deviation**2 < 2 * np.log(1e3):
+        return current
+    constants = current.state.constants.copy()
+    constants[SPEED_OFFSET] = usual
+    summary = current.summary()
+    del current             # the equations of one fit at a time
+    fixed_sigma = 1e-3 * coarse.step       # practically fixed
+    warm_start = replace(summary, priors=_fix_offset_priors(summary.priors, usual, fixed_sigma),
+                         first=_fix_offset_priors(summary.first, usual, fixed_sigma))
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)
 
 
 def _fix_offset_priors(priors: Priors, value: float, sigma: float) -> Priors:
-    """Return priors with the offset known."""
+    """Return priors with this mean and sigma of the speed offset."""
     constants, centre = priors.constants.copy(), priors.centre.copy()
     constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value
     return replace(priors, constants=constants, centre=centre)
 
 
 def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> Fit:
-    nominal, level = nominal_yaw(config), problem.leg.has_accelerometer
-    start = cold_start(problem.leg, problem.imu, problem.priors, None if level else nominal)
+    """Return the fit from the cold start, or from a second yaw if that has a higher likelihood."""
+    nominal, has_accelerometer = nominal_yaw(config), problem.leg.has_accelerometer
+    start = cold_start(problem.leg, problem.imu, problem.priors,
+                       None if has_accelerometer else nominal)
     starts, passes = [start], config.leg.compute_limit
-    if level and start.yaw_sigma > AMBIGUOUS_HEADING:
+    if has_accelerometer and start.yaw_sigma > AMBIGUOUS_HEADING:
         other = start.with_yaw(nominal)
-        turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
-        starts += [other] * bool(abs(turned) > AMBIGUOUS_HEADING)
+        yaw_difference = wrap(other.state.constants[YAW] - start.state.constants[YAW])
+        starts += [other] * bool(abs(yaw_difference) > AMBIGUOUS_HEADING)
     if len(starts) == 1:
         return fit(problem, start.state, _initial_levels(problem, start), passes, trace=trace)
     trials = (fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
@@ -121,16 +130,16 @@ def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> F
 
 
 def _initial_levels(problem: Problem, start: Start) -> Levels:
-    """Return initial levels: fixes no better than their fit to the odometer track."""
-    wide, wide_up = (max(1.0, (spread / sigma)**2) for spread, sigma in (
+    """Return initial levels; the noise of the fixes is at least their scatter about the track."""
+    factor, factor_up = (max(1.0, (scatter / sigma)**2) for scatter, sigma in (
         (start.fix_scatter, problem.fix_sigma), (2 * start.fix_scatter, problem.height_sigma)))
-    time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
+    correlation_time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     leg = problem.leg
     long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
-    return problem.first_levels.replaced(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE
-                                         * wide_up,
-                                         correlation_time=time, **sizes, **problem.vibrating)
+    return problem.first_levels.replaced(
+        fix=WHITE_SHARE * factor, fix_up=4.0 * WHITE_SHARE * factor_up,
+        correlation_time=correlation_time, **sizes, **problem.vibrating)
 
 
 def missing_samples_reason(leg: SmootherLeg) -> Reason | None:
@@ -138,13 +147,13 @@ def missing_samples_reason(leg: SmootherLeg) -> Reason | None:
     _, t = imu_rows(leg)
     if len(t) < 2:
         return too_few_samples_reason(0, 0.0)
-    beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    return too_few_samples_reason(int(beside.sum()), float(t[-1] - t[0]))
+    within = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+    return too_few_samples_reason(int(within.sum()), float(t[-1] - t[0]))
 
 
 def too_few_samples_reason(fixes: int, seconds: float) -> Reason | None:
     """Return the reason if a number of fixes, or their duration, is too small, else None."""
-    fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
+    fewest, shortest = 10, 20.0     # fixes, s: judgement, with less no cold start is found
     if fixes >= fewest and seconds >= shortest:
         return None
     # rounded down: 19.97 s are less than 20
@@ -157,7 +166,7 @@ def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Lev
     """
     Return the covariance of the constants at a given state: (M, M), ln K first.
 
-    The inverse of the information that the rows hold there, priors of the constants included.
+    It is the inverse of the information of all observations, with the priors of the constants.
     truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
     return Equations(make_problem(leg, config), truth, fitted=True).at(levels).solved().covariance
