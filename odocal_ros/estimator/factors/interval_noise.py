@@ -5,9 +5,10 @@
 Variance components of an interval, and the effect of a unit of each on its rows, (S13).
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
-time is a two-point Gauss rule, exact for the polynomials of constant force and speed, except for
-3 % of the small ones of fourth order (position by gyro noise). Columns of one component times the
-root of its level are independent unit noises (docs/method.md).
+time is a two-point Gauss rule. With constant force and speed the integrand is a polynomial in
+time. The rule is exact up to the third order, and 3 % off for the small terms of fourth order
+(position by gyro noise). Each column is the effect of one independent noise of unit variance: the
+root of its level is a factor on it (docs/method.md).
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
@@ -38,15 +39,15 @@ from odocal_ros.settings.levels import SWAY
 # vehicles, which do not slide, then matches their errors (docs/decisions/0005)
 TURN_SLIDE = 2e-4
 # m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
-# road. Tuned: with a tenth, pitch in yards was 3 sigmas off (docs/decisions/0005)
+# road. Tuned: with a tenth of it, pitch was 3 sigmas off on drives in yards (docs/decisions/0005)
 HEAVE = 2e-3
-# m/rad, by which the pitch of a body within a second lifts its axle beyond the model, as kerbs
-# shorter than a wheelbase do: initial level and lower limit, judgement; each drive has its own
+# m/rad, unmodelled lift of the axle per pitch of the body within an interval, as by kerbs shorter
+# than a wheelbase: initial value and lower limit, judgement; the value is estimated for each drive
 PITCHING, PITCHING_LEAST = 0.03, 1e-4
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
-# rad, total turn: one crossroads does not determine sideslip, two do. Judgement
-NO_TURN = np.pi / 2
+# rad, total turn angle: one corner does not determine sideslip, two do. Judgement
+CORNER_ANGLE = np.pi / 2
 SIDEWAYS = ('side', 'side_turn', 'up')
 # levels of the road, variance per second as those of IMU, and the axis of the vehicle
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
@@ -56,15 +57,15 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(2)[1] / 2
 # rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
 TURNING_RATE = 0.05
-# m in a second, minimum error of an odometer at rest: physical, play of a drive train
+# m, minimum error of the travel of an interval at rest: physical, play of a drive train
 REST_NOISE = 5e-4
-# rad/s, m/s^2, 1 sigma of the motion between samples: judgement, of a car in town
+# rad/s, m/s^2, 1 sigma of the unknown motion within a gap: judgement, of a car in town
 HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
-ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
+ABSENT_VARIANCE = 1e4   # m^2, of travel that is not observed
 
 
 def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
-    """Return the total angle of turns faster than TURNING_RATE, without sign, rad."""
+    """Return the sum of the absolute angles of turns faster than TURNING_RATE, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
     bias = gyro_bias_at_rest(leg, imu)
@@ -77,8 +78,8 @@ def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
 
 def least_sideslip(angle: float) -> float:
     """Return the minimum sideways and vertical noise, m/sqrt(s), by the total turn angle, rad."""
-    tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
-    return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
+    corners = np.clip((angle - CORNER_ANGLE) / CORNER_ANGLE, 0.0, 1.0)
+    return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**corners)
 
 
 def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
@@ -90,7 +91,7 @@ def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     return [Reason(
         Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
         f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to {np.rad2deg(problem.turned):.0f} deg, '
-        f'less than the limit of {np.rad2deg(2 * NO_TURN):.0f} deg. '
+        f'less than the limit of {np.rad2deg(2 * CORNER_ANGLE):.0f} deg. '
         f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed; the uncertainties of the mounting angles '
         'depend on it', 'Drive with left and right turns.')]
 
@@ -106,9 +107,9 @@ class IntervalNoise:
     motion: Motion
     axes: Floats                       # (K, 3, 3) rows: forward, left, up
     imu: Floats                        # (K, 4) factors on the unit noises of IMU
-    road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
+    road: Floats                       # (K, 6) effects of the unit noises of ROAD along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
-    given: Floats                      # (K, 18, g) columns of unit noises, the same
+    given: Floats                      # (K, 18, g) columns of unit noises that are given, too
     component: ClassVar[Ints] = np.array(
         len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
         + [INTERVAL.index(name) for name in ROAD])
@@ -140,7 +141,7 @@ class IntervalNoise:
         return out
 
     def grown(self, by: dict[str, float]) -> Floats:
-        """Return the factors of the variances by new levels, of the road and of IMU: (K, 7)."""
+        """Return factors on the variances along, side, up and of IMU by new levels: (K, 7)."""
         out = np.ones((len(self.road), JUMP))
         out[:, IMU_NOISE] = [by[name] for name in IMU]
         for column, (name, axis) in enumerate(ROAD.items()):
@@ -171,19 +172,19 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.displacement, axis=1) / T
-    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
+    root_path = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     variance_factors = np.ones(
         (K, VARIANCE_FACTOR_COUNT)) if variance_factors is None else variance_factors
-    acting = (share * ~hard, share * hard, share * ~turning, share * turning, share,
-              np.sqrt(2 * motion.half_pitch_variance))
-    road = np.stack([size * ~rest * np.sqrt(variance_factors[:, axis])
-                     for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
+    magnitudes = (root_path * ~hard, root_path * hard, root_path * ~turning, root_path * turning,
+                  root_path, np.sqrt(2 * motion.half_pitch_variance))
+    road = np.stack([magnitude * ~rest * np.sqrt(variance_factors[:, axis])
+                     for axis, magnitude in zip(ROAD.values(), magnitudes, strict=True)], -1)
     extra = _given_variances(motion, leg)
-    still = rest_noise(speed, rest)
-    extra[rest, D] += still
+    still_variance = rest_noise(speed, rest)
+    extra[rest, D] += still_variance
     slow = ~rest & (speed < 1.0)
-    extra[slow, D] += still * (1 - speed[slow, None])
+    extra[slow, D] += still_variance * (1 - speed[slow, None])
     return IntervalNoise(motion, axes, np.sqrt(variance_factors[:, IMU_NOISE]), road, extra,
                          _given_noises(motion, leg, axes, rest))
 
@@ -204,19 +205,19 @@ def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -
         given = np.zeros((len(rest), ROWS, 1))
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]
-    # of unknown length, in the direction of rolling, without the pitching of the body
+    # first column: unknown path length along the rolling direction, without pitching of the body
     size = np.linalg.norm(motion.wheel_displacement, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.wheel_displacement / np.maximum(size, 1e-3), axes[:, 0])
-    total_turn = motion.turning * motion.T[:, 0]
-    most = motion.state.scale * coarse.most * motion.T[:, 0]
+    turn_angle = motion.turning * motion.T[:, 0]
+    path_error = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
     given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
-    given[:, D, 1] = axes[:, 1] * (most * total_turn / 8)[:, None]
+    given[:, D, 1] = axes[:, 1] * (path_error * turn_angle / 8)[:, None]
     return given * ~rest[:, None, None]
 
 
 def rest_noise(speed: Floats, rest: Bools) -> float:
-    """Return the variance of the travel in a second at rest, m^2."""
+    """Return the variance of the travel of an interval at rest, m^2."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s: judgement
     return max(measured, REST_NOISE**2)
 
@@ -233,7 +234,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
 
 
 def _given_variances(motion: Motion, leg: SmootherLeg) -> Floats:
-    """Return variances of the motion within gaps and beside the rows: (K, 18)."""
+    """Return variances of the motion within gaps and outside the odometer samples: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
     # s: motion within a longer step between IMU samples is unknown
