@@ -29,8 +29,8 @@ from odocal_ros.nav.geodesy import A
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
 # m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: 6.4 % of
-# people live above 1500 m, 1.0 % above 2500 m (Tremblay and Ainslie, PNAS 118, 2021): beyond 1.9
-# and 3.1 sigma. Its effect on the scale is 125 ppm
+# people live above 1500 m, 1.9 sigma, 1.0 % above 2500 m, 3.1 sigma (Tremblay and Ainslie, PNAS
+# 118, 2021). Its effect on the scale is 125 ppm
 HEIGHT_UNKNOWN = 800.0
 PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
@@ -39,10 +39,10 @@ def parameter_gradient(f: Floats) -> Floats:
     """Return the derivative G of (ln K, yaw, pitch) by f, (3, 3): docs/method.md (T8)."""
     K = np.linalg.norm(f)
     x, y, z = f
-    level = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # as in mounting_from_forward
+    xz = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # sign as in mounting_from_forward
     return np.array([f / K**2,
-                     [x * y / level / K**2, -level / K**2, z * y / level / K**2],
-                     [-z / level**2, 0.0, x / level**2]])
+                     [x * y / xz / K**2, -xz / K**2, z * y / xz / K**2],
+                     [-z / xz**2, 0.0, x / xz**2]])
 
 
 def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
@@ -55,41 +55,45 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     r = D[-1] - D
     dt = np.diff(t)
     # e = integral of (C_nb db) x r
-    turn = by_step(_turn, r, q_nb)
-    bias = np.einsum('nij,n->ij', turn, dt) * alignment.gyro_bias_sigma
+    effect = by_step(_gyro_error_effect, r, q_nb)
+    bias = np.einsum('nij,n->ij', effect, dt) * alignment.gyro_bias_sigma
     # a misaligned axis j measures a share of the turn about each axis k
-    axes = np.einsum('nij,nk->ijk', turn, by_step(_turned, q_nb)).reshape(3, 9)
+    axes = np.einsum('nij,nk->ijk', effect, by_step(_step_rotations, q_nb)).reshape(3, 9)
     scale, off = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
     # R(u): integral of r from u to the end; a bias step at u acts on all of it
-    slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
-    R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
+    integrals = (r[:-1] + r[1:]) / 2 * dt[:, None]
+    R = np.concatenate([np.cumsum(integrals[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
             'gyro_scale': axes[:, scale] * alignment.gyro_scale_sigma,
             'gyro_axes': axes[:, off] * alignment.gyro_axes_sigma,
-            'gyro_noise': alignment.gyro_noise * root_of(_spread(r, dt)),
-            'gyro_bias_walk': alignment.gyro_bias_walk * root_of(_spread(R, dt))}
+            'gyro_noise': alignment.gyro_noise * root_of(_noise_integral(r, dt)),
+            'gyro_bias_walk': alignment.gyro_bias_walk * root_of(_noise_integral(R, dt))}
 
 
-def _turn(r: Floats, q_nb: Floats) -> Floats:
-    """Return the mean of (C_nb db) x r over each step: (n, 3), (n, 4) to (n - 1, 3, 3)."""
-    turn = -skew(r) @ matrix_from_quat(q_nb)
-    mean = turn[:-1] + turn[1:]
+def _gyro_error_effect(r: Floats, q_nb: Floats) -> Floats:
+    """
+    Return the mean matrix -[r x] C_nb of each step: (n, 3), (n, 4) to (n - 1, 3, 3).
+
+    It maps a gyro error db, rad/s, to (C_nb db) x r, the rate of the chord error, m/s.
+    """
+    effect = -skew(r) @ matrix_from_quat(q_nb)
+    mean = effect[:-1] + effect[1:]
     mean /= 2
     return mean
 
 
-def _turned(q_nb: Floats) -> Floats:
+def _step_rotations(q_nb: Floats) -> Floats:
     """Return the rotation of each step about the axes of b: (n, 4) to (n - 1, 3) rad."""
     step = quat_multiply(quat_conjugate(q_nb[:-1]), q_nb[1:])
     return 2 * step[:, :3] * np.sign(step[:, 3:])
 
 
-def _spread(r: Floats, dt: Floats) -> Floats:
-    """Return the integral of [r x][r x]^T, (3, 3)."""
+def _noise_integral(r: Floats, dt: Floats) -> Floats:
+    """Return the integral of [r x][r x]^T over time, (3, 3) m^2 s: the effect of white noise."""
     mid = (r[:-1] + r[1:]) / 2
     outer = np.einsum('ni,nj,n->ij', mid, mid, dt)
-    spread: Floats = np.trace(outer) * np.eye(3) - outer
-    return spread
+    integral: Floats = np.trace(outer) * np.eye(3) - outer
+    return integral
 
 
 def root_of(covariance: Floats) -> Floats:
@@ -99,9 +103,9 @@ def root_of(covariance: Floats) -> Floats:
     return root
 
 
-def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
+def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                    end: MarkFix) -> Floats:
-    """Return the change of the chord by an odometer delay of 1 s, (3,) m/s."""
+    """Return the chord error per odometer delay, (3,) m/s."""
     # travel is combined with later attitudes: the integral of dC/dt f ds; minus
     # v(end) - v(start), because the travel between the marks is shifted by the delay
     def middle_and_change(q_nb: Floats) -> Floats:
@@ -159,7 +163,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
         'fix_latency': (velocity_change * time_sigma)[:, None],
         'antenna_lever_arm': (C_end - C_start) * lever_arm_sigma,
-        'odometer_delay': (_late_odometer(f, t, D, q_nb, start, end)
+        'odometer_delay': (_odometer_delay_effect(f, t, D, q_nb, start, end)
                            * odometer_time_sigma)[:, None],
         'height': (D[-1] * (np.sqrt(height / 2) if start.height_known and end.height_known
                             else HEIGHT_UNKNOWN) / A)[:, None],
@@ -176,11 +180,11 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
 
 def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
     """Return the second-order error of the scale by attitude drift and heights: (T12)."""
-    share = np.linalg.norm(np.diff(D, axis=0), axis=1)
-    share = share / max(share.sum(), 1e-12)
-    tm = (t[:-1] + t[1:]) / 2 - t[0]
-    mean = share @ tm
-    by_bias = share @ (tm - mean)**2 * np.max(alignment.gyro_bias_sigma)**2
+    weight = np.linalg.norm(np.diff(D, axis=0), axis=1)
+    weight = weight / max(weight.sum(), 1e-12)
+    t_middle = (t[:-1] + t[1:]) / 2 - t[0]
+    mean = weight @ t_middle
+    by_bias = weight @ (t_middle - mean)**2 * np.max(alignment.gyro_bias_sigma)**2
     # random walk of attitude: distance-weighted variance of a Wiener process, 1/6 T when even
     by_noise = alignment.gyro_noise**2 * (t[-1] - t[0]) / 6
     by_height = height_variance / (D[-1] @ D[-1])
@@ -195,7 +199,11 @@ def epochs_between(track: Track, begin: float, end: float) -> slice:
 
 
 def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
-    """Return the displacement of a track by f from t_start to some epochs: (m, 3) m."""
+    """
+    Return the displacement from t_start to the epochs ``rows``, with the solution f: (m, 3) m.
+
+    f : (3,) m per unit of travel, in b.
+    """
     start = track.at(t_start)
     return by_row(lambda P: (P - start) @ f, track.P[rows])
 
@@ -207,7 +215,7 @@ def total_covariance(sources: Iterable[Source]) -> Floats:
 
 def budget_table(sources: Iterable[Source], parameters: Sequence[str],
                  scale: Sequence[float] | Floats) -> dict[str, dict[str, float]]:
-    """Return the one-sigma shares of the parameters; scale : (p,) factors on them (K of ln K)."""
+    """Return the one-sigma effect of each source; scale : (p,) factors on effects (K of ln K)."""
     return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
 

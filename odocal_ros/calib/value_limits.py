@@ -12,10 +12,11 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SCALE_LIMIT, TYRE_SPREAD
 
-# definition: m/s of units of speed
+# definition: units of speed, in m/s
 SPEED_UNITS = {1.0: 'm/s', 1 / 3.6: 'km/h', 0.44704: 'mph', 1852 / 3600: 'knots', 0.3048: 'ft/s',
                0.01: 'cm/s', 1e-3: 'mm/s'}
-# likely cause of a ratio to the nominal scale, by unit of the scale. Physical, definitions
+# likely causes of a wrong scale: by its unit, then its ratio to the nominal one. Physical,
+# definitions
 UNIT_RATIOS = {
     '1': {factor: f'speeds in {name}' for factor, name in SPEED_UNITS.items() if factor != 1}
     | {0.3048: 'speeds in ft/s, or for rad/s of a wheel of this radius in m'},
@@ -24,24 +25,24 @@ UNIT_RATIOS = {
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',
                 0.5: 'counting two edges per pulse (x2)'}}
 PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
-TYRE_CHANGE_LIMIT = 2 * TYRE_SPREAD    # relative change larger than tyres cause: physical
+TYRE_CHANGE_LIMIT = 2 * TYRE_SPREAD    # relative, physical: largest change that tyres cause
 TYRE_CAUSE = 'tyre pressure, wear, load or another tyre'
 OTHER_CAUSE = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
 
-def _probable_unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
-    """Return the probable unit of a scale this far from its nominal, and the setting for it."""
-    for known, what in UNIT_RATIOS.get(unit, {}).items():
-        if abs(ratio / known - 1) < 0.04:      # tolerance for tyres: the ratios are farther apart
+def _likely_cause(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
+    """Return the likely cause and the action, '' if unknown; ratio: scale to ``nominal``."""
+    for typical, what in UNIT_RATIOS.get(unit, {}).items():
+        if abs(ratio / typical - 1) < 0.04:    # tolerance for tyres: the ratios are farther apart
             return f', typical for {what}', (
-                f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or correct the '
+                f'If so, set odometer.nominal_scale to {typical * nominal:.6g}, or correct the '
                 'odometer driver. Otherwise check the odometer. The limit is '
                 'odometer.max_scale_deviation.')
     return '', ''
 
 
 def speed_unit(scale: float) -> tuple[float, str]:
-    """Return the unit of a speed with this scale: in m/s, and its name; '' if unknown."""
+    """Return the nearest unit of a speed, in m/s, and its name; ``scale`` and '' if none is."""
     near_unit = 0.2    # judgement: relative error of a speedometer and of a rough scale
     factor = min(SPEED_UNITS, key=lambda one: abs(scale / one - 1))
     return (factor, SPEED_UNITS[factor]) if abs(scale / factor - 1) < near_unit else (scale, '')
@@ -49,7 +50,11 @@ def speed_unit(scale: float) -> tuple[float, str]:
 
 def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
                  config: Config) -> tuple[Reason, ...]:
-    """Return the reasons by limits of the sigmas and of the deviation from nominal values."""
+    """
+    Return the reasons of a scale or yaw with too large a sigma, or a scale far from nominal.
+
+    nominal_scale : in the unit of the scale, 0 if unknown.   config : the limits.
+    """
     reasons = []
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
     if scale.value is not None:
@@ -60,7 +65,7 @@ def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
                                   f'{100 * relative:.0f} %, too large for a usable value; the '
                                   f'limit is {100 * SCALE_LIMIT:g} %'))
         elif relative > limit:
-            # in the unit of the uncertainty
+            # both in per cent, or both in ppm
             shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else format_relative(limit)
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
                                   f'{format_relative(relative)}; the limit is {shown}'))
@@ -74,14 +79,15 @@ def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
 
 
 def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) -> list[Reason]:
-    """Return SCALE_FAR_FROM_NOMINAL if the scale is; nominal: 0 if unknown."""
-    off = scale / nominal - 1 if nominal else 0.0
-    if abs(off) <= config.odometer.max_scale_deviation:
+    """Return SCALE_FAR_FROM_NOMINAL beyond max_scale_deviation; nominal: 0 if unknown."""
+    deviation = scale / nominal - 1 if nominal else 0.0
+    if abs(deviation) <= config.odometer.max_scale_deviation:
         return []
-    why, do = _probable_unit(off + 1, unit, nominal)
-    of = '' if unit == '1' else f' {unit}'
-    return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+z.1f} % '
-                   f'from the nominal value {nominal:.6g}{why}', do)]
+    cause, action = _likely_cause(deviation + 1, unit, nominal)
+    unit_text = '' if unit == '1' else f' {unit}'
+    text = (f'scale {scale:.6g}{unit_text} is {100 * deviation:+z.1f} % from the nominal value '
+            f'{nominal:.6g}{cause}')
+    return [Reason(Code.SCALE_FAR_FROM_NOMINAL, text, action)]
 
 
 def format_relative(relative: float, sign: str = '') -> str:
@@ -96,7 +102,7 @@ def cause_of_change(relative: float) -> str:
 
 
 def format_change(relative: float) -> str:
-    """Return a relative change as text, in ppm or per cent."""
+    """Return a signed relative change as text: in ppm, or in per cent if at least 0.1 %."""
     if abs(relative) < 1e-3:
         return f'{1e6 * relative:+z.0f} ppm'
     return f'{100 * relative:+.3g} %'
