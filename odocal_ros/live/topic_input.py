@@ -31,10 +31,11 @@ from odocal_ros.output.value_text import counted
 from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config
 
-MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
+# judgement: number of suggested topics; minimum similarity of names by difflib, 1 is equal
+MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4
 SEARCH_PERIOD_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
-STATIC_DEPTH = 100     # judgement: publishers of static transforms
+STATIC_DEPTH = 100     # judgement: queue, one message per publisher of static transforms
 Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
@@ -63,7 +64,7 @@ class StaticTransforms:
         return self._waiting.take()[:2]
 
     def decode(self, raws: list[bytes], sent_ns: list[int]) -> Pairs:
-        """Return the positions that waited for these messages."""
+        """Return the positions that could not be computed without these transforms."""
         return self._reader.rows(raws, sent_ns, self._deserialize)
 
 
@@ -111,17 +112,17 @@ class Input:
         """Return published topics of a suitable type, the most similar name first."""
         usable = set(self.allowed or TYPES)
         own_topics = {p.topic_name for p in self._node.publishers}
-        if self.slot == 'fix':      # most contain the wheel odometry
+        if self.slot == 'fix':      # most topics of these types contain the wheel odometry
             usable -= {'nav_msgs/msg/Odometry', TRANSFORMS}
         names = [name for name, types in self._node.get_topic_names_and_types()
                  if usable & set(types) and name not in own_topics
                  and self._node.count_publishers(name)]
-        # many types may be an odometer: only similar names
+        # many types can be an odometer: only topics with similar names
         return difflib.get_close_matches(self.topic, names, MOST_SUGGESTIONS,
                                          0.0 if self.allowed else NAME_SIMILARITY)
 
     def duplicate_publishers(self) -> str:
-        """Return a warning of several publishers or IMUs on the topic, empty without."""
+        """Return a warning if the topic has several publishers or IMUs, else an empty text."""
         frames = self.reader.frames if self.reader is not None else None
         if frames is not None and frames.other and not self._frame_id:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
@@ -137,7 +138,7 @@ class Input:
                 'mixed; stop all but one')
 
     def find_type(self, config: Config) -> None:
-        """Subscribe once the type is known."""
+        """Find the message type and subscribe; an error is logged and stored in ``trouble``."""
         if self.reader is not None:
             return
         published = [p.topic_type for p in self.publishers[:1]]
@@ -151,14 +152,15 @@ class Input:
             self.trouble = trouble
 
     def subscribe(self, msgtype: str, config: Config) -> None:
-        """Create the reader and the subscription; raise an error for a wrong type."""
+        """Create the reader and the subscription; an OdocalError is raised for a wrong type."""
         if self.allowed and msgtype not in self.allowed:
             raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
                           f'remap {self.name} to another topic')
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
         self._frame_id = config.imu.frame_id
-        # increments need the offered QoS; for optional topics, an idle subscription is not free
+        # wait for a publisher: increments need its QoS, and an optional topic may never have one,
+        # but its subscription would cost CPU time
         if not self.publishers and (self.slot in EXTERNAL_SLOTS
                                     or self._counts_increments(reader)):
             return
@@ -178,7 +180,7 @@ class Input:
 
     @staticmethod
     def _counts_increments(reader: Reader) -> bool:
-        # a lost increment is lost travel, so such a topic is reliable where offered
+        # a lost increment is lost travel, so such a topic uses reliable QoS if it is offered
         return reader.form is not None and reader.form.quantity == 'increment'
 
     def take(self) -> tuple[list[bytes], list[int]]:
@@ -190,7 +192,12 @@ class Input:
 
     def decode(self, raws: list[bytes], received_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
-        """Return (slot, block) pairs of messages; unreadable messages are counted."""
+        """
+        Return (slot, block) pairs of messages; unreadable messages are counted.
+
+        received_ns : their send times, from ``take``.   max_gap_s : longer steps are counted as
+        gaps; None: steps above five intervals.
+        """
         pairs = self._read(self.reader.rows if self.reader else None, raws, received_ns)
         for slot, block in pairs:
             if slot == self.slot:
@@ -202,7 +209,7 @@ class Input:
 
     def readings(self, raws: list[bytes],
                  received_ns: list[int]) -> list[tuple[str, list[Reading]]]:
-        """Return (slot, rows in plain numbers) pairs of a few messages, as ``decode``."""
+        """Return (slot, readings) pairs of a few messages: as ``decode``, but faster."""
         pairs = self._read(self.reader.readings if self.reader else None, raws, received_ns)
         for slot, rows in pairs:
             self._unreported += [row[:2] for row in rows] if slot == self.slot else []
@@ -238,6 +245,7 @@ class Input:
 
     @property
     def newest_ns(self) -> int:
+        """Return the newest usable stamp on the sender's clock, ns."""
         return self.health.newest_ns
 
     def is_flowing(self) -> bool:

@@ -40,8 +40,9 @@ Job: TypeAlias = Callable[[], Any]
 Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
 # By default glibc has an arena for every thread and, once one was freed, takes arrays of up to 32
 # MiB from it: a node kept 100 MiB unused after a leg of an hour at 1 kHz. judgement, of
-# mallopt(3): number of arenas of all threads, bytes from which a block is mapped separately
-OPTIONS = {-8: 2, -3: 2**22}
+# mallopt(3): M_ARENA_MAX, number of arenas of all threads, and M_MMAP_THRESHOLD, bytes from which
+# a block is mapped separately
+MALLOC_OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
 # judgement: s that ~/stop_leg waits for the result. It must answer within 5 s, 1 s of it is for a
 # busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
@@ -54,7 +55,8 @@ class Computed:
     Result of a leg.
 
     results : one for each part; gaps of the IMU separate parts.
-    carried, folded : information of earlier legs, and the number of kept legs added to it.
+    carried : information of the legs that are no longer kept.   folded : number of kept legs, the
+    oldest, that were added to it now.
     """
 
     results: tuple[LegResult, ...]
@@ -86,7 +88,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     carried_before, carried = carried, add_to_carried([result for leg in kept[:folded]
                                                        for result in leg],
                                                       config, carried)
-    # two-point results carry nothing: all are kept
+    # results of the two-point method cannot be added to ``carried``: all legs are kept
     if carried is carried_before and not is_automatic:
         folded = 0
     current = [result for leg in kept[folded:] for result in leg]
@@ -96,10 +98,12 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
 
 def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,
               ) -> tuple[Calibration, Paths]:
+    """Return the combination of the kept legs, at least one, and the paths of the last one."""
     return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> Paths:
+    """Return the paths of a leg in the frame frames.local, empty without a leg."""
     header = Header(frame_id=config.frames.local)
     if result is None:
         return PathMessage(header=header), PathMessage(header=header)
@@ -108,6 +112,7 @@ def leg_paths(result: LegResult | None, config: Config) -> Paths:
 
 
 def _path(track_n: Floats | None, header: Header) -> PathMessage:
+    """Return at most MOST_POSES positions of a track, (n, 3) m, as a message."""
     if track_n is None or not len(track_n):
         return PathMessage(header=header)
     upright = Quaternion(w=1.0)
@@ -119,7 +124,7 @@ def _path(track_n: Floats | None, header: Header) -> PathMessage:
 
 class Worker:
     """
-    Runs jobs one after the other in a thread of its own.
+    Runs jobs one after the other in its own thread.
 
     ``poll`` delivers their results in the calling thread, the executor's: only the job itself
     runs in parallel to the callbacks. A stopping node waits for requested result files and their
@@ -141,6 +146,7 @@ class Worker:
         self._jobs.put((job, then))
 
     def poll(self) -> None:
+        """Deliver the results of finished jobs."""
         while not self._done.empty():
             then, result, error = self._done.get()
             then(result, error)
@@ -166,7 +172,7 @@ class Worker:
 def limit_kept_memory() -> None:
     """Limit the freed memory that is kept; no effect if the C library has no such options."""
     if hasattr(_libc, 'mallopt'):
-        for option, value in OPTIONS.items():
+        for option, value in MALLOC_OPTIONS.items():
             _libc.mallopt(option, value)
 
 
@@ -220,6 +226,7 @@ class Computing:
         self._worker.submit(job, then)
 
     def drop(self) -> None:
+        """Ignore the result of the active job."""
         self._job = None
 
     def create_future(self, patience_s: float = math.inf) -> Future:
@@ -229,12 +236,13 @@ class Computing:
         return future
 
     def answer(self, success: bool, text: str) -> None:
+        """Answer all waiting callers."""
         waiting, self._waiting = self._waiting, []
         for future, _ in waiting:
             future.set_result((success, text))
 
     def answer_late(self, text: Callable[[], str]) -> None:
-        """Answer callers whose waiting time is over; the job continues."""
+        """Answer the callers that have waited for their ``patience_s``; the job continues."""
         now = time.monotonic()
         expired = [future for future, until in self._waiting if until <= now]
         self._waiting = [(future, until) for future, until in self._waiting if until > now]
