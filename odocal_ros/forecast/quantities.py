@@ -4,8 +4,8 @@
 """
 Quantities of a leg: which are observable with the settings, and which are within their limits.
 
-The former is by the code that processes recorded drives. The latter is yes, no or unknown, while a
-leg is recorded and after it.
+Before a leg, the functions that process recorded drives decide which are observable. While it is
+recorded and after it, each quantity has yes, no or unknown: whether its sigma is within the limit.
 """
 
 from collections.abc import Sequence, Set
@@ -45,9 +45,9 @@ YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
 @dataclass(frozen=True)
 class Received:
-    """Samples received before the start mark."""
+    """What the samples before the start mark contain."""
 
-    variances: dict[str, float]     # of the yaw by its source, rad^2; inf if none is sent
+    variances: dict[str, float]     # stated for the yaw, by source, rad^2; inf if none is sent
     rested_s: float = 0.0           # length of the current or last standstill
     latitude: float = 0.7           # rad
     height: bool = True             # the fixes have a height
@@ -58,10 +58,10 @@ class Received:
 
 @dataclass(frozen=True)
 class Observability:
-    """Observable quantities, unobservable ones with the cause, and a limitation of all values."""
+    """Quantities as texts, and a limitation of all of them."""
 
-    can: tuple[str, ...]
-    cannot: tuple[str, ...]
+    can: tuple[str, ...]        # observable
+    cannot: tuple[str, ...]     # not observable, with the cause
     weak: str = ''
 
     def as_text(self) -> str:
@@ -74,7 +74,7 @@ class Observability:
 
 
 def find_observable(config: Config, received: Received) -> Observability:
-    """Return the values that a leg can estimate with these settings, and those it cannot."""
+    """Return the quantities that a leg determines with these settings, and those it does not."""
     drive = config.odometer.drive
     if not received.imu or drive != DIFFERENTIAL:
         return Observability(PLANAR_QUANTITIES[drive], (
@@ -95,6 +95,7 @@ def find_observable(config: Config, received: Received) -> Observability:
 
 
 def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) -> tuple[bool, str]:
+    """Return (is observable, text) of the yaw with some methods."""
     if METHOD_WITHOUT_HEADING in methods:
         return True, 'the yaw (from stops, starts and turns)'
     alignment = _expected_alignment(config, received)
@@ -110,6 +111,7 @@ def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) ->
 
 
 def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
+    """Return (is observable, text) of each quantity of two wheels."""
     if METHOD_WITHOUT_HEADING not in deciding_methods(config.method):
         return [(False, f'left and right wheel separately (method {config.method} uses their '
                  'mean)')]
@@ -118,7 +120,7 @@ def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
 
 
 def _expected_alignment(config: Config, received: Received) -> Alignment:
-    """Return the alignment of a straight drive from the current position."""
+    """Return the alignment of a planned straight drive that starts from this standstill."""
     rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = drive_from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
@@ -135,7 +137,11 @@ def stated_variance(sent: Oriented) -> float:
 
 
 def with_heading(config: Config, variances: dict[str, float]) -> Config:
-    """Return config with the heading source and sigma that the alignment will find."""
+    """
+    Return config with the heading source and sigma that the alignment will use.
+
+    variances : stated variance of the yaw by source, rad^2; inf if none is sent.
+    """
     alignment = config.alignment
     source, sigma = alignment.source, max(alignment.heading_sigma, EXACT_HEADING)
     if source == 'fixed' and math.isnan(alignment.heading):
@@ -159,12 +165,12 @@ class Quantity:
     estimates: tuple[str, ...]
     relative: bool
     of_two_wheels: bool = False
-    of_imu: bool = False      # the planar estimator has none
+    of_imu: bool = False      # a mounting angle: not estimated by the planar estimator
 
     def limit(self, config: Config) -> float:
         """Return the limit of the sigma, relative to the value or rad."""
         if self.estimates[0] == 'track_width':
-            # no setting verdict.*: the limit of the method
+            # it has no setting verdict.*, only the limit of the estimator
             return TRACK_WIDTH.determined_share
         return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
 
@@ -186,10 +192,11 @@ def all_unknown() -> dict[str, str]:
 def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
                    lost: bool = False) -> dict[str, str]:
     """
-    Return yes, no or unknown for each quantity of a leg that ends now.
+    Return yes, no or unknown for each quantity, as if the leg ended now.
 
-    Unknown before the first update; a configured track width need not be determined.
-    ``lost``: the leg would be rejected: no value is within its limit.
+    forecast : None before its first update: unknown.   two_wheels : the odometer has two wheels.
+    lost : the leg would be rejected: no value is within its limit. A configured track width that
+    is not determined is unknown, not no.
     """
     if forecast is None:
         return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else \
@@ -212,14 +219,14 @@ def check_calibration(calibration: Calibration, config: Config, two_wheels: bool
 def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
                     names_with_reason: Set[str] = frozenset()) -> dict[str, str]:
     """
-    Return yes, no or unknown for each quantity: within its limit.
+    Return yes, no or unknown for each quantity: whether its sigma is within the limit.
 
     valid : False: no value is usable.   names_with_reason : estimates with a reason against their
     use.
     """
     planar = any(e.method == PLANAR for e in estimates.values())
     known: dict[str, float | None] = {}
-    bad = set()
+    unusable = set()
     for name, quantity in QUANTITIES.items():
         found = [estimates.get(part) for part in quantity.estimates]
         if quantity.of_imu and planar:
@@ -229,12 +236,12 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
             continue
         known[name] = max(_sigma_or_infinity(e, quantity.relative) for e in found)
         if not valid or names_with_reason & set(quantity.estimates):
-            bad.add(name)
-    return _check_sigmas(known, config) | dict.fromkeys(bad, NO)
+            unusable.add(name)
+    return _check_sigmas(known, config) | dict.fromkeys(unusable, NO)
 
 
 def status_keys(ok: dict[str, str]) -> dict[str, str]:
-    """Return the keys of ``~/status``."""
+    """Return the entries of ``~/status``: yes, no or unknown by key, such as ``yaw_ok``."""
     return {f'{name}_ok': value for name, value in ok.items()}
 
 

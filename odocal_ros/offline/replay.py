@@ -37,14 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='time series files, separated by commas or repeatable: trajectory.tum, states.csv, '
         'residuals.parquet, track.kml, scale_by_speed.png, debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
-    parser.set_defaults(brief=False)
+    parser.set_defaults(brief=False)      # only ``odocal try`` prints the short form
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
 def add_input_arguments(parser: argparse.ArgumentParser,
                         default: str = 'the only topic of a fitting type') -> None:
-    """Declare the options for settings and topics; ``default``: the topic without an option."""
+    """Declare the options for settings and topics; default: its text in the help of a topic."""
     add_settings_arguments(parser)
     for slot in TOPICS:
         parser.add_argument(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
@@ -59,7 +59,7 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) -> None:
-    """Declare the calibration options, for one vehicle or for a fleet."""
+    """Declare the calibration options; topics: ``default`` of ``add_input_arguments``, if any."""
     add_input_arguments(parser, **topics)
     add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
 def output_folder(name: str | None, bag: str, force: bool) -> Path:
     """Return the folder for the results; BadUsage if it has results and ``force`` is false."""
     output = Path(name or f'odocal_{one_line(Path(bag).stem)}')
-    if (output / 'calibration.json').exists() and not force:      # before the work
+    if (output / 'calibration.json').exists() and not force:      # before the long computation
         raise BadUsage(f'{output}/calibration.json already exists; give --force to replace it, '
                        'or another --output')
     return output
@@ -124,7 +124,11 @@ class _Screen(Listener):
 
 
 def config_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the requested settings: --config < --set < --accept and --method, each checked."""
+    """
+    Return the requested settings; an invalid one raises an OdocalError.
+
+    --set takes precedence over --config; --accept, --strict and --method over both.
+    """
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.config_groups import parse_accept
     settings = settings_from_arguments(args)
@@ -139,12 +143,14 @@ def config_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def settings_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of --config and --set; the latter take precedence."""
     from odocal_ros.settings.config_file import parse_set, read_config_file
     settings = read_config_file(Path(args.config)) if args.config else {}
     return settings | dict(parse_set(text) for text in args.settings)
 
 
 def topics_from_arguments(args: argparse.Namespace) -> dict[str, str]:
+    """Return the requested topics by slot."""
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
@@ -152,11 +158,12 @@ def _terminal_size(stream: Any) -> tuple[int, int | None]:
     """Return columns, at most 98, and rows of a terminal; None rows without a terminal."""
     if not stream.isatty():
         return 98, None
-    columns, rows = get_terminal_size()      # 80, 24 if it gives none
+    columns, rows = get_terminal_size()      # 80, 24 if unknown
     return max(40, min(98, columns)), rows
 
 
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
+    """Write and print the result; return the exit code."""
     from odocal_ros.output.files import Results
     from odocal_ros.output.stored import objection_to_folder, stored_in
     from odocal_ros.output.summary import sentence
@@ -181,12 +188,12 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
         elif not args.quiet:
             _show_files(output, written, results.report * (not report_error))
             if not args.brief:
-                print_text(sentence(calibration.result))      # again, since it scrolled away
+                print_text(sentence(calibration.result))      # again: the first has scrolled away
         return _exit_code(calibration.result, calibration.config, args)
 
 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
-    """Return 0 for a good result, after printing the decision on limits."""
+    """Return the exit code, after printing the decision on the acceptance limits, if any."""
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.output.value_text import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
@@ -202,14 +209,15 @@ def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespa
     return OK if acceptance.decision is Decision.PASS else REJECTED
 
 
-def _show(calibration: 'Combined', args: Any) -> OSError | None:
+def _show(calibration: 'Combined', args: argparse.Namespace) -> OSError | None:
     """Print the result before the report is drawn; return an error of the stream, or None."""
     from odocal_ros.output.summary import screen
     columns, rows = _terminal_size(sys.stdout)
     styled = (sys.stdout.isatty() and 'NO_COLOR' not in os.environ
               and os.environ.get('TERM') != 'dumb')
+    lines_below = 9      # files, report and verdict, printed afterwards
     try:
-        print_text(screen(calibration, styled, columns, rows and rows - 9, args.brief))
+        print_text(screen(calibration, styled, columns, rows and rows - lines_below, args.brief))
         if args.holdout:
             print_text('\ntrack against fixes: last fifth of each leg, excluded from the fit')
         sys.stdout.flush()
@@ -219,6 +227,7 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
 
 
 def _show_files(output: Path, written: list[Path], report: list[Path]) -> None:
+    """Print the names of the written files, and of the report if it was drawn."""
     columns, rows = _terminal_size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'
     print_text('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,

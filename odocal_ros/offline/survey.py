@@ -20,20 +20,21 @@ from odocal_ros.settings.config import Config, GnssConfig
 from odocal_ros.settings.nominal import G
 
 AXES = 'xyz'
-# tuned by benchmarks/odometer_fields.py and 3 real drives: true odometers explain 0.90 or more of
-# the variance of the distances, engine speed, gear and consumed energy 0.98 or less, time and
-# temperature 0.48 or less; where fix errors are most of the variance (always 1 m/s, fixes of
-# 0.8 m), odometers 0.65
+# minimum share of the variance of the distances between fixes that an odometer explains, and that
+# if the rest is within the fix errors. Tuned by benchmarks/odometer_fields.py and 3 real drives:
+# odometers explain 0.90 or more, time and temperature 0.48 or less; engine speed, gear and
+# consumed energy up to 0.98, so this does not exclude them. Where fix errors are most of the
+# variance (always 1 m/s, fixes of 0.8 m), odometers explain 0.65
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
 RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; equal stamps have such rates
 FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
-# s, judgement: less than the spread of delays if stamps are rounded down to seconds, 0.24 s;
-# epochs of a receiver at whole seconds have one of some ms
-LOST_FRACTION = 0.15
+# s, judgement: delays have a standard deviation of 0.24 s if stamps are rounded down to seconds,
+# of some ms if a receiver has its epochs at whole seconds
+WHOLE_SECONDS_LIMIT = 0.15
 
 
 def rate_of(count: int, seconds: float) -> float | None:
-    """Return a rate, Hz; None if it is unknown, since stamps are equal or almost equal."""
+    """Return a rate, Hz; None if it is unknown because stamps are equal or almost equal."""
     rate = count / seconds if seconds > 0 else 0.0
     return rate if 0 < rate < RATE_LIMIT_HZ else None
 
@@ -44,8 +45,9 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     Return rate, gaps and irregular stamps of a topic.
 
     ``at`` is in seconds from the bag's first message; ``header_to_bag`` is the median delay from
-    header stamp to recording, s, None without a header; ``arrival_jitter`` is the standard
-    deviation of arrivals without a header, s; ``whole_seconds``: the stamps lack the fraction.
+    header stamp to recording, s, and ``header_to_bag_spread`` its standard deviation, None without
+    a header; ``arrival_jitter`` is the standard deviation of arrivals without a header, s;
+    ``whole_seconds``: the stamps are rounded down to seconds.
     """
     stamped = samples.stamp_ns > 0
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
@@ -59,14 +61,14 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     delay: Floats = np.multiply(received - stamp, 1e-9)
     spread = None if headerless or not len(delay) else float(
         np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4)
-    # mean between the gaps: bursts and gaps are no rate
+    # mean rate outside the gaps; the median interval would be wrong with bursts
     running = float(rising.sum() - step[gaps].sum())
     return {
         'rate_hz': rate_of(len(rising) - len(gaps), running),
         'headerless': headerless,
         'header_to_bag': None if headerless or not len(delay) else median(delay),
         'header_to_bag_spread': spread,
-        'whole_seconds': bool(len(stamp) and (spread or 0.0) > LOST_FRACTION
+        'whole_seconds': bool(len(stamp) and (spread or 0.0) > WHOLE_SECONDS_LIMIT
                               and (stamp % 10**9 == 0).all()),
         'arrival_jitter': arrival_jitter(
             np.maximum.accumulate(stamp - start_ns) * 1e-9) if headerless else None,
@@ -77,7 +79,12 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
 
 
 def imu_facts(samples: ImuSamples) -> dict[str, Any]:
-    """Return gravity, units and orientation of an IMU topic."""
+    """
+    Return gravity, units and orientation of an IMU topic.
+
+    ``gravity`` is in its unit; ``tilt_from_axis``, rad, is the angle to ``gravity_axis``;
+    ``fastest_turn`` is the 99.9 % quantile of the turn rate; ``yaw_sigma`` is in rad.
+    """
     samples = without_invalid_orientations(samples)
     f_i = samples.f_i[~is_impossible('f_i', samples.f_i)]
     w_i = samples.w_i[~is_impossible('w_i', samples.w_i)]
@@ -86,8 +93,8 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
     axis = int(np.argmax(np.abs(mean)))
     fast = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
     has_orientation = ~np.isnan(samples.yaw_variance)
-    turned = has_orientation & (reduce_columns(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
-    variance = samples.yaw_variance[turned]
+    rotated = has_orientation & (reduce_columns(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
+    variance = samples.yaw_variance[rotated]
     known = variance[variance > 0]
     return {
         'gravity': size, 'gravity_axis': f'{"+" if mean[axis] > 0 else "-"}{AXES[axis]}',
@@ -98,7 +105,7 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
         'fastest_turn': fast,
         'not_finite': len(samples.stamp_ns) - min(len(f_i), len(w_i)),
         # an identity that never changes is a default, not an attitude
-        'orientation': bool(turned.mean() > 0.5) if len(turned) else False,
+        'orientation': bool(rotated.mean() > 0.5) if len(rotated) else False,
         'orientation_refused': float((~has_orientation).mean()) if len(has_orientation) else 0.0,
         'yaw_sigma': float(np.sqrt(np.median(known))) if len(known) else None}
 
@@ -114,6 +121,7 @@ def odometer_facts(samples: OdometerSamples, form: OdometerForm) -> dict[str, An
 
 
 def fix_facts(samples: FixSamples) -> dict[str, Any]:
+    """Return status counts, stated sigmas (m), resolution (m) and heights (m) of a fix topic."""
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~is_impossible('covariance_n', covariance)
@@ -134,7 +142,7 @@ def fix_facts(samples: FixSamples) -> dict[str, Any]:
 def _grid_step(latitude: Floats) -> float | None:
     """Return the resolution of latitudes, m, if it is coarser than 5 mm, else None."""
     steps = np.abs(np.diff(np.unique(latitude))) * 6.37e6
-    steps = steps[steps > 1e-6]        # below that it is the last bit
+    steps = steps[steps > 1e-6]        # smaller ones are rounding errors of the number format
     if len(steps) < 10 or np.median(steps) < 0.005:
         return None
     step = float(steps.min())
@@ -144,11 +152,11 @@ def _grid_step(latitude: Floats) -> float | None:
 
 @dataclass(frozen=True)
 class Match:
-    """Comparison of a travel with the path of the fixes."""
+    """Comparison of a travel (sum of an odometer signal) with the path of the fixes."""
 
     explained: float     # share of the variance of the distances that the travel explains
     scale: float         # m per unit of travel, negative if it decreases with distance
-    follows: bool        # it is proportional to the distance, within the errors of the fixes
+    follows: bool        # the travel is proportional to the distance, within the fix errors
 
 
 # definition: result without a comparison
@@ -180,10 +188,10 @@ class FixPath:
         if not run.any() or not np.ptp(length):
             return NO_MATCH
         scale = float(length.sum() / run.sum())
-        left = float(np.mean((length - scale * run)**2))
-        explained = 1 - left / float(np.var(length))
+        residual_variance = float(np.mean((length - scale * run)**2))
+        explained = 1 - residual_variance / float(np.var(length))
         follows = explained >= EXPLAINED or (
-            explained >= EXPLAINED_OF_NOISE and left <= self.sigma**2)
+            explained >= EXPLAINED_OF_NOISE and residual_variance <= self.sigma**2)
         return Match(explained, scale if step.sum() >= 0 else -scale, follows)
 
 
@@ -202,9 +210,10 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     path_length = path_and_chord(t, fixes_n)[0]
     if path_length == 0:
         return None
-    # of a usual cell: fix noise of both ends is below 15 % of its length, s and m
-    shortest, longer_than_noise = 4.0, 10.0
-    cell = max(shortest, longer_than_noise * fix_white_noise(fixes_n) * (t[-1] - t[0])
+    # duration of a cell, s: its mean path length is ten times the fix noise or more, so that the
+    # noise of both ends is below 15 % of it
+    shortest, noise_ratio = 4.0, 10.0
+    cell = max(shortest, noise_ratio * fix_white_noise(fixes_n) * (t[-1] - t[0])
                / path_length)
     knots = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], cell)))
     return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
@@ -212,12 +221,12 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
 
 
 def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floats, list[float]]:
-    """Return (k, 2) s of the standstills, and lowest and highest speed, m/s, 0 without a scale."""
+    """Return standstills, (k, 2) s, and lowest and highest speed, m/s; scale: 0 if unknown."""
     if len(inputs.t_imu) <= 3:
         return np.empty((0, 2)), [0.0, 0.0]
-    at_speed = 1.0    # s, over which a speed is computed
-    t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
-    speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
+    interval = 1.0    # s, over which a speed is computed
+    t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - interval, interval / 2)
+    speed = np.abs(inputs.travel.at(t + interval) - inputs.travel.at(t)) * scale / interval
     return (inputs.standstills(scale or 1.0, config),
             [float(speed.min()), float(speed.max())] if len(t) else [0.0, 0.0])
 
@@ -227,25 +236,26 @@ def straight_stretches(inputs: Inputs, located: LocatedFixes,
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
     if not located.rough or len(inputs.t_fix) < 3:
         return []
-    points = 600    # fixes tested for straight sections, evenly selected
-    pick = np.unique(np.linspace(0, len(inputs.t_fix) - 1, points).astype(int))
-    t, p = inputs.t_fix[pick], located.fixes_n[pick, :2]
+    most_fixes = 600    # fixes tested for straight sections, evenly selected
+    selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, most_fixes).astype(int))
+    t, p = inputs.t_fix[selected], located.fixes_n[selected, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
     is_long = chord >= shortest
-    # the rough scale cuts corners; the straightest sections determine it best
+    # the rough scale is too small in curves, where chords are shorter than the path: the
+    # straightest sections determine it best
     ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
     path_length = travel * max(located.rough, min(best, 1.2 * located.rough))
     # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
     # both end points have errors of sigma: a section within these errors is accepted
-    fit = np.triu((chord >= straight * path_length - located.fix_sigma)
-                  & (path_length >= shortest)
-                  & (chord <= path_length / straight + 4 * located.fix_sigma))
+    suitable = np.triu((chord >= straight * path_length - located.fix_sigma)
+                       & (path_length >= shortest)
+                       & (chord <= path_length / straight + 4 * located.fix_sigma))
     found: list[tuple[float, float]] = []
-    while fit.any():
-        i, j = np.unravel_index(np.argmax(np.where(fit, path_length, 0)), fit.shape)
+    while suitable.any():
+        i, j = np.unravel_index(np.argmax(np.where(suitable, path_length, 0)), suitable.shape)
         found.append((float(t[i]), float(t[j])))
-        fit[:j + 1, i:] = False            # all that overlap it
+        suitable[:j + 1, i:] = False            # all that overlap it
     return found
