@@ -180,10 +180,10 @@ class Code(Enum):
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
-    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. For fix errors '
-                                      'use better positions (RTK), for IMU noise a better IMU. '
-                                      'For slip use a wheel that is not driven. The limit is '
-                                      'verdict.max_scale_sigma.')
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. Reduce the '
+                                      'largest error. Fix errors: use better positions (RTK). '
+                                      'IMU noise: use a better IMU. Slip: use a wheel that is '
+                                      'not driven. The limit is verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '
                                     'verdict.max_yaw_sigma.')

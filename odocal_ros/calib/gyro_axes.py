@@ -117,8 +117,8 @@ def _inverted_turns(orientation: ImuOrientation, found: Found,
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
-        return (Reason(Code.IMU_AXES, f'{seen}, and the turn of gravity about {found[0][0]} is '
-                       f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
+        return (Reason(Code.IMU_AXES, f'{seen}, and gravity rotates about {found[0][0]} opposite '
+                       f'to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
                        + NO_ROTATION),)
     return (Reason(Code.GYRO_SIGN, f'{seen}: the sign of angular_velocity.{names[2][-1]}, or of '
@@ -150,7 +150,7 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
 
 def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
                names: list[str]) -> Found:
-    """Return the gyro axes that measure the turn of gravity about another axis."""
+    """Return the gyro axes that measure the rotation of gravity about another axis."""
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough)
     found: Found = []
     if fit is None:
@@ -164,8 +164,8 @@ def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, 
             continue
         along, part = (names[0], c.real) if first[k] else (names[1], c.imag)
         sent, true = _measured(names[k], along, float(part))
-        found.append((sent, true, f'angular_velocity.{sent} measures the turn of gravity about '
-                      f'{true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
+        found.append((sent, true, f'angular_velocity.{sent} measures the rotation of gravity '
+                      f'about {true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
     return found
 
 

@@ -193,8 +193,8 @@ def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
         if len(at):
             found.append(Reason(code, (
                 f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '
-                f'{len(at)} place{"s" * (len(at) > 1)} {where}, {"most " * (len(at) > 1)}at t = '
-                f'{at[np.argmax(size)]:.0f} s')))
+                f'{len(at)} place{"s" * (len(at) > 1)} {where}, {"the largest " * (len(at) > 1)}'
+                f'at t = {at[np.argmax(size)]:.0f} s')))
     return found
 
 

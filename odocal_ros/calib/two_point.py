@@ -277,7 +277,8 @@ def _plane_reasons(check: dict[str, dict[str, float]], K: float,
     # relative: a plane about the leg preserves ratios of chords far better
     limit = 3e-5 + 0.2 * sigma_relative
     if worst > limit:
-        return (Reason(Code.PLANES_DISAGREE, 'the scale as ratio of chords, in a map plane or on '
-                       f'the ellipsoid, differs by {format_relative(worst)} from the estimated '
-                       f'scale; the limit is {format_relative(limit)}'),)
+        return (Reason(Code.PLANES_DISAGREE, 'the scale from the straight-line distance between '
+                       'the marks (in a map plane or on the ellipsoid) differs by '
+                       f'{format_relative(worst)} from the estimated scale; the limit is '
+                       f'{format_relative(limit)}'),)
     return ()

@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'and bag), or bags, folders of bags, globs, URLs')
     add('--output', required=True, metavar='DIR', help='folder for rows and results; all workers '
         'must have access')
-    add('--vehicle-from', metavar='PATTERN', help='regular expression on the path of a bag whose '
-        "group names the vehicle (default: the bag's folder)")
+    add('--vehicle-from', metavar='PATTERN', help='regular expression for the path of a bag; '
+        "its group is the name of the vehicle (default: the bag's folder)")
     add('--scheduler', metavar='ADDRESS', help='Dask cluster, such as tcp://host:8786 (default: '
         'local processes)')
     add('--workers', type=_positive_count, metavar='N', help='number of local processes (default: '
@@ -60,8 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'(default {TIMEOUT:g})')
     add('--task-memory', type=_byte_count, default=2 * GIB, metavar='SIZE', help='memory limit '
         'per bag (default 2G)')
-    add('--tries', type=_positive_count, default=3, metavar='N', help='retries of a bag that '
-        'ends its local worker (default 3)')
+    add('--tries', type=_positive_count, default=3, metavar='N', help='attempts for a '
+        'bag whose local worker process ends (default 3)')
     add('--again', action='store_true', help='retry bags that failed')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
         'get a report of their own')

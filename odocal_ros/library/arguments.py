@@ -156,7 +156,7 @@ def parse_leg(text: str) -> LegSpan:
         raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
     (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
     if start is not None and stop is not None and rel_a == rel_b and stop <= start:
-        raise BadUsage(f'--leg {text}: the end is not after the start')
+        raise BadUsage(f'--leg {text}: the end is not after the start; give the start first')
     return LegSpan(start, stop, (rel_a, rel_b))
 
 

@@ -167,7 +167,7 @@ def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
         similar = difflib.get_close_matches(topic, topics, 1)
-        wrong = 'no such topic' + (f'; did you mean {similar[0]}?' if similar else '')
+        wrong = 'no such topic' + (f' (did you mean {similar[0]}?)' if similar else '')
     elif not topics[name].count:
         wrong = 'the topic has no message'
     elif not _fits_slot(topics[name].msgtype, slot):

@@ -177,8 +177,8 @@ class LegJournal:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size
             if taken + size > self.plan.limit:
-                self._give_up(f'{self.plan.root}: the journals reach {self.plan.limit} bytes, the '
-                              'limit; raise journal.max_bytes')
+                self._give_up(f'{self.plan.root}: the journals reach their limit of '
+                              f'{self.plan.limit} bytes; raise journal.max_bytes')
                 return
         self._bag.append(self._waiting)
         self._waiting = []

@@ -66,7 +66,7 @@ def _head(plan: Planned) -> list[str]:
     lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
              f'the start mark, {stands[1]} at the end mark; marks {length(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
-             f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m at '
+             f'(sigma {math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m at '
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in plan.methods:
         slip = 1000 * sigmas.slip

@@ -66,12 +66,12 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
     add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
-        help='method that gives the result (wheels: the smoother; patent: the smoother with the '
-        'search of two wheels beside it; all: each method)')
+        help='method that gives the result (wheels: alias of smoother; patent: smoother, plus '
+        'the search of two wheels; all: each method)')
     add('--accept', action='append', default=[], metavar='NAME=LOW:HIGH',
         help='acceptance limits for value plus and minus 2 sigma, such as '
         'yaw_mounting_angle_deg=-0.5:0.5; repeatable; prints one line of JSON per vehicle')
-    add('--strict', action='store_true', help='a caution exits with 1 and does not pass')
+    add('--strict', action='store_true', help='a caution does not pass; exit code 1')
 
 
 def run(args: argparse.Namespace) -> int:

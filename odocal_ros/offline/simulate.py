@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--scenario', required=True, metavar='NAME',
         help='paper, straight, out_and_back, town, motorway, oval, yard, indoor or square')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
-        'calibrator.yaml are written to the same folder')
+        'calibrator.yaml are written next to it')
     add('--seed', type=int, metavar='N', help='seed of all random numbers (default 1); each seed '
         'gives another date')
     add('--imu-grade', metavar='GRADE',
@@ -93,11 +93,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--two-wheels', action='store_true', default=None, help='left and right odometer')
     add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1; indoor '
         '2); more than 2 are joints of one JointState')
-    add('--drive', metavar='KIND', help='of a robot (indoor, square): differential (default), '
-        'skid, mecanum (4 wheels) or omni (3 or more), with sideways moves')
+    add('--drive', metavar='KIND', help='drive of a robot (indoor, square): differential '
+        '(default), skid, mecanum (4 wheels) or omni (3 or more), with sideways moves')
     add('--no-imu', action='store_const', const=False, dest='imu', help='a robot without an IMU')
     add('--front-fixed', action='store_const', const=False, dest='front_steers',
-        help='the front ones of more than 2 wheels do not steer')
+        help='with more than 2 wheels: the front wheels do not steer')
     add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default), or positions in a '
         'local frame with the usual errors of their kind: mocap, total_station, slam (indoor, '
         'square: default) or amcl; pose: PoseStamped with the errors of fixes')

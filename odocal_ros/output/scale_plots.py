@@ -72,9 +72,9 @@ def by_window(found: Floats, name: str) -> style.Drawing:
     ax.set(xscale='log', xlabel='length of the window, s', ylabel='fixes / track - 1, %')
     ax.set_xticks(length, [f'{x:g}' for x in length], minor=False)
     ax.set_xticks([], minor=True)
-    text = ('Displacement from the fixes divided by that of the calibrated track, in windows of '
-            'seconds to minutes, ± their scatter over eight parts of the leg. A level line at 0 '
-            'shows that fix errors do not depend on the motion. If short windows differ, the '
+    text = ('Ratio of displacements, fixes to calibrated track, minus 1, in windows of seconds to '
+            'minutes. Bars: one sigma, from the scatter over eight parts of the leg. A level line '
+            'at 0 shows that fix errors do not depend on the motion. If short windows differ, the '
             'fixes contain an odometer, or are filtered or late.')
     picture = style.svg(figure, f'{name}-by-window', text)
     return 'Scale against the length of the window', text, picture

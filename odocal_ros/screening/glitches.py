@@ -225,6 +225,6 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
     if not found:
         return ()
     count, t, words = max(found)
-    others = f'; {len(found) - 1} more such limits' if len(found) > 1 else ''
+    others = f'; other axis limits reached: {len(found) - 1}' if len(found) > 1 else ''
     return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
                    f't = {t:.1f} s{others}'),)

@@ -128,7 +128,7 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
         return (Reason(Code.WHEEL_DEAD, f'the {two.names[weak]} wheel does not count: its travel '
                        f'is {percent_text(rolled[weak], rolled.max())} of that of the '
                        f'{two.names[1 - weak]} wheel (limit {100 * STILL_SHARE:g} %). The mean of '
-                       'both is not the travel'),)
+                       'both wheels is not the travel of the vehicle'),)
     left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
@@ -215,7 +215,7 @@ def _dead_reasons(two: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple[
         where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(after and len(spans) > 1)
     return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where}, in '
                    f'{percent_text(lost, other.sum())} of the travel of the {two.names[1 - k]} '
-                   'wheel: the mean of both is not the travel'),)
+                   'wheel: the mean of both wheels is not the travel of the vehicle'),)
 
 
 def percent_text(part: float, whole: float) -> str:
@@ -232,7 +232,8 @@ def _reversed_reasons(two: WheelPair, steps: Floats, expected: Floats, ratio: fl
                  f'{two.names[1 - k]} wheel counts up' if k is not None else
                  'one wheel counts up while the other counts down; the IMU data cannot decide '
                  'which is correct')
-        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is not the travel'),)
+        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both wheels is not the travel '
+                       'of the vehicle'),)
     rolling = _rolling(np.stack([expected, steps[1]]), two.quantum).all(axis=0)
     against = two.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
     against_time = 1.5    # s of counting against the other wheel

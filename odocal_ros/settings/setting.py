@@ -52,7 +52,8 @@ class Setting:
         """Return value as this setting's type, or raise BadConfig with the requirement."""
         if isinstance(self.default, tuple):
             if isinstance(value, str) or not hasattr(value, '__len__'):
-                raise BadConfig(f'{self.name}: {value!r} is not a list')
+                raise BadConfig(f'{self.name}: {value!r} is not a list; required: a list '
+                                'such as [A, B, C]')
             if self.item is str:        # an index is a name too
                 return tuple(self._check_item(str(v) if type(v) is int else v, str) for v in value)
             items = tuple(self._check_item(v, float) for v in value)

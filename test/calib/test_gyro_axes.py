@@ -73,7 +73,7 @@ def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
     """On gentle hills three segments determine the roll: 1.00 ± 0.04, ± 0.06."""
     made = drive(scenario='town', duration=300.0, imu_rate=50.0, imu_grade='industrial',
                  odometer_rate=20.0, fix_rate=5.0, fix_noise='rtk', slope=0.03, seed=seed)
-    assert 'measures the turn of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
+    assert 'measures the rotation of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
     assert Code.GYRO_AXES not in of_gyro(made)
 
 

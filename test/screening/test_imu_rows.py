@@ -125,7 +125,7 @@ def test_limits_are_of_the_scaled_unit_and_both_ends_are_counted():
     w[:, 1] = np.clip(3.0 * np.sin(T), -2.18, 2.18)
     text, = words(w, NONE)
     assert text.startswith('gyro y saturates at ')
-    assert text.endswith('; 1 more such limits')
+    assert text.endswith('; other axis limits reached: 1')
 
 
 @pytest.mark.parametrize('signal', [

@@ -92,8 +92,8 @@ def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
         Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
         f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to {np.rad2deg(problem.turned):.0f} deg, '
         f'less than the limit of {np.rad2deg(2 * CORNER_ANGLE):.0f} deg. '
-        f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed; the uncertainties of the mounting angles '
-        'depend on it', 'Drive with left and right turns.')]
+        f'{1e3 * np.sqrt(least):.0f} mm/√s of sideslip are assumed; the uncertainties of the '
+        'mounting angles depend on this value', 'Drive with left and right turns.')]
 
 
 @dataclass(eq=False)

@@ -51,7 +51,9 @@ REMEDIES = {
     'sideslip': 'Check odometer.lever_arm. Wheels that slide in turns also look like this: then '
                 'drive wider turns.',
     'heights': 'Check the unit of heights in the fix driver.',
-    'heading_fixed': "Check alignment.heading: of the IMU's x axis, clockwise from true north.",
+    'heading_fixed': (
+        "Check alignment.heading: it is the heading of the IMU's x axis, clockwise from true "
+        'north.'),
     'heading_sent': 'Check that this heading is an ENU yaw relative to true north. Magnetic '
                     'headings err by several degrees near steel: then use another source.'}
 
