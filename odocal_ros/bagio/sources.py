@@ -142,7 +142,7 @@ def _read_metadata(path: Path) -> BagMetadata:
     """Return the content of a metadata.yaml; with ``fault`` if it is invalid."""
     import yaml
     if not limits.is_file(path):
-        return BagMetadata(fault=f'{path} is not a regular file and is ignored')
+        return BagMetadata(fault=f'{path}: is not a regular file and is ignored')
     try:
         return _parse_metadata(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
     except (OSError, MemoryError):
@@ -204,14 +204,14 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
 def kind_of(path: Path) -> str:
     """Return the format of a file from its first bytes, or raise BadBag."""
     if path.exists() and not limits.is_file(path):
-        raise BadBag(f'{path} is not a regular file; give a bag file')
+        raise BadBag(f'{path}: is not a regular file; give a bag file')
     with path.open('rb') as file:
         head = file.read(16)
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return kind
     fault = 'is an empty file' if not head else 'is not a bag'
-    raise BadBag(f'{path.name} {fault}; give a folder with metadata.yaml or a .mcap, .db3 or '
+    raise BadBag(f'{path.name}: {fault}; give a folder with metadata.yaml or a .mcap, .db3 or '
                  '.bag file')
 
 

@@ -135,7 +135,8 @@ class Calibration:
 
     def _drawable(self, leg: int) -> Evidence:
         if not 1 <= leg <= len(self.result.legs):
-            raise BadUsage(f'leg {leg} does not exist; required: 1 to {len(self.result.legs)}')
+            raise BadUsage(f'leg {leg} does not exist; there are legs 1 to '
+                           f'{len(self.result.legs)}')
         found = self.result.legs[leg - 1].evidence
         if found is None or not len(found.t):
             raise BadUsage(f'leg {leg} has no track to draw; see its reasons')

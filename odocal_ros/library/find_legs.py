@@ -190,7 +190,7 @@ def _span_in_bag(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[i
     if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
         requested = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
-        raise BadUsage(f'{bag.name}: the leg {requested} contains no data: the bag lasts '
+        raise BadUsage(f'{bag.name}: the leg {requested} contains no data; the bag runs '
                        f'from 0 to {length:.1f} s; correct --leg')
     return start, stop
 

@@ -107,7 +107,7 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); give the path of a GPX '
                        'file') from None
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise BadUsage(f'{path} is not a GPX file ({error}); export the track again as '
+        raise BadUsage(f'{path}: is not a GPX file ({error}); export the track again as '
                        'GPX') from None
     points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
     most_points = 1_000_000

@@ -61,7 +61,7 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
 
 def test_an_empty_leg_and_a_speed_beside_counts_are_errors_of_their_bag(bags, tmp_path, capsys):
     assert replayed(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
-    assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 is empty' in \
+    assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 contains no data' in \
         capsys.readouterr().err
     assert replayed(bags, ['one', 'speed'], tmp_path / 'out') == 2
     line, = (x for x in capsys.readouterr().err.splitlines() if x.startswith('odocal: '))
