@@ -158,13 +158,15 @@ def twist(name: str, samples: data.OdometerSamples, frame: str = 'base_link') ->
                           {'twist.linear.x': samples.value})
 
 
-def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '') -> Topic:
-    """Return sensor_msgs/JointState of OdometerSamples by joint: positions only."""
+def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '',
+           rates: bool = False) -> Topic:
+    """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
     first, *_ = columns = list(wheels.values())
+    quantity = 'velocity' if rates else 'position'
     return _stamped_topic(
         name, 'sensor_msgs/msg/JointState', first, frame,
-        {'position': lambda rows: np.column_stack([one.value[rows] for one in columns])},
-        {'name': list(wheels), 'position': len(columns)})
+        {quantity: lambda rows: np.column_stack([one.value[rows] for one in columns])},
+        {'name': list(wheels), quantity: len(columns)})
 
 
 def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.errors import BadUsage
 from odocal_ros.safe_io.atomic_files import whole_file
 
 # Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
@@ -129,11 +130,14 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure; raise OSError if that fails."""
+    """Write a figure; raise BadUsage if that fails."""
     ending = path.suffix[1:].lower()
     data = io.BytesIO()
     # without a date, the same result gives the same file
     figure.savefig(data, format=ending, dpi=150,
                    metadata={'Date': None} if ending == 'svg' else None)
-    with whole_file(path) as file:
-        file.write(data.getvalue())
+    try:
+        with whole_file(path) as file:
+            file.write(data.getvalue())
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot be written ({error.strerror or error})') from None

@@ -87,7 +87,7 @@ def test_fixes_where_the_imu_is_silent_are_none():
 def is_road_noise_assumed(method):
     """Return True if the result states that the noise of a road was assumed."""
     return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'turns faster than 3 deg/s add up'
-               in r.text and 'is assumed' in r.text for r in method.reasons)
+               in r.text and 'are assumed' in r.text for r in method.reasons)
 
 
 def straight(**options):
