@@ -197,6 +197,8 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, 
     assert f'gnss.lever_arm {text}' in reason.text
     assert re.search(do, reason.do)
     assert ('easure' in reason.do) != ('larger' in text)
+    assert ('On z, a body that rolls' in reason.do) == ('easure' in reason.do)
+    assert 'Slip in turns' not in reason.do
 
 
 @pytest.mark.parametrize(('imu_arm', 'part'), [
@@ -209,6 +211,8 @@ def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
     assert 'odometer.lever_arm x: not set, estimated +1.00' in reason.text
     assert reason.remedy.startswith('Measure odometer.lever_arm x, y and set it. Axes: ')
     assert part in reason.remedy
+    assert 'Slip in turns' in reason.remedy
+    assert 'On z' not in reason.remedy
 
 
 def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_a_value_is():

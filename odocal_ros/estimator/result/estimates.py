@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, name_antenna, unknown_values
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
+from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZES
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.result.remarks import IMU_SCALES
@@ -110,6 +112,32 @@ def configured_constants(leg: SmootherLeg) -> Floats:
     value = np.zeros(layout.M)
     value[layout.ODO_ARM], value[layout.GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
     return value
+
+
+def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformation:
+    """
+    Return the marginal information of a fit at its last linearisation point.
+
+    The Schur complement of the constants less their priors. Constants that are fixed in the leg
+    have no information for other legs.
+
+    setting_values : (M,) values of the settings that constants are corrections to.
+    """
+    at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
+    reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
+    # each leg has its own ground and errors of the fixes, with their own priors
+    own = np.linalg.solve(reduced[layout.OF_LEG, layout.OF_LEG], reduced[layout.OF_LEG]).T
+    g_reduced = g_reduced - own @ g_reduced[layout.OF_LEG]
+    reduced = reduced - own @ reduced[layout.OF_LEG]
+    weight = 1 / priors.constants**2
+    free = priors.constants > layout.NO_ERROR
+    free[layout.OF_LEG] = False
+    return MarginalInformation(
+        layout.CONSTANTS, at + setting_values,
+        (reduced - np.diag(weight)) * np.outer(free, free),
+        (g_reduced + weight * (at - priors.centre)) * free, priors.centre + setting_values,
+        fit.first.constants, priors.constants).with_errors(
+            fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
 
 
 def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:

@@ -37,6 +37,7 @@ from odocal_ros.estimator.result.estimates import (
     configured_constants,
     estimate_constants,
     FittedConstants,
+    marginal_information,
     not_observable_reason,
     OPTIONAL,
 )
@@ -275,29 +276,3 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
         covariance[name] = effects @ effects.T
     own = [Source(name, root_of(value)) for name, value in covariance.items()]
     return (*own, *shared, Source('standstill', root_of(rest)))
-
-
-def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformation:
-    """
-    Return the marginal information of a fit at its last linearisation point.
-
-    The Schur complement of the constants less their priors. Constants that are fixed in the leg
-    have no information for other legs.
-
-    setting_values : (M,) values of the settings that constants are corrections to.
-    """
-    at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
-    reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
-    # each leg has its own ground and errors of the fixes, with their own priors
-    own = np.linalg.solve(reduced[layout.OF_LEG, layout.OF_LEG], reduced[layout.OF_LEG]).T
-    g_reduced = g_reduced - own @ g_reduced[layout.OF_LEG]
-    reduced = reduced - own @ reduced[layout.OF_LEG]
-    weight = 1 / priors.constants**2
-    free = priors.constants > layout.NO_ERROR
-    free[layout.OF_LEG] = False
-    return MarginalInformation(
-        layout.CONSTANTS, at + setting_values,
-        (reduced - np.diag(weight)) * np.outer(free, free),
-        (g_reduced + weight * (at - priors.centre)) * free, priors.centre + setting_values,
-        fit.first.constants, priors.constants).with_errors(
-            fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data

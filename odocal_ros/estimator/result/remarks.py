@@ -53,9 +53,11 @@ POSE_COVARIANCE_REMEDY = (
 POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
-LEVER_ARM_REMEDY = (
-    'Axes: from base_link, x forward, y left, z up. {} Slip in turns (skid steering, '
-    'tracks) has this effect, and body roll on z: then keep the setting.')
+LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
+# by whether the axis is z
+OTHER_CAUSE = {
+    False: 'Slip in turns, with skid steering or tracks, has this effect: then keep the setting.',
+    True: 'On z, a body that rolls on its springs has this effect: then keep the setting.'}
 # by whether imu.lever_arm is set
 IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it first.',
            True: 'A wrong imu.lever_arm has the same effect: check it too.'}
@@ -231,9 +233,13 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
             axes_of[action, name].append(axis)
     actions = [action.format(f'{name} {", ".join(axes)}')
                for (action, name), axes in axes_of.items()]
-    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for', ' '.join(
-        [*actions, LEVER_ARM_REMEDY.format(IMU_ARM[any(config.imu.lever_arm)])]
-        if any('easure' in x for x in actions) else actions))] if texts else []
+    is_z = {axis == 'z' for (action, _), axes in axes_of.items() if 'easure' in action
+            for axis in axes}
+    if is_z:
+        actions += [LEVER_ARM_AXES, IMU_ARM[any(config.imu.lever_arm)],
+                    *(OTHER_CAUSE[key] for key in sorted(is_z))]
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for',
+                   ' '.join(actions))] if texts else []
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
