@@ -58,19 +58,19 @@ class Received:
 
 @dataclass(frozen=True)
 class Observability:
-    """Quantities as texts, and a limitation of all of them."""
+    """Texts of the quantities that a leg determines or not, and a limitation of all of them."""
 
-    can: tuple[str, ...]        # observable
-    cannot: tuple[str, ...]     # not observable, with the cause
-    weak: str = ''
+    observable: tuple[str, ...]
+    not_observable: tuple[str, ...]     # with the cause
+    limitation: str = ''                # a sentence, '' for none
 
     def as_text(self) -> str:
-        *first, last = self.can
+        *first, last = self.observable
         values = f'{", ".join(first)} and {last}' if first else last
         text = f'observable: {values}'
-        if self.cannot:
-            text += f'; not observable: {"; ".join(self.cannot)}'
-        return text + (f'; {self.weak}' if self.weak else '')
+        if self.not_observable:
+            text += f'; not observable: {"; ".join(self.not_observable)}'
+        return text + (f'; {self.limitation}' if self.limitation else '')
 
 
 def find_observable(config: Config, received: Received) -> Observability:
@@ -88,10 +88,11 @@ def find_observable(config: Config, received: Received) -> Observability:
         values[-1] = False, 'the pitch (IMU without acceleration)'
     if received.two_wheels:
         values += _wheel_quantities(config)
-    weak = '' if received.rested_s >= config.leg.standstill else (
+    limitation = '' if received.rested_s >= config.leg.standstill else (
         'level and gyro bias are estimated from the drive, because it starts without a standstill')
-    return Observability(tuple(text for can, text in values if can),
-                         tuple(text for can, text in values if not can), weak)
+    return Observability(tuple(text for is_observable, text in values if is_observable),
+                         tuple(text for is_observable, text in values if not is_observable),
+                         limitation)
 
 
 def _yaw_quantity(config: Config, received: Received, methods: Sequence[str]) -> tuple[bool, str]:

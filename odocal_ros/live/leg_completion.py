@@ -52,7 +52,7 @@ class LegCompletion:
         self._node_name = node.get_fully_qualified_name()
         self._computing = worker.Computing(self._worker, self._fail, self.show_status,
                                            node.context.ok)
-        self._ability: Observability | None = None  # of the leg last started
+        self._observability: Observability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for a retry
         # of the open leg: its last running estimate
@@ -146,7 +146,8 @@ class LegCompletion:
             restored=session.restored_since(), distance_m=self._distance_m,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0,
             max_speed=progress.max_speed(), still_s=progress.still_s(),
-            two_wheels=recording.two_wheels(), ability=self._ability if in_leg else None,
+            two_wheels=recording.two_wheels(),
+            observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
             computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg_text(),
@@ -192,11 +193,12 @@ class LegCompletion:
         if not is_automatic:
             self._recording.progress.begin_leg()
         self._running_estimate.begin(self._recording.snapshot(), mark_ns, session.config)
-        self._ability = find_observable(session.config, self._recording.received_before(
+        self._observability = find_observable(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
         text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; '
-                f'{answers.hint(self.view())}. With these settings, {self._ability.as_text()}')
+                f'{answers.hint(self.view())}. With these settings, '
+                + self._observability.as_text())
         self._log.info(text)
         return text
 

@@ -53,7 +53,7 @@ PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odom
 
 def calibration_status(view: SessionView) -> DiagnosticStatus:
     session, results = view.session, view.results
-    text, ok = answers.hint(view), answers.quantities_ok(view)
+    text, ok, found = answers.hint(view), answers.quantities_ok(view), view.observability
     keys = {
         'state': view.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
         'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
@@ -72,8 +72,8 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
         'required_yaw_sigma_deg': math.degrees(view.config.verdict.max_yaw_sigma),
         'manoeuvres': '; '.join(answers.manoeuvres(view)),
-        'observable': ', '.join(view.ability.can) if view.ability else '',
-        'not_observable': '; '.join(view.ability.cannot) if view.ability else '',
+        'observable': ', '.join(found.observable) if found else '',
+        'not_observable': '; '.join(found.not_observable) if found else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': _reason_codes(view), 'saved': view.saved,
         'save_trouble': view.save_trouble, 'lost': view.lost,

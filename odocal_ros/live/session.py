@@ -244,7 +244,7 @@ class SessionView:
     max_speed: float = 0.0
     still_s: float = 0.0
     two_wheels: bool = False                     # left and right wheel are known
-    ability: Observability | None = None               # of the recorded leg
+    observability: Observability | None = None   # of the recorded leg
     forecast: Forecast | None = None               # of the recorded or computed leg
     faults: tuple[Reason, ...] = ()              # of the recorded leg, most severe first
     forecast_age_s: float = nan                   # since its newest sample

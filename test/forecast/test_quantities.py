@@ -224,10 +224,10 @@ def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, ex
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
     monkeypatch.setattr(quantities, 'METHODS', ('two_point', 'smoother'))
-    can = find_observable(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0)).can
-    assert 'the yaw (from stops, starts and turns)' in can
+    found = find_observable(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0))
+    assert 'the yaw (from stops, starts and turns)' in found.observable
     only = with_settings(CONFIG, {'method': 'two_point'})
-    assert len(find_observable(only, Received(NONE, 30.0)).cannot) == 1
+    assert len(find_observable(only, Received(NONE, 30.0)).not_observable) == 1
 
 
 def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
