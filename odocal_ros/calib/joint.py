@@ -4,9 +4,9 @@
 """
 Joint estimate of a vehicle's constants from several legs, equal to one fit of all their rows.
 
-Each leg is given by its marginal information. The constants are the same in every leg, except
-ln K, a random walk from leg to leg; priors count once: docs/method.md (S35). New tyres or a load
-change the scale beyond the random walk.
+Input is the marginal information of each leg. The constants are the same in every leg, except
+ln K, a random walk from leg to leg; priors count once: docs/method.md (S35). Scale and angles also
+scatter between legs, (S38). New tyres or a load change the scale beyond both: ``scale_steps``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,18 +33,20 @@ class JointEstimate:
     """Joint estimate of m constants from all J legs."""
 
     names: tuple[str, ...]
-    value: Floats                   # (m,), of the last leg for the one that drifts
-    covariance: Floats              # (m, m)
-    sigma: Floats                   # (m,) of the priors
-    used: Floats                    # (m,) the same, widened by legs that contradict them
-    chi2: float                     # of the legs before any widening
-    freedom: float                  # its degrees of freedom
-    deviation: Floats  # (J, m) of each leg from the others, in sigmas, without scatter
-    carried: MarginalInformation                 # information of all legs, for later legs
-    between: dict[str, float] = field(default_factory=dict)  # scatter between legs
-    disputed: tuple[str, ...] = ()  # constants in which legs differ
-    factor: float = 1.0             # on all sigmas, included in ``covariance``
-    bent: Floats = field(default_factory=lambda: np.zeros(0))  # rad, linearisation errors
+    value: Floats                     # (m,), of the last leg for the one that drifts
+    covariance: Floats                # (m, m)
+    prior_sigma: Floats               # (m,)
+    relaxed_sigma: Floats             # (m,) the same, widened by legs that contradict the priors
+    chi2: float                       # of the legs, before ``factor``
+    freedom: float                    # its degrees of freedom
+    deviation: Floats                 # (J, m) sigmas, of each leg from the others, (S37)
+    information: MarginalInformation  # of all legs, for later ones
+    # sigma of the differences between legs, by constant; empty for a single leg
+    scatter: dict[str, float] = field(default_factory=dict)
+    disputed: tuple[str, ...] = ()    # constants in which legs differ significantly
+    factor: float = 1.0               # on all sigmas, included in ``covariance``
+    # (J,) rad or relative, additional error of each leg by its linearisation
+    linearisation_error: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
@@ -63,24 +65,26 @@ def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float]
     """
     usual = usual or {}
     legs = LinkedLegs(list(marginals), drifting, np.asarray(steps, float), angles)
-    bent = _add_linearisation_errors(legs, [n for n in curved if n in legs.names])
+    linearisation_error = _add_linearisation_errors(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
     drives = legs.combine_sections(same)
-    scatter = _scatter(drives, usual)
+    estimated = _estimate_scatter(drives, usual)
     # a single leg has no scatter
-    alone = len(drives.marginals) == 1 and not marginals[0].evidence
-    between = {} if alone else scatter.sigmas
-    left, rest = (in_scatter + of_legs - of_drives for in_scatter, of_legs, of_drives in zip(
-        drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
-    factor = float(np.sqrt(left / rest)) if rest and normal_deviate(left,
-                                                                    rest) > NORMAL_95 else 1.0
-    where = drives.place(len(drives.marginals) - 1)
-    x, C = drives.solve() if alone else _average_over_scatter(drives, scatter, usual)
-    carried = drives.carried(x[where], scatter.sigmas, scatter.evidence).widened(factor)
-    return JointEstimate(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma,
-                         legs.used,
-                         chi2, freedom, legs.deviations(), carried, between,
-                         _find_disputed(legs, between, usual), factor, bent)
+    is_single = len(drives.marginals) == 1 and not marginals[0].scatter_likelihood
+    scatter = {} if is_single else estimated.sigmas
+    # chi-square of the drives with scatter, plus that between the sections of each
+    residual_chi2, residual_freedom = (
+        with_scatter + of_legs - of_drives for with_scatter, of_legs, of_drives in zip(
+            drives.disagreement(scatter), (chi2, freedom), drives.disagreement(), strict=True))
+    disagree = residual_freedom and normal_deviate(residual_chi2, residual_freedom) > NORMAL_95
+    factor = float(np.sqrt(residual_chi2 / residual_freedom)) if disagree else 1.0
+    last = drives.indices(len(drives.marginals) - 1)
+    x, C = drives.solve() if is_single else _average_over_scatter(drives, estimated, usual)
+    information = drives.combined_information(x[last], estimated.sigmas, estimated.likelihood)
+    return JointEstimate(
+        legs.names, x[last], C[np.ix_(last, last)] * factor**2, legs.prior_sigma,
+        legs.relaxed_sigma, chi2, freedom, legs.deviations(), information.widened(factor),
+        scatter, _find_disputed(legs, scatter, usual), factor, linearisation_error)
 
 
 def normal_deviate(chi2: float, freedom: float) -> float:
@@ -92,85 +96,92 @@ def normal_deviate(chi2: float, freedom: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter of constants between legs, by name."""
+    """Estimated scatter of constants between legs, by name; arrays are at SCATTER_GRID."""
 
-    sigmas: dict[str, float]     # geometric means
-    evidence: dict[str, Floats]  # (g,) log likelihood at the points of SCATTER_GRID
-    weights: dict[str, Floats]   # (g,) of these points
+    sigmas: dict[str, float]        # geometric means
+    likelihood: dict[str, Floats]   # (SCATTER_POINTS,) log likelihood
+    weights: dict[str, Floats]      # (SCATTER_POINTS,) of a mean over the scatter, (S39)
 
 
-def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
+def _estimate_scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     """Return the scatter between the legs of the constants in ``usual``, (S38)."""
     # by restricted likelihood, with a half-Cauchy prior of the usual sigma (Gelman 2006)
     from scipy.interpolate import CubicSpline
-    between, evidence, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
+    sigmas, likelihood, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
     fine = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
     for _ in range(2):      # sweeps: the scatter of one hardly depends on that of another
         for name, size in usual.items():
-            own = np.array([legs.log_likelihood({**between, name: size * float(np.exp(off))})
-                            for off in SCATTER_GRID])
-            evidence[name] = own - own.max() + legs.evidence(name, len(own))
-            odds = CubicSpline(SCATTER_GRID, evidence[name])(fine)
-            odds = odds + fine - np.log1p(np.exp(2 * fine))
-            weight = np.exp(odds - odds.max())
+            log = np.array([legs.log_likelihood({**sigmas, name: size * float(np.exp(x))})
+                            for x in SCATTER_GRID])
+            # legs combined earlier bring the likelihood of their scatter
+            likelihood[name] = log - log.max() + sum(
+                (b.scatter_likelihood[name] for b in legs.marginals
+                 if name in b.scatter_likelihood), np.zeros(SCATTER_POINTS))
+            posterior = CubicSpline(SCATTER_GRID, likelihood[name])(fine)
+            posterior = posterior + fine - np.log1p(np.exp(2 * fine))
+            weight = np.exp(posterior - posterior.max())
             weight /= weight.sum()
-            between[name] = size * float(np.exp(weight @ fine))
+            sigmas[name] = size * float(np.exp(weight @ fine))
             weights[name] = np.array([weight @ np.interp(fine, SCATTER_GRID, node)
-                                      for node in np.eye(len(own))])
-    return Scatter(between, evidence, weights)
+                                      for node in np.eye(SCATTER_POINTS)])
+    return Scatter(sigmas, likelihood, weights)
 
 
 def _average_over_scatter(legs: LinkedLegs, scatter: Scatter,
                           usual: Mapping[str, float]) -> tuple[Floats, Floats]:
     """Return the unknowns at this scatter, and their covariance averaged over all of it, (S39)."""
     x, C = legs.solve(scatter.sigmas)
-    out = C.copy()
+    averaged = C.copy()
     for name, weight in scatter.weights.items():
-        for w, off in zip(weight, SCATTER_GRID, strict=True):
-            value, covariance = legs.solve(scatter.sigmas | {name: usual[name] * np.exp(off)})
-            out += w * (covariance - C + np.multiply.outer(value - x, value - x))
-    return x, out
+        for w, log_ratio in zip(weight, SCATTER_GRID, strict=True):
+            value, covariance = legs.solve(
+                scatter.sigmas | {name: usual[name] * np.exp(log_ratio)})
+            averaged += w * (covariance - C + np.multiply.outer(value - x, value - x))
+    return x, averaged
 
 
-def _find_disputed(legs: LinkedLegs, between: dict[str, float],
+def _find_disputed(legs: LinkedLegs, scatter: dict[str, float],
                    usual: Mapping[str, float]) -> tuple[str, ...]:
     """Return the constants in which legs differ by more than the usual scatter."""
-    # of those without scatter, only the one that explains most of the remaining chi-square
-    def deviates(name: str) -> float:
-        now, freedom = (legs.disagreement({**between, name: usual[name]}) if name in usual
-                        else as_they_are)
-        left, rest = legs.disagreement({**between, name: np.inf})
-        # below, the legs do not determine the constant
-        return normal_deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
+    def deviate(name: str) -> float:
+        """Return the normal deviate of the chi-square that a free constant in each leg removes."""
+        chi2, freedom = (legs.disagreement({**scatter, name: usual[name]}) if name in usual
+                         else with_scatter)
+        free_chi2, free_freedom = legs.disagreement({**scatter, name: np.inf})
+        # below 0.5, the legs do not determine the constant
+        return normal_deviate(chi2 - free_chi2, freedom - free_freedom) \
+            if freedom - free_freedom > 0.5 else -np.inf
     if len(legs.marginals) < 2:
         return ()
-    as_they_are = legs.disagreement(between)
-    odds = {name: deviates(name) for name in legs.names}
-    others = [name for name in legs.names if name not in between]
-    sure = [*between, *([max(others, key=odds.__getitem__)] if others else [])]
-    return tuple(name for name in sure if odds[name] > DISPUTED_DEVIATES)
+    with_scatter = legs.disagreement(scatter)
+    deviates = {name: deviate(name) for name in legs.names}
+    # of those without scatter, only the one that explains most of the remaining chi-square
+    others = [name for name in legs.names if name not in scatter]
+    tested = [*scatter, *([max(others, key=deviates.__getitem__)] if others else [])]
+    return tuple(name for name in tested if deviates[name] > DISPUTED_DEVIATES)
 
 
 def _add_linearisation_errors(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
-    """Add a linearisation error to each leg, by the distance from its point; return it, (J,)."""
-    first, at = legs.marginals, [legs.names.index(n) for n in curved]
-    bent = np.zeros(len(first))
+    """Add an error to each leg by its distance from the linearisation point; return it: (J,)."""
+    linearised, at = legs.marginals, [legs.names.index(n) for n in curved]
+    error = np.zeros(len(linearised))
     for _ in range(3 if curved else 0):     # with reduced weights the estimate changes
         x, _ = legs.solve()
-        moved = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
-        bent = (moved**2).sum(axis=1) / 2
-        legs.replace_marginals([b.loosened(dict.fromkeys(curved, size))
-                   for b, size in zip(first, bent, strict=True)])
-    return bent
+        distance = np.array([x[legs.indices(j)][at] - b.point[at]
+                             for j, b in enumerate(linearised)])
+        error = (distance**2).sum(axis=1) / 2
+        legs.replace_marginals([b.with_leg_errors(dict.fromkeys(curved, size))
+                                for b, size in zip(linearised, error, strict=True)])
+    return error
 
 
 @dataclass(frozen=True)
 class ScaleStep:
-    """A change of ln K from leg number ``leg`` - 1 to ``leg``, from 0, and its size in sigmas."""
+    """A permanent change of the scale between two legs."""
 
-    leg: int
-    change: float
-    sigmas: float
+    leg: int        # index of the later one, from 0
+    change: float   # of ln K
+    sigmas: float   # its size in sigmas
 
 
 def scale_steps(marginals: Sequence[MarginalInformation], steps: Sequence[float] | Floats,
@@ -189,6 +200,6 @@ def scale_steps(marginals: Sequence[MarginalInformation], steps: Sequence[float]
         steps[j - 1] = FREE_STEP
         legs = LinkedLegs(marginals[:j + 1], drifting, steps[:j], angles)
         x, _ = legs.solve()
-        before, now = (x[legs.place(k)[legs.drifting]] for k in (j - 1, j))
+        before, now = (x[legs.indices(k)[legs.drifting]] for k in (j - 1, j))
         found.append(ScaleStep(j, float(now - before), sigmas))
     return found

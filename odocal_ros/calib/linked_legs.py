@@ -1,7 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rows of several legs as one least-squares problem: docs/method.md (S35) to (S37)."""
+"""
+Several legs of a vehicle as one linear least-squares problem: docs/method.md (S35) to (S37).
+
+Input is the marginal information of each leg. All constants are the same in all legs, except one
+that drifts, ln K: a random walk from leg to leg. Output are the normal equations, their solution,
+and the residuals of legs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from odocal_ros.calib.marginal_information import eliminate_own_errors, MarginalInformation
+from odocal_ros.calib.marginal_information import eliminate_leg_errors, MarginalInformation
 from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
@@ -21,183 +27,193 @@ LEG_ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class LinkedEquations:
-    """Normal equations H x = g of linked legs; see ``LinkedLegs.equations``."""
+    """Normal equations H x = g of linked legs; n unknowns x as in ``LinkedLegs.equations``."""
 
-    H: Floats
-    g: Floats
-    cost: float                          # of the rows at x = 0
-    prior: tuple[Floats, Floats, float]  # diagonal of H, g and cost by priors
-    others: int                          # number of constants that do not drift
-    rows: int                            # number of rows of legs and random walk
+    H: Floats                            # (n, n)
+    g: Floats                            # (n,)
+    cost: float                          # weighted sum of squares at x = 0
+    prior: tuple[Floats, Floats, float]  # its part of the priors: diagonal of H, g, and cost
+    common_count: int                    # of unknowns common to all legs, the first ones of x
+    rank: int                            # of the information of the legs and the random walk
 
     @cached_property
-    def _parts(self) -> tuple[Floats, Floats, Floats]:
-        """Return eigenvalues of H with a unit diagonal, its eigenvectors, and the scale."""
-        s = 1 / np.sqrt(np.maximum(np.diag(self.H), LEG_ROUNDING))
-        size, V = np.linalg.eigh(self.H * np.multiply.outer(s, s))
-        return size, V * s[:, None], s
+    def _eigen(self) -> tuple[Floats, Floats, Floats]:
+        """Return eigenvalues of H with a unit diagonal, its eigenvectors, and the scale of x."""
+        scale = 1 / np.sqrt(np.maximum(np.diag(self.H), LEG_ROUNDING))
+        eigenvalues, V = np.linalg.eigh(self.H * np.multiply.outer(scale, scale))
+        return eigenvalues, V * scale[:, None], scale
 
     @property
     def log_determinant(self) -> float:
         """Return the log determinant of H."""
-        size, _, s = self._parts
-        return float(np.log(np.maximum(size, LEG_ROUNDING)).sum() - 2 * np.log(s).sum())
+        eigenvalues, _, scale = self._eigen
+        return float(np.log(np.maximum(eigenvalues, LEG_ROUNDING)).sum()
+                     - 2 * np.log(scale).sum())
 
     def least_cost(self) -> float:
         """Return the weighted sum of squares at the solution."""
-        size, V, _ = self._parts
-        return self.cost - float(((self.g @ V)**2) @ (1 / np.maximum(size, LEG_ROUNDING)))
+        eigenvalues, V, _ = self._eigen
+        return self.cost - float(((self.g @ V)**2) @ (1 / np.maximum(eigenvalues, LEG_ROUNDING)))
 
     def misfit(self) -> tuple[float, float]:
-        """Return the chi-square of legs and random walk, and its degrees of freedom."""
-        size, V, _ = self._parts
-        size, V = size[size > LEG_ROUNDING], V[:, size > LEG_ROUNDING]
-        x = V @ (self.g @ V / size)
-        weight, pull, at_zero = self.prior
-        of_prior = x @ (weight * x - 2 * pull) + at_zero
-        fitted = len(size) - float((weight @ V**2) @ (1 / size))
-        return self.cost - float(self.g @ x + of_prior), self.rows - fitted
+        """Return the chi-square of legs and random walk, and its degrees of freedom: (S36)."""
+        eigenvalues, V, _ = self._eigen
+        kept = eigenvalues > LEG_ROUNDING
+        eigenvalues, V = eigenvalues[kept], V[:, kept]
+        x = V @ (self.g @ V / eigenvalues)
+        weight, prior_g, prior_cost = self.prior
+        of_prior = x @ (weight * x - 2 * prior_g) + prior_cost
+        fitted = len(eigenvalues) - float((weight @ V**2) @ (1 / eigenvalues))
+        return self.cost - float(self.g @ x + of_prior), self.rank - fitted
 
-    def solved(self) -> tuple[Floats, Floats]:
-        """Return the solution and its covariance, of each leg its own drifting constant."""
-        size, V, _ = self._parts
-        V = V.copy()
-        V[self.others:] = np.cumsum(V[self.others:][::-1], axis=0)[::-1]
-        size = np.maximum(size, LEG_ROUNDING)
-        return V @ (self.g @ self._parts[1] / size), V / size @ V.T
+    def solve(self) -> tuple[Floats, Floats]:
+        """Return x and its covariance, with the drifting constant of each leg for its steps."""
+        eigenvalues, V, _ = self._eigen
+        summed = V.copy()
+        summed[self.common_count:] = np.cumsum(V[self.common_count:][::-1], axis=0)[::-1]
+        eigenvalues = np.maximum(eigenvalues, LEG_ROUNDING)
+        return summed @ (self.g @ V / eigenvalues), summed / eigenvalues @ summed.T
 
     def eliminate_others(self, keep: Ints) -> tuple[Floats, Floats]:
         """Return H and g of some unknowns, the others eliminated."""
-        gone = np.setdiff1d(np.arange(len(self.g)), keep)
-        if not len(gone):
+        others = np.setdiff1d(np.arange(len(self.g)), keep)
+        if not len(others):
             return self.H[np.ix_(keep, keep)], self.g[keep]
-        taken = np.linalg.solve(self.H[np.ix_(gone, gone)], self.H[np.ix_(gone, keep)]).T
-        D = self.H[np.ix_(keep, keep)] - taken @ self.H[np.ix_(gone, keep)]
-        return (D + D.T) / 2, self.g[keep] - taken @ self.g[gone]
+        gain = np.linalg.solve(self.H[np.ix_(others, others)], self.H[np.ix_(others, keep)]).T
+        D = self.H[np.ix_(keep, keep)] - gain @ self.H[np.ix_(others, keep)]
+        return (D + D.T) / 2, self.g[keep] - gain @ self.g[others]
 
 
 class LinkedLegs:
-    """Marginals of legs with common names, priors of the constants, random walk of one."""
+    """J legs, with the same m constants each, their priors, and the random walk of one of them."""
 
     def __init__(self, marginals: Sequence[MarginalInformation], drifting: str,
                  steps: Sequence[float] | Floats, angles: Sequence[str] = ()) -> None:
-        """Take legs by time; ``steps`` (J - 1,): sigmas of the change of ``drifting``."""
+        """
+        Take the marginal information of legs in order of time.
+
+        drifting : name of the constant with a random walk.   steps : (J - 1,) sigma of its change
+        from leg to leg.   angles : names of constants with a period of one turn.
+        """
         self.names = tuple(dict.fromkeys(n for b in marginals for n in b.names))
-        self.replace_marginals([_on(b, self.names) for b in marginals])
+        self.replace_marginals([_with_names(b, self.names) for b in marginals])
         last = self.marginals[-1]
         for name in angles:
-            about = last.value[self.names.index(name)]
-            self.replace_marginals([b.turned(name, about) for b in self.marginals])
-        self.centre = last.centre
-        self.sigma, self.used = (
+            reference = last.point[self.names.index(name)]
+            self.replace_marginals([b.with_angle_near(name, reference) for b in self.marginals])
+        self.prior_mean = last.prior_mean
+        self.prior_sigma, self.relaxed_sigma = (
             np.max([getattr(b, which) for b in self.marginals], axis=0)
-            for which in ('sigma', 'used'))
-        self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
+            for which in ('prior_sigma', 'relaxed_sigma'))
+        self.unit = np.where(np.isfinite(self.relaxed_sigma), self.relaxed_sigma, STEP_UNIT)
         self.drifting = self.names.index(drifting)
         # 0.1 ppm of ln K: any vehicle changes more; with smaller sigmas rounding is too large
         self.steps = np.maximum(steps, 1e-7)
 
     def combine_sections(self, same: Sequence[bool]) -> 'LinkedLegs':
-        """Return these legs, with the sections of the same leg added up."""
+        """Return these legs with sections added up; same: (J - 1,) True if of the leg before."""
         is_new_leg = [not together for together in same] or [True] * len(self.steps)
         if all(is_new_leg):
             return self
         marginals = self.marginals[:1]
-        for marginal, own in zip(self.marginals[1:], is_new_leg, strict=True):
-            marginals = [*marginals, marginal] if own else [
+        for marginal, is_new in zip(self.marginals[1:], is_new_leg, strict=True):
+            marginals = [*marginals, marginal] if is_new else [
                 *marginals[:-1], marginals[-1].plus(marginal)]
         return LinkedLegs(marginals, self.names[self.drifting], self.steps[is_new_leg])
 
     def replace_marginals(self, marginals: list[MarginalInformation]) -> None:
         """Set the marginals of the legs; each must have the names of all."""
         self.marginals = marginals
-        self._clean: dict[float, LegInformation] = {}
+        self._information: dict[float, LegInformation] = {}
 
     def information(self, least: float = 0.0) -> 'LegInformation':
-        """Return the information of the legs in directions with more than ``least`` priors."""
-        if least not in self._clean:      # requested for each constant
-            self._clean[least] = information(self.marginals, self.unit, least)
-        return self._clean[least]
+        """Return the information of the legs, in directions with more than ``least`` priors."""
+        if least not in self._information:      # requested for each constant
+            self._information[least] = _in_units(self.marginals, self.unit, least)
+        return self._information[least]
 
-    def place(self, j: int) -> Ints:
-        """Return the indices of the constants of leg j in the unknowns."""
-        others = len(self.names) - 1
-        return np.insert(np.arange(others), self.drifting, others + j)
+    def indices(self, j: int) -> Ints:
+        """Return the indices of the constants of leg j in the unknowns: (m,)."""
+        common = len(self.names) - 1
+        return np.insert(np.arange(common), self.drifting, common + j)
 
-    def equations(self, legs: 'LegInformation', spread: dict[str, float] | None = None,
+    def equations(self, legs: 'LegInformation', scatter: dict[str, float] | None = None,
                   prior: bool = True) -> LinkedEquations:
         """
-        Return the equations of all legs with a scatter, the random walk, and the priors.
+        Return the equations of all legs, the random walk, and the priors.
 
-        Unknowns, in their units and less the values of the last leg: the constants but the
+        Unknowns, in ``unit`` and relative to the point of the last leg: the constants but the
         drifting one; then its steps from leg to leg, last its value in the last leg.
-        """
-        H, g, cost, rank = self._of_legs(legs, spread)
-        others, steps = len(self.names) - 1, len(self.steps)
-        walk = np.arange(others, others + steps)
-        H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
-        weight, off = np.zeros((2, len(g)))
-        if prior:
-            at = self.place(steps)
-            weight[at] = np.isfinite(self.used)
-            off[at] = (self.centre - self.marginals[-1].value) / self.unit
-        at_zero = float(weight @ off**2)
-        return LinkedEquations(H + np.diag(weight), g + weight * off, cost + at_zero,
-                               (weight, weight * off, at_zero), others, rank + steps)
 
-    def _of_legs(self, legs: 'LegInformation',
-                 spread: dict[str, float] | None) -> tuple[Floats, Floats, float, int]:
-        """Return the equations of the legs, their cost at zero and the number of their rows."""
+        scatter : sigma between legs, by constant.   prior : include the priors.
+        """
+        H, g, cost, rank = self._leg_equations(legs, scatter)
+        common, steps = len(self.names) - 1, len(self.steps)
+        walk = np.arange(common, common + steps)
+        H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
+        weight, offset = np.zeros((2, len(g)))
+        if prior:
+            at = self.indices(steps)
+            weight[at] = np.isfinite(self.relaxed_sigma)
+            offset[at] = (self.prior_mean - self.marginals[-1].point) / self.unit
+        prior_cost = float(weight @ offset**2)
+        return LinkedEquations(H + np.diag(weight), g + weight * offset, cost + prior_cost,
+                               (weight, weight * offset, prior_cost), common, rank + steps)
+
+    def _leg_equations(self, legs: 'LegInformation', scatter: dict[str, float] | None,
+                       ) -> tuple[Floats, Floats, float, int]:
+        """Return H, g and cost at zero of the legs alone, and the rank of their information."""
         # the drifting constant of a leg is the sum of its steps from the leg on: rows and columns
         # of the steps are sums over the legs up to each
-        J, k, rest = len(legs.D), self.drifting, np.delete(np.arange(len(self.names)),
-                                                           self.drifting)
-        taken, DA, pull, rank = self._scattering(legs, spread)
-        off = np.stack([b.value - self.marginals[-1].value for b in self.marginals]) / self.unit
-        g_legs = pull + (legs.D @ off[:, :, None]
-                         - taken @ (np.swapaxes(DA, 1, 2) @ off[:, :, None]))[:, :, 0]
-        cost = float((off * (g_legs + pull)).sum() + (legs.nearest * pull).sum())
-        of_drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', taken, DA[:, k])
-        whole = legs.D.sum(axis=0) - np.tensordot(taken, DA, ((0, 2), (0, 2)))
-        across = np.cumsum(of_drifting[:, rest], axis=0)
+        J, k = len(legs.D), self.drifting
+        common = np.delete(np.arange(len(self.names)), k)
+        T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
+        offset = np.stack([b.point - self.marginals[-1].point
+                           for b in self.marginals]) / self.unit
+        g_legs = gradient + (legs.D @ offset[:, :, None]
+                             - T @ (np.swapaxes(DA, 1, 2) @ offset[:, :, None]))[:, :, 0]
+        cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())
+        of_drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', T, DA[:, k])
+        whole = legs.D.sum(axis=0) - np.tensordot(T, DA, ((0, 2), (0, 2)))
+        across = np.cumsum(of_drifting[:, common], axis=0)
         steps = np.cumsum(of_drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
-        return (np.block([[whole[np.ix_(rest, rest)], across.T], [across, steps]]),
-                np.concatenate([g_legs.sum(axis=0)[rest], np.cumsum(g_legs[:, k])]), cost, rank)
+        return (np.block([[whole[np.ix_(common, common)], across.T], [across, steps]]),
+                np.concatenate([g_legs.sum(axis=0)[common], np.cumsum(g_legs[:, k])]), cost, rank)
 
-    def solve(self, spread: dict[str, float] | None = None) -> tuple[Floats, Floats]:
-        """Return the unknowns and their covariance, of leg j at ``place``."""
-        x, C = self.equations(self.information(), spread).solved()
+    def solve(self, scatter: dict[str, float] | None = None) -> tuple[Floats, Floats]:
+        """Return constants and covariance, SI units; those of leg j are at ``indices(j)``."""
+        x, C = self.equations(self.information(), scatter).solve()
         scale, last = np.empty((2, len(x)))
         for j in range(len(self.marginals)):
-            scale[self.place(j)], last[self.place(j)] = self.unit, self.marginals[-1].value
+            scale[self.indices(j)], last[self.indices(j)] = self.unit, self.marginals[-1].point
         return last + x * scale, C * np.multiply.outer(scale, scale)
 
-    def log_likelihood(self, spread: dict[str, float]) -> float:
-        """Return the restricted log likelihood of a scatter between legs, up to a constant."""
-        at, size = [self.names.index(n) for n in spread], np.array(list(spread.values()))
+    def log_likelihood(self, scatter: dict[str, float]) -> float:
+        """Return the restricted log likelihood of a scatter, up to a constant: (S38)."""
+        at, size = [self.names.index(n) for n in scatter], np.array(list(scatter.values()))
         size = size / self.unit[at]
-        equations = self.equations(self.information(), spread)
+        equations = self.equations(self.information(), scatter)
         out = -(equations.least_cost() + equations.log_determinant) / 2
-        own = self.information().D[:, at][:, :, at][[not b.evidence for b in self.marginals]]
+        D = self.information().D[:, at][:, :, at][[not b.scatter_likelihood
+                                                   for b in self.marginals]]
         return float(out - np.linalg.slogdet(
-            np.eye(len(at)) + own * np.multiply.outer(size, size))[1].sum() / 2)
+            np.eye(len(at)) + D * np.multiply.outer(size, size))[1].sum() / 2)
 
-    def carried(self, value: Floats, spread: dict[str, float],
-                evidence: dict[str, Floats]) -> MarginalInformation:
-        """Return the information of all legs at ``value``; evidence : of the scatter, by name."""
-        equations = self.equations(self.information(), spread, prior=False)
-        D, pull = equations.eliminate_others(self.place(len(self.marginals) - 1))
-        D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
-        return MarginalInformation(self.names, value, D, pull
-                                   - D @ (value - self.marginals[-1].value),
-                                   self.centre, self.sigma, self.used, evidence)
+    def combined_information(self, point: Floats, scatter: dict[str, float],
+                             likelihood: dict[str, Floats]) -> MarginalInformation:
+        """
+        Return the information of all legs at a point, as that of one leg at the last.
 
-    def evidence(self, name: str, points: int) -> Floats:
-        """Return the log likelihood of a constant's scatter by combined legs: (points,)."""
-        return sum((b.evidence[name] for b in self.marginals if name in b.evidence),
-                   np.zeros(points))
+        likelihood : log likelihood of the scatter, by constant.
+        """
+        equations = self.equations(self.information(), scatter, prior=False)
+        D, gradient = equations.eliminate_others(self.indices(len(self.marginals) - 1))
+        D, gradient = D / np.multiply.outer(self.unit, self.unit), gradient / self.unit
+        return MarginalInformation(
+            self.names, point, D, gradient - D @ (point - self.marginals[-1].point),
+            self.prior_mean, self.prior_sigma, self.relaxed_sigma, likelihood)
 
-    def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
+    def disagreement(self, scatter: dict[str, float] | None = None) -> tuple[float, float]:
         """
         Return the chi-square of the legs with common constants, and its degrees of freedom: (S36).
 
@@ -206,68 +222,67 @@ class LinkedLegs:
         legs that determine half of the constants each, in different directions, would always
         agree.
         """
-        return self.equations(self.information(1.0), spread).misfit()
+        return self.equations(self.information(1.0), scatter).misfit()
 
     def deviations(self) -> Floats:
         """
         Return the normalised residual of each leg's constants against the others': (J, m) sigmas.
 
         The gradient of the leg at the joint estimate, over its sigma, for each constant: the test
-        of one additional unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
+        of one additional unknown, as if the leg were left out (Baarda 1968), (S37).
         """
         x, C = self.solve()
         out = np.zeros((len(self.marginals), len(self.names)))
         legs = self.information(1.0)
-        for j, (D, pull) in enumerate(zip(legs.D, legs.pull, strict=True)):
-            where = self.place(j)
-            pull = pull - D @ ((x[where] - self.marginals[j].value) / self.unit)
-            own = C[np.ix_(where, where)] / np.multiply.outer(self.unit, self.unit)
-            variance = np.diag(D - D @ own @ D)
+        for j, (D, gradient) in enumerate(zip(legs.D, legs.gradient, strict=True)):
+            at = self.indices(j)
+            gradient = gradient - D @ ((x[at] - self.marginals[j].point) / self.unit)
+            C_leg = C[np.ix_(at, at)] / np.multiply.outer(self.unit, self.unit)
+            variance = np.diag(D - D @ C_leg @ D)
             # no test if the others have less than a millionth of the leg's information
-            news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
-            out[j, news] = pull[news] / np.sqrt(variance[news])
+            tested = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
+            out[j, tested] = gradient[tested] / np.sqrt(variance[tested])
         return out
 
-    def _scattering(self, legs: 'LegInformation', spread: dict[str, float] | None
-                    ) -> tuple[Floats, Floats, Floats, int]:
-        """Return T and DA of ``eliminate_own_errors`` by a scatter, pull, and sum of ranks."""
+    def _eliminate_scatter(self, legs: 'LegInformation', scatter: dict[str, float] | None
+                           ) -> tuple[Floats, Floats, Floats, int]:
+        """Return T and DA of ``eliminate_leg_errors``, the gradient left, and the sum of ranks."""
         # the information of combined legs already includes their scatter
-        at = [self.names.index(n) for n in spread or ()]
-        sigmas = np.array(list((spread or {}).values())) / self.unit[at]
-        taken, DA, A = eliminate_own_errors(legs.D, at, sigmas)
-        taken[[bool(b.evidence) for b in self.marginals]] = 0.0
-        free = (np.isinf(sigmas) & taken.any(axis=1)).sum()
-        pull = legs.pull - (taken @ (np.swapaxes(A, 1, 2) @ legs.pull[:, :, None]))[:, :, 0]
-        return taken, DA, pull, int(legs.rank.sum() - free)
+        at = [self.names.index(n) for n in scatter or ()]
+        sigmas = np.array(list((scatter or {}).values())) / self.unit[at]
+        T, DA, A = eliminate_leg_errors(legs.D, at, sigmas)
+        T[[bool(b.scatter_likelihood) for b in self.marginals]] = 0.0
+        free = (np.isinf(sigmas) & T.any(axis=1)).sum()
+        errors = np.swapaxes(A, 1, 2) @ legs.gradient[:, :, None]
+        return T, DA, legs.gradient - (T @ errors)[:, :, 0], int(legs.rank.sum() - free)
 
 
 @dataclass(frozen=True, eq=False)
 class LegInformation:
     """Information of J legs, in units of their m constants, without what is rounding."""
 
-    D: Floats        # (J, m, m), as in ``MarginalInformation``
-    pull: Floats     # (J, m)
-    nearest: Floats  # (J, m) own estimate, less its value: D nearest = pull, also for a scatter
-    rank: Ints       # (J,) of D
+    D: Floats         # (J, m, m), as ``MarginalInformation.information``
+    gradient: Floats  # (J, m)
+    estimate: Floats  # (J, m) of the leg alone, relative to its point: D estimate = gradient
+    rank: Ints        # (J,) of D
 
 
-def information(marginals: Sequence[MarginalInformation], unit: Floats,
-                least: float) -> LegInformation:
-    """Return the information of legs in directions of more than ``least``: (m,) unit."""
+def _in_units(marginals: Sequence[MarginalInformation], unit: Floats,
+              least: float) -> LegInformation:
+    """Return the information of legs in units (m,), in directions with more than ``least``."""
     J, m = len(marginals), len(unit)
     out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
     for j, marginal in enumerate(marginals):
-        size, V = np.linalg.eigh(marginal.information * np.multiply.outer(unit, unit))
-        # of doubles, times the loss by elimination
-        keep = size > max(LEG_ROUNDING * size[-1], least, 1e-300)
-        size, V = size[keep], V[:, keep]
-        along = V.T @ (marginal.pull * unit)
-        out.D[j], out.pull[j], out.nearest[j] = V * size @ V.T, V @ along, V @ (along / size)
-        out.rank[j] = len(size)
+        eigenvalues, V = np.linalg.eigh(marginal.information * np.multiply.outer(unit, unit))
+        kept = eigenvalues > max(LEG_ROUNDING * eigenvalues[-1], least, 1e-300)
+        eigenvalues, V = eigenvalues[kept], V[:, kept]
+        along = V.T @ (marginal.gradient * unit)
+        out.D[j], out.gradient[j] = V * eigenvalues @ V.T, V @ along
+        out.estimate[j], out.rank[j] = V @ (along / eigenvalues), len(eigenvalues)
     return out
 
 
-def _on(marginal: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
+def _with_names(marginal: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
     """Return a marginal with more names, without information or prior on the new ones."""
     if marginal.names == names:
         return marginal
@@ -276,10 +291,10 @@ def _on(marginal: MarginalInformation, names: tuple[str, ...]) -> MarginalInform
     D = np.zeros((m, m))
     D[np.ix_(at, at)] = marginal.information
 
-    def on(values: Floats) -> Floats:
-        out = np.zeros(m)       # sigma 0: has no effect in the maximum over legs
-        out[at] = values
-        return out
+    def expand(values: Floats) -> Floats:
+        expanded = np.zeros(m)       # sigma 0: has no effect in the maximum over legs
+        expanded[at] = values
+        return expanded
     return MarginalInformation(
-        names, on(marginal.value), D, on(marginal.pull), on(marginal.centre), on(marginal.sigma),
-        on(marginal.used), marginal.evidence)
+        names, expand(marginal.point), D, expand(marginal.gradient), expand(marginal.prior_mean),
+        expand(marginal.prior_sigma), expand(marginal.relaxed_sigma), marginal.scatter_likelihood)

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Information of a leg's data on the constants of the vehicle, without priors.
+Marginal information of a leg on the constants of vehicle and IMU, without their priors.
 
-That of earlier legs is carried on without their data: for later days and restarts.
+A fit estimates states, errors of one leg, and constants (scale, mounting angles, lever arms,
+delays, IMU errors). With all but the constants eliminated, it is what the leg contributes to a
+combination with other legs: docs/method.md (S33) to (S34). A file keeps it for later days.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,104 +19,115 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import wrap
 
 SCATTER_POINTS = 11     # judgement: of the grid over the scatter between legs
-NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
+# format: field of MarginalInformation: its key in calibration.json
+JSON_KEYS = {'point': 'value', 'information': 'information', 'gradient': 'pull',
+             'prior_mean': 'centre', 'prior_sigma': 'sigma', 'relaxed_sigma': 'used'}
 
 
 @dataclass(frozen=True, eq=False)
 class MarginalInformation:
     """
-    Log likelihood of a leg as a quadratic in the constants x, its other unknowns eliminated.
+    Log likelihood of a leg as a quadratic function of m constants x: docs/method.md (S33).
 
-    It is pull (x - value) - (x - value)' information (x - value) / 2, up to a constant,
-    docs/method.md (S33). Constants are identified by name; ln K, rad, m, s.
+    It is gradient (x - point) - (x - point)' information (x - point) / 2, up to a constant. A
+    combination adds the priors once. The units are those of the constants: 1 (ln K), rad, m, s.
     """
 
-    names: tuple[str, ...]
-    value: Floats  # (m,) linearisation point, as the settings are: lever arms are the full ones
-    information: Floats  # (m, m), semidefinite
-    pull: Floats         # (m,)
-    centre: Floats       # (m,) of the priors
-    sigma: Floats        # (m,) of the priors, inf: no prior
-    used: Floats         # (m,) the same, widened if the leg contradicts them, or by sizes
-    evidence: dict[str, Floats] = field(default_factory=dict)  # (S38)
+    names: tuple[str, ...]   # of the constants
+    point: Floats            # (m,) linearisation point; lever arms as in the settings
+    information: Floats      # (m, m) semidefinite
+    gradient: Floats         # (m,)
+    prior_mean: Floats       # (m,)
+    prior_sigma: Floats      # (m,) inf: no prior
+    # (m,) the same, widened if the leg contradicts it; of imperfections, their estimated size
+    relaxed_sigma: Floats
+    # (SCATTER_POINTS,) each: log likelihood of the scatter between combined legs, by name (S38)
+    scatter_likelihood: dict[str, Floats] = field(default_factory=dict)
 
     def widened(self, factor: float) -> 'MarginalInformation':
         """Return the information with all sigmas multiplied by a factor."""
-        return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
+        return replace(self, information=self.information / factor**2,
+                       gradient=self.gradient / factor**2)
 
     def plus(self, other: 'MarginalInformation') -> 'MarginalInformation':
-        """Return the sum with that of a leg of the same constants, at this one's ``value``."""
-        pull = other.pull - other.information @ (self.value - other.value)
+        """Return the sum with that of another leg, linearised at the point of this one."""
+        gradient = other.gradient - other.information @ (self.point - other.point)
         return replace(self, information=self.information + other.information,
-                       pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
-                       used=np.maximum(self.used, other.used))
+                       gradient=self.gradient + gradient,
+                       prior_sigma=np.maximum(self.prior_sigma, other.prior_sigma),
+                       relaxed_sigma=np.maximum(self.relaxed_sigma, other.relaxed_sigma))
 
-    def loosened(self, sigmas: dict[str, float]) -> 'MarginalInformation':
+    def with_leg_errors(self, sigmas: dict[str, float]) -> 'MarginalInformation':
         """
-        Return the information of a leg whose constants have errors of its own.
+        Return the information on the vehicle if the leg's constants deviate from its: (S34).
 
-        The constants of the vehicle are without them.
-
-        sigmas : by name, of each constant's own error d; inf: no information on it remains.
-        The data depend on x + d; d is eliminated, docs/method.md (S34).
+        sigmas : of the deviation, by constant; inf: no information on the constant remains.
         """
         at = [self.names.index(name) for name in sigmas]
-        taken, DA, A = eliminate_own_errors(self.information, at, np.array(list(sigmas.values())))
-        left = self.information - taken @ DA.T
-        return replace(self, information=(left + left.T) / 2,
-                       pull=self.pull - taken @ (A.T @ self.pull))
+        T, DA, A = eliminate_leg_errors(self.information, at, np.array(list(sigmas.values())))
+        remaining = self.information - T @ DA.T
+        return replace(self, information=(remaining + remaining.T) / 2,
+                       gradient=self.gradient - T @ (A.T @ self.gradient))
 
     def with_errors(self, effects: Floats) -> 'MarginalInformation':
-        """Return the information on x, a covariance larger by E E', effects (m, L), (S33a)."""
-        weight = 1 / self.used**2
-        G = (self.information + np.diag(weight)) @ effects
-        taken = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
-        off = np.where(weight > 0, self.centre - self.value, 0.0)
-        left = self.information - taken @ G.T
-        return replace(self, information=(left + left.T) / 2,
-                       pull=self.pull - taken @ (effects.T @ (self.pull + weight * off)))
+        """
+        Return the information reduced by further errors of the estimate: (S33a).
 
-    def only(self, names: Sequence[str]) -> 'MarginalInformation':
+        effects : (m, L) of L independent unit errors; the covariance with the relaxed priors
+        increases by effects effects'.
+        """
+        weight = 1 / self.relaxed_sigma**2
+        G = (self.information + np.diag(weight)) @ effects
+        T = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
+        prior_step = np.where(weight > 0, self.prior_mean - self.point, 0.0)
+        remaining = self.information - T @ G.T
+        return replace(self, information=(remaining + remaining.T) / 2,
+                       gradient=self.gradient
+                       - T @ (effects.T @ (self.gradient + weight * prior_step)))
+
+    def select(self, names: Sequence[str]) -> 'MarginalInformation':
         """Return the information on some constants, the others eliminated with their priors."""
         at = np.isin(self.names, names)
-        free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
-                              if n not in names})
-        D, off = free.information, np.where(np.isfinite(self.used), self.centre - self.value, 0.0)
-        evidence = {n: own for n, own in self.evidence.items() if n in names}
+        whole = self.with_leg_errors({n: s for n, s in zip(
+            self.names, self.relaxed_sigma, strict=True) if n not in names})
+        D = whole.information
+        prior_step = np.where(np.isfinite(self.relaxed_sigma), self.prior_mean - self.point, 0.0)
         return MarginalInformation(
-            tuple(n for n in self.names if n in names), self.value[at], D[np.ix_(at, at)],
-            free.pull[at] - D[np.ix_(at, ~at)] @ off[~at], self.centre[at], self.sigma[at],
-            self.used[at], evidence)
+            tuple(n for n in self.names if n in names), self.point[at], D[np.ix_(at, at)],
+            whole.gradient[at] - D[np.ix_(at, ~at)] @ prior_step[~at], self.prior_mean[at],
+            self.prior_sigma[at], self.relaxed_sigma[at],
+            {n: x for n, x in self.scatter_likelihood.items() if n in names})
 
-    def turned(self, name: str, about: float) -> 'MarginalInformation':
-        """Return it with an angle, rad, wrapped to within half a turn of ``about``."""
-        value, i = self.value.copy(), self.names.index(name)
-        value[i] = about + wrap(value[i] - about)
-        return replace(self, value=value)
+    def with_angle_near(self, name: str, reference: float) -> 'MarginalInformation':
+        """Return it with the point of an angle, rad, within half a turn of a reference."""
+        point, i = self.point.copy(), self.names.index(name)
+        point[i] = reference + wrap(point[i] - reference)
+        return replace(self, point=point)
 
 
-def eliminate_own_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats,
+def eliminate_leg_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats,
                                                                             Floats]:
     """
-    Return T, DA and A: eliminating own errors of constants takes T DA' of D, T A' pull, (S34).
+    Return T, DA and A of the elimination of errors of k constants: (..., m, k) each, (S34).
 
-    D : (..., m, m) information of legs.   at, sigmas : (k,) indices of the constants, and sigmas
-    of their errors; inf: unbounded.   The results are (..., m, k).
+    It reduces the information D by T DA' and the gradient h by T A' h, with A the unit vectors
+    times the sigmas, and T = DA (1 + A' DA)^-1.
+
+    D : (..., m, m).   at, sigmas : (k,) indices of the constants, and sigmas of their errors in
+    this leg; inf: unbounded.
     """
-    known, own = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., at]
+    bounded, diagonal = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., at]
     # the column of an unbounded error may have any length
-    size = np.where(known, sigmas, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
+    size = np.where(bounded, sigmas,
+                    np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0))
     A = np.eye(D.shape[-1])[:, at] * size[..., None, :]
     DA = D[..., at] * size[..., None, :]
-    return DA @ np.linalg.pinv(np.diag(known * 1.0) + np.swapaxes(A, -1, -2) @ DA), DA, A
-
-
-NUMBERS = [f for f in fields(MarginalInformation) if f.name not in ('names', 'evidence')]
+    return DA @ np.linalg.pinv(np.diag(bounded * 1.0) + np.swapaxes(A, -1, -2) @ DA), DA, A
 
 
 @dataclass(frozen=True, eq=False)
 class CarriedInformation:
-    """Information of all legs so far, with the scale at the last leg."""
+    """Information of all legs so far, carried on to later ones; its scale is that of the last."""
 
     marginal: MarginalInformation      # on the constants
     unit: str      # of the scale
@@ -126,45 +139,48 @@ class CarriedInformation:
         """Return True if it contains all the information of another."""
         return self.first_ns == other.first_ns and self.legs > other.legs
 
-    def only(self, names: Sequence[str], keeps: float | Floats) -> 'CarriedInformation':
+    def select(self, names: Sequence[str], change: float) -> 'CarriedInformation':
         """
-        Return the information on some constants.
+        Return the information on some constants, which may change until they are used.
 
-        keeps : share of its prior sigma by which each constant may have changed until use.
+        change : 1 sigma, over that of the constant's prior.
         """
-        marginal = self.marginal.only(names)
-        return replace(self, marginal=marginal.loosened(
-            dict(zip(marginal.names, (keeps * marginal.used).tolist(), strict=True))))
+        marginal = self.marginal.select(names)
+        return replace(self, marginal=marginal.with_leg_errors(
+            dict(zip(marginal.names, (change * marginal.relaxed_sigma).tolist(), strict=True))))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for calibration.json."""
-        entry = {f.name: np.asarray(getattr(self.marginal, f.name)).tolist() for f in NUMBERS}
-        entry |= {'names': list(self.marginal.names),
-                  'evidence': {n: x.tolist() for n, x in self.marginal.evidence.items()}}
+        one = self.marginal
+        entry = {key: np.asarray(getattr(one, name)).tolist() for name, key in JSON_KEYS.items()}
+        entry |= {'names': list(one.names),
+                  'evidence': {n: x.tolist() for n, x in one.scatter_likelihood.items()}}
         return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
                 'legs': self.legs, 'border': entry}
 
 
 def read_carried(content: dict[str, Any]) -> CarriedInformation:
-    """Return the content of ``as_dict``, null: not finite; raises ValueError if not valid."""
+    """Return the content of ``as_dict``, null: no prior; raises ValueError if not valid."""
     try:
         entry = content['border']
         names = tuple(map(str, entry['names']))
         m = len(names)
-        numbers = {f.name: _array(entry[f.name], (m, m) if f.name == 'information' else (m,),
-                                  NOTHING.get(f.name, np.nan))
-                   for f in NUMBERS}
-        evidence = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
-                    for n, x in dict(entry.get('evidence', {})).items()}
-        information = MarginalInformation(names, **numbers, evidence=evidence)
-        return CarriedInformation(information, str(content['unit']), int(content['first_ns']),
+        arrays = {name: _array(entry[key], (m, m) if name == 'information' else (m,),
+                               np.inf if name.endswith('_sigma') else np.nan)
+                  for name, key in JSON_KEYS.items()}
+        likelihood = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
+                      for n, x in dict(entry.get('evidence', {})).items()}
+        return CarriedInformation(MarginalInformation(names, **arrays,
+                                                      scatter_likelihood=likelihood),
+                                  str(content['unit']), int(content['first_ns']),
                                   int(content['last_ns']), int(content['legs']))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'carried: {error}') from None
 
 
-def _array(values: Any, shape: tuple[int, ...], nothing: float) -> Floats:
-    found = np.array([nothing if x is None else float(x) for x in np.ravel(values)])
+def _array(values: Any, shape: tuple[int, ...], null: float) -> Floats:
+    """Return values as an array of a shape, ``null`` for None; raises ValueError otherwise."""
+    found = np.array([null if x is None else float(x) for x in np.ravel(values)])
     if found.size != np.prod(shape) or np.isnan(found).any():
         raise ValueError(f'{np.size(values)} numbers; required: {shape}, or null')
     return found.reshape(shape)

@@ -144,7 +144,7 @@ class GrowingFit:
 def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
     # tyres warm up from the begin of a leg: each window has its own rate
-    legs = [replace(one.method, marginal=_information(one.method).loosened(
+    legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
                 {CONSTANTS[BY_TIME]: np.inf}))
             for one in (past, now)]
     whole = combine_legs(legs, [0] * len(legs), config)
@@ -163,11 +163,11 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
 
 def _parameter_sigmas(method: MethodResult) -> Floats:
     """Return the sigmas of ln scale, yaw and pitch, also of undetermined ones: (3,)."""
-    border = _information(method)
-    legs = LinkedLegs([border], CONSTANTS[LN_K], np.empty(0))
-    at = legs.place(0)[:PARAMETER_COUNT]
+    information = _information(method)
+    legs = LinkedLegs([information], CONSTANTS[LN_K], np.empty(0))
+    at = legs.indices(0)[:PARAMETER_COUNT]
     sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[at]), MODEL_FLOOR)
-    sigmas[border.sigma[:PARAMETER_COUNT] <= NO_ERROR] = np.inf
+    sigmas[information.prior_sigma[:PARAMETER_COUNT] <= NO_ERROR] = np.inf
     for i, name in enumerate(PARAMETERS):
         e = method.estimates[name]
         if e.value is not None and e.sigma is not None:

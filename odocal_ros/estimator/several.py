@@ -68,18 +68,18 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     C = with_model_floor(found.covariance[np.ix_(at, at)])
     C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
-    fitted = FittedConstants(found.value[at], sigma, sigma / found.factor / found.sigma[at])
+    fitted = FittedConstants(found.value[at], sigma, sigma / found.factor / found.prior_sigma[at])
     wheels = combine_wheels(legs)
     estimates, refusals = _estimate(legs, fitted, wheels, config, local)
-    sources = _error_sources(found.used[at] * found.factor, C, common)
+    sources = _error_sources(found.relaxed_sigma[at] * found.factor, C, common)
     # by any leg with an accelerometer
-    grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
+    grade = grade_of(config.imu) if np.isinf(found.prior_sigma[at][PITCH]) else None
     details = _details(found, fitted.value, C, sources, len(legs)) | {
         'beside': additional_figures(fitted.value, C, grade)} | wheel_details(wheels)
     reasons = (*(_scale_change_reason(change, times, leg_numbers) for change in changes),
                *_disagreement_reasons(found, leg_numbers), *refusals)
     return MethodResult('smoother', reasons, estimates, PARAMETERS, sources, details,
-                        found.carried)
+                        found.information)
 
 
 def _fit(legs: Sequence[MethodResult], times_ns: Ints,
@@ -120,18 +120,19 @@ def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInfor
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
     for marginal in marginals:
-        prior = 1 / marginal.used**2
+        prior = 1 / marginal.relaxed_sigma**2
         data = 1 / np.diag(np.linalg.inv(marginal.information + np.diag(prior))) - prior
-        known = data / (data + 1 / (SIZE * marginal.sigma**2))        # docs/method.md (S29)
-        for name, used, weight in zip(marginal.names, marginal.used, known, strict=True):
+        known = data / (data + 1 / (SIZE * marginal.prior_sigma**2))        # docs/method.md (S29)
+        for name, size, weight in zip(marginal.names, marginal.relaxed_sigma, known, strict=True):
             if name in imperfect:
-                logs.setdefault(name, []).append((np.log(used), max(weight, 1e-9)))
+                logs.setdefault(name, []).append((np.log(size), max(weight, 1e-9)))
     sizes = {}
     for name, pairs in logs.items():
         log, weight = np.transpose(pairs)
         sizes[name] = float(np.exp(np.average(log, weights=weight)))
-    return [replace(marginal, used=np.array([sizes.get(name, used) for name, used in zip(
-        marginal.names, marginal.used, strict=True)])) for marginal in marginals]
+    return [replace(marginal, relaxed_sigma=np.array([
+        sizes.get(name, sigma) for name, sigma in zip(
+            marginal.names, marginal.relaxed_sigma, strict=True)])) for marginal in marginals]
 
 
 def _scale_change_reason(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
@@ -164,7 +165,7 @@ def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Rea
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
     if found.factor > 1:
-        of = ' in all parameters but scale, yaw and pitch' * bool(found.between)
+        of = ' in all parameters but scale, yaw and pitch' * bool(found.scatter)
         reasons.append(Reason(
             Code.LEGS_DISAGREE, f'the scatter of {J} legs{of} is {found.factor:.1f} times their '
             f'uncertainties; {_largest_deviation(found, numbers)}'))
@@ -173,7 +174,7 @@ def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Rea
 
 def _largest_deviation(found: JointEstimate, numbers: list[int]) -> str:
     """Return the largest deviation of a constant without scatter between legs, as text."""
-    own = [i for i, name in enumerate(found.names) if name not in found.between]
+    own = [i for i, name in enumerate(found.names) if name not in found.scatter]
     z = found.deviation[:, own]
     j, i = np.unravel_index(np.argmax(np.abs(z)), z.shape)
     # two legs have the same deviation from each other
@@ -211,5 +212,6 @@ def _details(found: JointEstimate, value: Floats, C: Floats, sources: tuple[Sour
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
         'correlation': correlations(C[:PARAMETER_COUNT, :PARAMETER_COUNT], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
-                         'between_legs': found.between, 'curvature': found.bent.tolist()},
+                         'between_legs': found.scatter,
+                         'curvature': found.linearisation_error.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}

@@ -55,9 +55,9 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
-        imu_keeps = 0.1    # of their prior sigma: change by temperature and time
-        left['imu'] = calibration.carried.only(
-            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
+        imu_change = 0.1    # of their prior sigma: change by temperature and time
+        left['imu'] = calibration.carried.select(
+            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_change).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
     content: dict[str, Any] = plain({

@@ -50,7 +50,7 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
         details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
-        marginal=method.marginal and method.marginal.loosened(
+        marginal=method.marginal and method.marginal.with_leg_errors(
             {'scale_factor': relative['scale_factor']}),
         reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
                  *sigma_reasons))

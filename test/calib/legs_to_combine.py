@@ -97,7 +97,7 @@ def moved(result, name, by):
     """Return a result whose border has another value of a constant."""
     border = result.marginal
     at = np.arange(len(border.names)) == border.names.index(name)
-    return replace(result, marginal=replace(border, value=border.value + by * at))
+    return replace(result, marginal=replace(border, point=border.point + by * at))
 
 
 def leg_result(method, number, *codes):

@@ -37,7 +37,7 @@ def test_legs_are_one_fit_of_all_rows(toy):
 def test_errors_of_each_leg_alone_are_unknowns_of_the_fit(toy):
     own = {'z0': 0.3, 'z3': 0.05}
     value, covariance = toy.batch(own=[(NAMES.index(n), s) for n, s in own.items()])
-    found = of([b.loosened(own) for b in toy.borders()])
+    found = of([b.with_leg_errors(own) for b in toy.borders()])
     assert largest_deviation(found.value, value, covariance) < 1e-9
 
 
@@ -63,17 +63,17 @@ def test_some_constants_of_a_leg_are_told_as_with_beliefs_about_the_rest(toy):
     whole = toy.border(0)
     prior = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
     H = whole.information + np.diag(prior)
-    x = np.linalg.solve(H, whole.pull + whole.information @ whole.value)
-    some = whole.only(('z1', 'z2'))
+    x = np.linalg.solve(H, whole.gradient + whole.information @ whole.point)
+    some = whole.select(('z1', 'z2'))
     C = np.linalg.inv(some.information)
     assert some.names == ('z1', 'z2')
     assert np.linalg.inv(H)[2:4, 2:4] == pytest.approx(C, rel=1e-9)
-    assert some.value + C @ some.pull == pytest.approx(x[2:4], abs=1e-9)
+    assert some.point + C @ some.gradient == pytest.approx(x[2:4], abs=1e-9)
 
 
 def test_a_leg_without_information_changes_nothing(toy):
     borders = toy.borders()
-    nothing = replace(borders[0], information=np.zeros((5, 5)), pull=np.zeros(5))
+    nothing = replace(borders[0], information=np.zeros((5, 5)), gradient=np.zeros(5))
     a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
     assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
     # freedom is a sum of some twenty shares weighted by priors: equal but for rounding
@@ -117,12 +117,12 @@ def test_the_leg_and_the_constant_that_differ_are_named():
     constants[3, 4] += 5.0
     borders = small.draw(rng, constants).borders()
     # the prior of that leg has given way, as it does where the data contradict it
-    borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
+    borders[3] = replace(borders[3], relaxed_sigma=np.where(PRIOR == 1.0, 5.0, PRIOR))
     found = of(borders, usual=USUAL)
     assert found.disputed == ('z3',)
     assert np.argmax(np.abs(found.deviation[:, 4])) == 3
     # one of five off by 5: scattering by 5 / sqrt(5), the mean off by 1
-    assert found.between['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
+    assert found.scatter['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
     assert abs(found.value[4] - TRUTH[4]) < 2 * np.sqrt(found.covariance[4, 4])
     assert np.abs((found.value - TRUTH) / np.sqrt(np.diag(found.covariance))).max() < 3.5
 
@@ -147,7 +147,7 @@ def test_a_leg_far_from_where_it_was_linearised_counts_less():
     # the first knows nothing of the yaw and was linearised 0.1 rad off: its scale is 0.5 % off
     legs = [scale_and_yaw(0.1, 1e12, 1e-2), scale_and_yaw(0.0, 1e8, 1e8)]
     found = fit_jointly(legs, [0.0], 'k', ('yaw',), ('k', 'yaw'))
-    assert found.bent == pytest.approx([0.005, 0.0], abs=1e-9)
+    assert found.linearisation_error == pytest.approx([0.005, 0.0], abs=1e-9)
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(1e-4, rel=1e-3)
     assert np.sqrt(fit_jointly(legs, [0.0], 'k').covariance[0, 0]) < 2e-6
 

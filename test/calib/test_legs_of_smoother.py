@@ -59,7 +59,8 @@ def test_legs_of_the_smoother_add_up_their_information(legs, monkeypatch):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
     # one size of each imperfection, whichever leg it is of
-    used = np.max([b.used for b in several._share_sizes([r.marginal for r in results])], axis=0)
+    shared = several._share_sizes([r.marginal for r in results])
+    used = np.max([b.relaxed_sigma for b in shared], axis=0)
     C = np.linalg.inv(sum(r.marginal.information for r in results) + np.diag(1 / used**2))
     sigma = np.hypot(np.sqrt(np.diag(C))[:3], MODEL_FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
@@ -92,8 +93,9 @@ def test_a_shared_source_is_what_an_error_of_that_belief_does(legs, monkeypatch)
     def combined(name, sigmas):
         at = results[0].marginal.names.index(name)
         unit = np.eye(len(results[0].marginal.names))[at]
-        moved = [r.marginal.centre + sigmas * r.marginal.used[at] * unit for r in results]
-        return combine_legs([replace(r, marginal=replace(r.marginal, centre=c)) for r, c in
+        moved = [m.prior_mean + sigmas * m.relaxed_sigma[at] * unit
+                 for m in (r.marginal for r in results)]
+        return combine_legs([replace(r, marginal=replace(r.marginal, prior_mean=c)) for r, c in
                              zip(results, moved, strict=True)], [0, 1, 2], config)
     before, after = (combined('gnss_delay', sigmas) for sigmas in (0.0, 1.0))
     (effect,) = [s.effects[:, 0] for s in before.sources if s.name == 'fix_latency']
@@ -149,7 +151,7 @@ def test_sections_of_a_leg_that_disagree_name_the_largest_deviation(legs):
 
 
 def test_small_deviations_are_no_cause():
-    found = SimpleNamespace(names=('scale_factor', 'odometer_delay', 'gnss_delay'), between={
+    found = SimpleNamespace(names=('scale_factor', 'odometer_delay', 'gnss_delay'), scatter={
         'scale_factor': 1e-5}, deviation=np.array([[9, 1, 0], [0, -2.5, 1], [0, 1, -1.0]]))
     assert several._largest_deviation(found, [4, 7, 9]) == (
         'no parameter alone explains it: odometer_delay of leg 7 differs most (2.5 sigma)')
@@ -171,7 +173,7 @@ def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
 
     def refused(one):
         """Return a result whose yaw is told to 0.8 deg only, as on a drive straight on."""
-        loose = one.marginal.loosened({YAW: 0.014})
+        loose = one.marginal.with_leg_errors({YAW: 0.014})
         return replace(one, marginal=loose, estimates=one.estimates | {
             YAW: Estimate(None, None, 'rad')}, reasons=(Reason(Code.YAW_NOT_DETERMINED, 'no'),))
     whole = combine([leg_result(refused(one), i) for i, one in enumerate(results)], config)

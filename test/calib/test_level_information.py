@@ -106,7 +106,7 @@ def test_a_border_with_errors_of_levels_has_the_sum_of_both_covariances():
 
     def posterior(one):
         P = np.linalg.inv(one.information + np.diag(weight))
-        return P, P @ (one.pull + weight * centre)
+        return P, P @ (one.gradient + weight * centre)
 
     (P, x), (wide, same) = posterior(border), posterior(wider)
     np.testing.assert_allclose(wide, P + effects @ effects.T, rtol=1e-9)

@@ -33,7 +33,7 @@ ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of 
 def test_legs_carried_on_are_one_fit_with_those_to_come(first):
     borders = Toy(np.random.default_rng(5)).borders()
     whole = fit_jointly(borders, STEPS, 'k')
-    before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').carried
+    before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').information
     found = fit_jointly([before, *borders[first:]], STEPS[first - 1:], 'k')
     assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     sigma = np.sqrt(np.diag(whole.covariance))
@@ -188,5 +188,5 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
     found = combine(legs[2:], config, read_carried(json.loads(json.dumps(
         add_to_carried(legs[:2], config).as_dict()))))
     compare(found, whole, 0.1)
-    evidence = found.carried.marginal.evidence
+    evidence = found.carried.marginal.scatter_likelihood
     assert set(evidence) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}

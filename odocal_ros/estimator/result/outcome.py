@@ -178,7 +178,8 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
         sources.append(Source(error.source, error.sigma
                               * np.eye(PARAMETER_COUNT)[:, [error.constant]], shared))
         if not shared:
-            information = information.loosened({layout.CONSTANTS[error.constant]: error.sigma})
+            information = information.with_leg_errors(
+                {layout.CONSTANTS[error.constant]: error.sigma})
     return sources, information
 
 
