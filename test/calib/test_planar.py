@@ -14,7 +14,7 @@ from odocal_ros.calib.planar.run import (
     make_side_wheels,
     PriorKnowledge,
     Run,
-    UNEQUAL,
+    WHEEL_DIFFERENCE,
     wheel_rows,
     Wheels,
 )
@@ -108,8 +108,8 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
     """A turn and no sideways motion: one difference of four wheels has its prior alone."""
     run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
     sigma = np.sqrt(np.diag(fit_run(run, PriorKnowledge()).covariance)[:4])
-    assert (sigma < 1.2 * UNEQUAL * SCALES).all()
-    monkeypatch.setattr('odocal_ros.calib.planar.run.UNEQUAL', 0.3)
+    assert (sigma < 1.2 * WHEEL_DIFFERENCE * SCALES).all()
+    monkeypatch.setattr('odocal_ros.calib.planar.run.WHEEL_DIFFERENCE', 0.3)
     assert (np.sqrt(np.diag(fit_run(run, PriorKnowledge()).covariance)[:4]) > 2 * sigma).all()
 
 
@@ -117,7 +117,7 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
 def test_wheels_by_their_rows_give_the_motion_that_rolled_them(kind):
     """The table is the pseudo-inverse of the rows: numpy.linalg.pinv."""
     rows = wheel_rows(kind, 5, 0.3)
-    table = Wheels(np.zeros((1, len(rows))), rows, kind).table
+    table = Wheels(np.zeros((1, len(rows))), rows, kind).body_by_wheel
     assert_allclose(table, np.linalg.pinv(rows) * [[1], [1], [2]], atol=1e-12)
 
 

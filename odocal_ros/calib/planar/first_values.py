@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""First values of a planar fit: scale, track width and headings, without prior values."""
+"""
+First values of a planar fit: scale factors, track width and headings, without prior values.
+
+Wheel paths are dead-reckoned for many widths and ratios of the wheels; the best ones are refined.
+Horizontal positions and vectors are complex numbers, x + y i.
+"""
 
 from typing import Any, NamedTuple
 
@@ -14,25 +19,25 @@ from odocal_ros.data.arrays import Complexes, Floats, Ints, running_sum
 # track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
 RATIOS = np.linspace(-0.03, 0.03, 13)
-MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
-SWAPPED = 0.3              # judgement: cost ratio of the mirrored positions
+MOST_MINIMA, SAME_COST = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
+SWAPPED = 0.3     # judgement: cost by mirrored positions over cost, if the wheels are swapped
 # m, wheel path over which dead reckoning is compared. Judgement: several moves and turns
 WINDOW = 6.0
 # judgement: steps in a window between distant positions, such as marks; two fit any path
 WINDOW_STEPS = 4
 
 
-class First(NamedTuple):
-    """First values."""
+class FirstValues(NamedTuple):
+    """First values of the wheels and of the n + 1 nodes of a run."""
 
-    left: float      # scale factor
-    right: float     # scale factor
+    left: float      # scale factor, m per unit
+    right: float     # the same
     width: float     # m, track width
     heading: Floats  # (n + 1,) rad, of nodes
     swapped: bool    # the mirrored positions fit better
 
 
-def first_values(run: Run, width: float) -> First:
+def first_values(run: Run, width: float) -> FirstValues:
     """
     Return the first values of a run; width : m, as configured, 0 unknown.
 
@@ -43,85 +48,91 @@ def first_values(run: Run, width: float) -> First:
     """
     # imported here: the start of a node does not need it
     from scipy.optimize import minimize
-    z = run.position[:, 0] + 1j * run.position[:, 1]
-    s = running_sum(run.wheels.path)[run.node]
-    rough = _rough(z, s)
-    windows = _windows(s * rough)
-    aligned = _Alignment(run, z, windows, rough)
+    position = run.position[:, 0] + 1j * run.position[:, 1]
+    path = running_sum(run.wheels.path)[run.node]
+    scale_guess = _scale_guess(position, path)
+    windows = _windows(path * scale_guess)
+    align = _Alignment(run, position, windows, scale_guess)
     # cost of the positions and of their mirror image for each width and ratio
-    costs, mirrored = np.stack([aligned(w, RATIOS)[0] for w in np.log(WIDTHS)], axis=1)
+    costs, mirrored = np.stack([align(w, RATIOS)[0] for w in np.log(WIDTHS)], axis=1)
     least = costs.min(axis=1)
     padded = np.pad(least, 1, constant_values=np.inf)
     minima = np.flatnonzero((least <= padded[:-2]) & (least <= padded[2:]))
-    found = []
-    for k in minima[np.argsort(least[minima])][:MINIMA]:
+    refined = []      # (cost, (log width, ratio - 1))
+    for k in minima[np.argsort(least[minima])][:MOST_MINIMA]:
         guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
-        better = minimize(lambda x: aligned(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
+        better = minimize(lambda x: align(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
                           options={'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]],
                                    'maxfev': 80})
-        found.append((better.fun, better.x))
-    limit = ALIKE * min(cost for cost, _ in found) + len(z) * 1e-6      # (1 mm)^2 each
-    near = np.log(width or WIDTHS[-1])
-    x = min((x for cost, x in found if cost <= limit), key=lambda x: abs(x[0] - near))
-    _, (factor,), (turn,) = aligned(x[0], x[1:])
+        refined.append((better.fun, better.x))
+    limit = SAME_COST * min(cost for cost, _ in refined) + len(position) * 1e-6    # (1 mm)^2 each
+    expected = np.log(width or WIDTHS[-1])
+    x = min((x for cost, x in refined if cost <= limit), key=lambda x: abs(x[0] - expected))
+    _, (factor,), (turn,) = align(x[0], x[1:])
     middle = run.node[windows.sum(axis=1) // 2]
     heading = turn + np.interp(np.arange(len(turn)), middle, np.unwrap(np.angle(factor)))
     scale = float(np.median(np.abs(factor)))
-    return First(scale * (1 - x[1] / 2), scale * (1 + x[1] / 2),
-                 float(np.exp(x[0])) * scale / rough, heading,
-                 bool(mirrored.min() < SWAPPED * costs.min()))
+    return FirstValues(scale * (1 - x[1] / 2), scale * (1 + x[1] / 2),
+                       float(np.exp(x[0])) * scale / scale_guess, heading,
+                       bool(mirrored.min() < SWAPPED * costs.min()))
 
 
-def _rough(z: Complexes, s: Floats) -> float:
-    """Return metres per unit: 75th percentile over straight lines between positions."""
-    step = max(float(s[-1] - s[0]) / 200, 1e-12)
-    at = np.unique(np.searchsorted(s[:-1], np.arange(s[0], s[-1], step)))
-    ratio = np.abs(np.diff(z[at])) / np.diff(s[at])
+def _scale_guess(position: Complexes, path: Floats) -> float:
+    """Return metres per unit of wheel path: 75th percentile of lines between positions."""
+    step = max(float(path[-1] - path[0]) / 200, 1e-12)
+    at = np.unique(np.searchsorted(path[:-1], np.arange(path[0], path[-1], step)))
+    ratio = np.abs(np.diff(position[at])) / np.diff(path[at])
     return float(np.percentile(ratio, 75))
 
 
-def _windows(s: Floats) -> Ints:
-    """Return first and last + 1 position of each window, by wheel path s at positions: (w, 2)."""
-    steps = np.sort(np.diff(s))
+def _windows(path: Floats) -> Ints:
+    """Return first and last + 1 position of each window, by the wheel path there, m: (w, 2)."""
+    steps = np.sort(np.diff(path))
     usual = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]    # median by path
     length = max(WINDOW, WINDOW_STEPS * usual)
-    begins = np.arange(s[0], max(s[-1] - length / 2, s[0] + 1e-9), length / 2)
-    spans = np.stack([np.searchsorted(s, begins), np.searchsorted(s, begins + length)], -1)
-    fewest = 3
+    begins = np.arange(path[0], max(path[-1] - length / 2, path[0] + 1e-9), length / 2)
+    spans = np.stack([np.searchsorted(path, begins), np.searchsorted(path, begins + length)], -1)
+    fewest = 3      # positions
     spans = spans[spans[:, 1] - spans[:, 0] >= fewest]
-    return spans if len(spans) else np.array([[0, len(s)]])
+    return spans if len(spans) else np.array([[0, len(path)]])
 
 
 class _Alignment:
-    """Fit of dead-reckoned paths to positions in windows; holds what is independent of wheels."""
+    """
+    Least-squares fit of dead-reckoned paths to positions, in w windows: rotation, scale, shift.
 
-    def __init__(self, run: Run, z: Complexes, windows: Ints, rough: float) -> None:
+    It holds the terms that do not depend on width and ratio of the wheels.
+    """
+
+    def __init__(self, run: Run, position: Complexes, windows: Ints, scale_guess: float) -> None:
         forward, side, wheel_difference = run.wheels.body(run.wheels.count).T
-        self.node, self.windows, self.rough = run.node, windows, rough
+        self.node, self.windows, self.scale_guess = run.node, windows, scale_guess
         self.left, self.right = forward - wheel_difference / 2, forward + wheel_difference / 2
         self.moved = forward + 1j * side
         self.count = np.diff(windows, axis=1)[:, 0]
-        y = z - z.mean()
-        self.y = np.stack([y, y.conj()])[:, None]
-        self.of_y = self._sums(self.y)
-        self.target = (self._sums(np.abs(y)**2) - np.abs(self.of_y[0, 0])**2 / self.count).real
+        centred = position - position.mean()
+        self.y = np.stack([centred, centred.conj()])[:, None]
+        self.sum_y = self._sums(self.y)
+        self.power_y = (self._sums(np.abs(centred)**2)
+                        - np.abs(self.sum_y[0, 0])**2 / self.count).real
 
     def __call__(self, log_width: float, ratios: Floats) -> tuple[Floats, Complexes, Floats]:
         """
-        Return costs, (2, r) m^2, scales and rotations, (r, w), and headings, (r, n + 1) rad.
+        Return costs, (2, r) m^2, complex factors, (r, w), and headings, (r, n + 1) rad.
 
-        Of r ratios of right over left wheel; costs are of the positions and of their mirror image.
+        The costs are of the positions and of their mirror image. A factor scales and rotates the
+        path of a window onto its positions.   ratios : (r,) right over left wheel, minus 1.
         """
         half = ratios[:, None] / 2
         turn = _from_zero((1 + half) * self.right - (1 - half) * self.left)
-        turn *= self.rough / np.exp(log_width)
+        turn *= self.scale_guess / np.exp(log_width)
         path = _from_zero(self.moved * np.exp(1j * (turn[:, 1:] + turn[:, :-1]) / 2))[:, self.node]
         x = path - path.mean(axis=1, keepdims=True)
-        of_x = self._sums(x)
-        power = (self._sums(np.abs(x)**2) - np.abs(of_x)**2 / self.count).real
-        cross = self._sums(x.conj() * self.y) - of_x.conj() * self.of_y / self.count
+        sum_x = self._sums(x)
+        power = (self._sums(np.abs(x)**2) - np.abs(sum_x)**2 / self.count).real
+        cross = self._sums(x.conj() * self.y) - sum_x.conj() * self.sum_y / self.count
         factor = cross / np.maximum(power, 1e-30)
-        return (self.target - np.abs(factor)**2 * power).sum(axis=-1), factor[0], turn
+        return (self.power_y - np.abs(factor)**2 * power).sum(axis=-1), factor[0], turn
 
     def _sums(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return the sums over each window, along the last axis."""

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a planar fit: estimates with sigmas, and refusals of those not determined."""
+"""The result of a planar fit: estimates with sigmas, and reasons for those not determined."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -21,10 +21,10 @@ from odocal_ros.settings.config import Config, SIDES
 # the two without a straight after their only turn have widths that are 3 to 570 sigma off, with a
 # sigma of 6 to 70 % of the width, or of 2.5 % of the scale
 SCALE_SIGMA_LIMIT, SIGMA_LIMIT = 0.02, 0.03
-ARC = 0.75      # definition: straightness on a radius of twice the track width
-# 1 sigma, share of the change of the width from the spot to that radius: its law is assumed.
-# Judgement, by measurement on 12 simulated runs with another law: the rms of error over sigma is
-# 3.6 without it, now 0.69
+ARC = 0.75      # definition: ``Wheels.straightness`` on a radius of twice the track width
+# 1 sigma, share of the change of the width from turns on the spot to that radius, since the
+# dependence on the radius is assumed. Judgement, by measurement on 12 simulated runs with another
+# dependence: the rms of error over sigma is 3.6 without it, now 0.69
 WIDTH_LAW_SHARE, ARC_SIGMA_LIMIT = 0.15, 0.05
 LAW_SOURCE, FIT_SOURCE, SLOPES = 'width_by_radius', 'positions_and_wheel_noise', 'slopes'
 WHEEL_NOISE, NOISE_LIMIT = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip
@@ -34,13 +34,13 @@ Constants = dict[str, float]
 
 
 class Quantity(NamedTuple):
-    """An estimate: the constant it needs, its value, limit, and the code and text of a refusal."""
+    """Definition of an estimate by the constants of a fit."""
 
-    needs: str
+    needs: str              # constant without which the quantity does not exist
     value: Callable[[Constants], float]
-    limit: float
-    code: Code
-    required_motion: str
+    limit: float            # of the relative sigma
+    code: Code              # of the reason, if the sigma is larger
+    required_motion: str    # that would determine it, for the remedy
 
 
 QUANTITIES = {
@@ -85,11 +85,11 @@ def _select_quantities(constants: tuple[str, ...], config: Config) -> dict[str, 
 
 
 class Value(NamedTuple):
-    """A quantity by a fit: its value, and effects of one sigma of the constants and of the law."""
+    """A quantity with its errors."""
 
     value: float
-    effects: Floats      # (m,) of independent errors of the constants
-    law_sigma: float     # by the assumed law of the width, or by slopes
+    effects: Floats      # (m,) of independent unit errors of the constants
+    law_sigma: float     # by the assumed dependence of the width on the radius, or by slopes
 
     @property
     def sigma(self) -> float:

@@ -4,7 +4,8 @@
 """
 Input and result of the planar estimator: wheels of a robot, positions, prior knowledge, fit.
 
-``Wheels`` has the kinematics: body increments from the increments of the wheels.
+``Wheels`` has the kinematics. A body increment is the motion of base_link in an interval: forward,
+m, left, m, and turn, rad, counter-clockwise.
 """
 
 from dataclasses import dataclass, field
@@ -20,9 +21,9 @@ from odocal_ros.settings.config import MECANUM, OMNI, SKID
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
-# relative, 1 sigma, of wheel differences if a robot moves sideways. Judgement: without it scale of
-# a run of 7 m with few turns was 1.9 % off (sigma 1.9 %), now 0.04 % (0.08 %)
-UNEQUAL = 0.03
+# relative, prior sigma of wheel differences if a robot moves sideways. Judgement: without it scale
+# of a run of 7 m with few turns was 1.9 % off (sigma 1.9 %), now 0.04 % (0.08 %)
+WHEEL_DIFFERENCE = 0.03
 
 
 def wheel_rows(kind: str, count: int, offset: float = 0.0) -> Floats:
@@ -59,7 +60,7 @@ class Wheels:
                 *{SKID: ('arc',), MECANUM: ('lateral',)}.get(self.kind, ()))
 
     @property
-    def table(self) -> Floats:
+    def body_by_wheel(self) -> Floats:
         """Return forward, left, and width times turn per metre of each wheel: (3, w)."""
         shares: Floats = self.rows / np.maximum((self.rows**2).sum(0), 1e-12)
         out: Floats = (shares * np.array([1.0, 1.0, 2.0])).T
@@ -68,7 +69,7 @@ class Wheels:
     def body(self, metres: Floats) -> Floats:
         """Return forward, left, and width times turn by metres of the wheels, (n, w): (n, 3)."""
         # not by BLAS: its last bits depend on the number of rows
-        out: Floats = np.einsum('kw,iw->ki', metres, self.table)
+        out: Floats = np.einsum('kw,iw->ki', metres, self.body_by_wheel)
         return out
 
     @property
@@ -89,8 +90,8 @@ class Wheels:
     def straightness(self) -> Floats:
         """Return 0 for a turn on the spot, 1 - width / (2 radius) on an arc: (n,)."""
         forward, _, wheel_difference = np.abs(self.body(self.count)).T
-        most = np.maximum(2 * forward, wheel_difference)
-        return 1 - np.where(most > 0, wheel_difference / np.maximum(most, 1e-30), 1.0)
+        larger = np.maximum(2 * forward, wheel_difference)
+        return 1 - np.where(larger > 0, wheel_difference / np.maximum(larger, 1e-30), 1.0)
 
     def increments(self, c: Floats) -> tuple[Floats, Floats]:
         """
@@ -100,13 +101,13 @@ class Wheels:
         the increase of the latter from turns on the spot to a straight line; for mecanum wheels
         the ratio of motion to rolling sideways.
         """
-        w, table = self.count.shape[1], self.table
+        w, body_by_wheel = self.count.shape[1], self.body_by_wheel
         scale, inverse_width, side = self._split_constants(c)
         forward, rolled, wheel_difference = self.body(self.count * scale).T
         J = np.zeros((len(self.count), 3, len(self.names)))
-        J[:, 0, :w] = self.count * table[0]
-        J[:, 1, :w] = self.count * table[1] * side
-        J[:, 2, :w] = self.count * table[2] * inverse_width[:, None]
+        J[:, 0, :w] = self.count * body_by_wheel[0]
+        J[:, 1, :w] = self.count * body_by_wheel[1] * side
+        J[:, 2, :w] = self.count * body_by_wheel[2] * inverse_width[:, None]
         J[:, 2, w] = wheel_difference
         if self.kind == SKID:
             J[:, 2, w + 1] = wheel_difference * self.straightness
@@ -147,12 +148,13 @@ class Wheels:
         wide = 0.35     # relative, judgement: too wide to affect any run with a result
         w, scale = self.count.shape[1], (left + right) / 2
         scales = [left, right] if w == len(SIDE_ROWS) else [scale] * w
-        further = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
+        # value and sigma of the constant after the inverse width
+        last = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
         covariance = np.diag([(wide * scale)**2] * w + [
-            width**-2.0, *(sigma**2 for _, sigma in further)])
+            width**-2.0, *(sigma**2 for _, sigma in last)])
         if w > len(SIDE_ROWS):
-            covariance[:w, :w] = scale**2 * (wide**2 + UNEQUAL**2 * np.eye(w))
-        return np.array([*scales, 1 / width, *(value for value, _ in further)]), covariance
+            covariance[:w, :w] = scale**2 * (wide**2 + WHEEL_DIFFERENCE**2 * np.eye(w))
+        return np.array([*scales, 1 / width, *(value for value, _ in last)]), covariance
 
 
 def make_side_wheels(left: Floats, right: Floats, kind: str) -> Wheels:
@@ -162,14 +164,15 @@ def make_side_wheels(left: Floats, right: Floats, kind: str) -> Wheels:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run on n + 1 nodes in time."""
+    """Measurements of a run, on n + 1 nodes in time."""
 
     t: Floats         # (n + 1,) s
     wheels: Wheels    # increments between nodes
     node: Ints        # (k,) nodes with a position
     position: Floats  # (k, 2) m
     sigma: Floats     # (k,) m, stated white error
-    gyro: Floats = field(default_factory=lambda: np.empty(0))  # (n,) rad; empty: no gyro
+    # (n,) rad, turn between nodes by the gyro; empty: no gyro
+    gyro: Floats = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,13 +191,13 @@ class PriorKnowledge:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Estimated constants."""
+    """Estimate of a run: m constants, n + 1 poses and noise levels."""
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]    # of the constants
     value: Floats             # (m,)
     covariance: Floats        # (m, m)
     pose: Floats              # (n + 1, 3) m, m, rad
-    levels: dict[str, float]  # sigma of each noise
-    passes: int               # their number
+    levels: dict[str, float]  # sigma of each noise, in the units of ``fit.LEVELS``
+    passes: int               # number of passes
     converged: bool           # False at the limit of passes
     swapped: bool             # left and right wheels are swapped
