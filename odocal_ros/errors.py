@@ -4,7 +4,7 @@
 """Errors raised on purpose; commands and nodes catch OdocalError once and show its sentence."""
 
 from collections.abc import Iterable
-import difflib
+from difflib import SequenceMatcher
 
 
 class OdocalError(Exception):
@@ -27,9 +27,24 @@ class BadUsage(OdocalError):
     """An option or argument is invalid: correct the call."""
 
 
+class BadTopics(BadUsage):
+    """The topics of a bag do not fit; the text lists topics, escaped, one on each line."""
+
+
+def similar_names(name: str, names: Iterable[str]) -> list[str]:
+    """Return at most three of ``names`` that contain a wrong one, else the most similar ones."""
+    known_names = list(names)
+    if longer := [known for known in known_names if name and name in known]:
+        return longer[:3]
+    lowest, margin = 0.6, 0.1     # judgement: least similarity; and below that of the best
+    ranked = sorted(((SequenceMatcher(None, name, known).ratio(), known) for known in known_names),
+                    reverse=True)
+    return [known for ratio, known in ranked[:3] if ratio >= max(lowest, ranked[0][0] - margin)]
+
+
 def unknown_name(name: str, names: Iterable[str]) -> str:
     """Return the text for a name that is none of ``names``: similar ones, and all of them."""
     known = list(names)
-    similar = difflib.get_close_matches(name, known, 3)
+    similar = similar_names(name, known)
     hint = f'did you mean {" or ".join(similar)}? ' if similar else ''
     return f'{hint}required: one of {", ".join(known)}'

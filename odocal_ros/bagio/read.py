@@ -18,11 +18,12 @@ from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.rosbags_readers import Rosbag1File, Types
 from odocal_ros.bagio.sources import file_names, find_source, Source, unpack
 from odocal_ros.bagio.sqlite_file import SqliteFile
-from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
+from odocal_ros.errors import BadBag, BadData, BadTopics, OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io.limits import Allowance, Damaged, is_file
+from odocal_ros.safe_io.text_formats import indented_list, one_line
 
 LEAST_LOSS = 0.5   # s, judgement: shorter losses are not reported
 
@@ -115,7 +116,8 @@ class Bag:
         read; none of a topic's can be used.
         """
         for topic in readers.keys() - self.topics.keys():
-            raise BadUsage(f'{self.name}: no topic {topic}; topics: {", ".join(self.topics)}')
+            raise BadTopics(f'{self.name}: no topic {one_line(topic)}; the bag has:'
+                            f'{indented_list(list(self.topics))}')
         deserialize = {topic: self._types.deserializer(self.topics[topic].msgtype)
                        for topic in readers}
         used = dict.fromkeys(readers, 0)

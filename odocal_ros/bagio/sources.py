@@ -210,9 +210,10 @@ def kind_of(path: Path) -> str:
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return kind
-    fault = 'is an empty file' if not head else 'is not a bag'
-    raise BadBag(f'{path.name}: {fault}; give a folder with metadata.yaml or a .mcap, .db3 or '
-                 '.bag file')
+    content = 'a text file' if head and all(9 <= byte < 127 for byte in head) else (
+        f'a file that starts with the bytes {head[:4].hex(" ")}' if head else 'an empty file')
+    raise BadBag(f'{path.name}: {content}, which is not a bag; give a folder of rosbag2, or a '
+                 '.mcap, .db3 or .bag file')
 
 
 def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path:

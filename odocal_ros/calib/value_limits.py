@@ -65,10 +65,8 @@ def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
                                   f'{100 * relative:.0f} %, too large for a usable value; the '
                                   f'limit is {100 * SCALE_LIMIT:g} %'))
         elif relative > limit:
-            # both in per cent, or both in ppm
-            shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else format_relative(limit)
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
-                                  f'{format_relative(relative)}; the limit is {shown}'))
+                                  f'{1e6 * relative:.0f} ppm; the limit is {1e6 * limit:.0f} ppm'))
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:

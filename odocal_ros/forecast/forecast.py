@@ -44,9 +44,10 @@ class ParameterForecast:
 
         since : distance driven since the forecast, m.
         """
-        if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
-            unit, factor = '%', 100.0
         limit = three_digits(float(f'{self.limit * factor:.2g}'))
+        limit_with_unit = f'{limit} {unit}'
+        if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
+            unit, factor, limit = '%', 100.0, limit_with_unit
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'
         if self.value_text and sigma is not None:
@@ -60,7 +61,7 @@ class ParameterForecast:
             return f'OK: {known} (limit {limit})'
         left = self.remaining_m - since
         more = (f'drive {_rounded_up(left)} m more' if left > 0 else 'drive on') + (
-            f' to reach the limit of {limit} {unit}')
+            f' to reach the limit of {limit_with_unit}')
         if sigma is None:
             return f'{name} is not determined yet; {more}'
         return f'{known} so far; {more}' if self.value_text else (

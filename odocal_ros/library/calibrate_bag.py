@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib.result import LegResult
-from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.errors import BadTopics, BadUsage, OdocalError
 from odocal_ros.library.arguments import (
     config_of,
     Leg,
@@ -204,7 +204,7 @@ def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
 
 def error_about(path: Path, error: Exception) -> str:
     """Return the error of one of several bags, starting with the bag."""
-    text = str(error)
+    text = ' '.join(str(error).split()) if isinstance(error, BadTopics) else str(error)
     if text.startswith(str(path)):
         return text
     for name in (path.name, path.stem):      # some sentences begin with the bag's name

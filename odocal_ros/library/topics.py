@@ -4,12 +4,11 @@
 """Assignment of a bag's topics to inputs, by message type if exactly one topic fits."""
 
 from collections.abc import Iterable, Mapping
-import difflib
 import re
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, topic_option
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadTopics, BadUsage, similar_names
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.message_fields import (
     FIX,
@@ -20,6 +19,7 @@ from odocal_ros.messages.message_fields import (
     types_of,
 )
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
+from odocal_ros.safe_io.text_formats import indented_list, one_line
 from odocal_ros.settings.config import Config, OdometerConfig
 
 SYSTEM_TOPICS = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
@@ -54,7 +54,8 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     slot -> topic, by the user.   marked : the positions are those of marks.
 
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
-    fit. All such inputs are named at once, with the option that selects each.
+    fit. All such inputs are named at once, with the option that selects each. BadTopics lists
+    topics.
     """
     chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
@@ -71,9 +72,9 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
         elif not _is_optional(slot, config, found):
             errors.append(_open_slot_text(topics, slot, found, config, chosen))
     if errors:
-        raise BadUsage('; '.join(errors) + (
-            '' if all('; choose one with ' in text for text in errors) else
-            f'; the bag has {_described(topics, topics)}'))
+        if not all('; choose one with ' in text for text in errors):
+            errors.append(f'the bag has:{_described(topics, topics)}')
+        raise BadTopics(';\n'.join(errors))
     return chosen
 
 
@@ -166,7 +167,7 @@ def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
     """Return the name in the bag of a topic that the user named; raise BadUsage if unusable."""
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
-        similar = difflib.get_close_matches(topic, topics, 1)
+        similar = similar_names(topic, topics)
         wrong = 'no such topic' + (f' (did you mean {similar[0]}?)' if similar else '')
     elif not topics[name].count:
         wrong = 'the topic has no message'
@@ -175,8 +176,8 @@ def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
                  f'{INPUTS[slot].label}')
     else:
         return name
-    raise BadUsage(f'{topic_option(slot)} {topic}: {wrong}; the bag has '
-                   f'{_described(topics, topics)}')
+    raise BadTopics(f'{topic_option(slot)} {one_line(topic)}: {wrong}; the bag has:'
+                    f'{_described(topics, topics)}')
 
 
 def topics_without_messages(types: Mapping[str, tuple[str, int]], slot: str) -> list[str]:
@@ -204,9 +205,9 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
                 side for name in found for side in ('left', 'right') if side in name}:
-            hint = '; for two wheels set odometer.left and odometer.right to topic'
+            hint = ', or for two wheels set odometer.left and odometer.right to topic'
         return (f'{len(found)} topics can be the {INPUTS[slot].label}; choose one with '
-                f'{topic_option(slot)}: {_described(topics, found)}{hint}')
+                f'{topic_option(slot)}{hint}:{_described(topics, found)}')
     types = tuple(_types(slot, config))
     empty = topics_without_messages({t.name: (t.msgtype, t.count) for t in topics.values()}, slot)
     if empty:
@@ -222,10 +223,10 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
 
 
 def _described(topics: Topics, names: Iterable[str]) -> str:
-    """Return the topics that have messages, with their types, as text."""
-    shown = [name for name in names if topics[name].count and name not in SYSTEM_TOPICS]
-    return ', '.join(f'{name} ({topics[name].msgtype})' for name in shown) or (
-        'no topic with messages')
+    """Return the topics that have messages, with their types, as a list."""
+    return indented_list([f'{name} ({topics[name].msgtype})' for name in names
+                          if topics[name].count and name not in SYSTEM_TOPICS]
+                         or ['no topic with messages'])
 
 
 def _base_name(name: str) -> str:

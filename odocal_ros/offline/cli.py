@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from odocal_ros import __version__
-from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.errors import BadTopics, BadUsage, OdocalError, unknown_name
 from odocal_ros.offline import cli
 from odocal_ros.safe_io.text_formats import brief_line, for_terminal
 
@@ -109,6 +109,9 @@ def main(argv: list[str] | None = None) -> int:
         if hasattr(stream, 'reconfigure'):
             stream.reconfigure(errors='replace')
     try:
+        if argv and argv[0] not in COMMANDS and not argv[0].startswith('-'):
+            raise _Usage(f'odocal: no command {argv[0]!r}; {unknown_name(argv[0], COMMANDS)} '
+                         '(see odocal --help)')
         parser = _parser({a for a in argv[:1] if a in COMMANDS})
         args = parser.parse_args(argv)
         if args.command is None:
@@ -119,8 +122,8 @@ def main(argv: list[str] | None = None) -> int:
         return code
     except OdocalError as error:
         text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
-        longest = 2000    # characters of a sentence: a bag may hold a name of any length
-        warn(text if len(text) <= longest else f'{text[:longest]} ...')
+        for line in text.split('\n') if isinstance(error, BadTopics) else [text]:
+            warn(line)
         return WRONG_USE
     except KeyboardInterrupt as stopped:
         warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')

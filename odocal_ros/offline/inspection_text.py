@@ -243,7 +243,9 @@ def _findings(found: dict[str, Any]) -> list[str]:
 def _length_text(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
-        lines += wrapped(f'replay without options fails: {found["open"]}', '')
+        lines.append('replay without options fails:')
+        lines += [part for line in found['open'].split('\n')
+                  for part in wrapped(line.strip(), '  ' + '  ' * line.startswith(' '))]
     if found['command']:
         lines += ['suggested command', f'  {found["command"]}']
     return lines

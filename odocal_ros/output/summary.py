@@ -37,6 +37,7 @@ PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of 
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
+LABEL_WIDTH = 19      # judgement: columns of the label of a value
 # what is shown: small errors, notes, budget
 SHORTER = ((True, True, True), (False, True, True), (False, False, True), (False, False, False))
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
@@ -214,7 +215,10 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int)
     found = {axis: e for axis, e in found.items() if e.value is not None}
     shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
     where = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= WIDTH)
-    return _line(f'{word} {", ".join(found)}', f'{shown} m{where}') if found else ''
+    label, axes = f'{word} {", ".join(found)}', ''
+    if len(label) > LABEL_WIDTH:
+        label, axes = word, f'{", ".join(found)}: '
+    return _line(label, f'{axes}{shown} m{where}') if found else ''
 
 
 def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
@@ -234,7 +238,7 @@ def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
 
 
 def _line(label: str, text: str) -> str:
-    return f'  {label:<19} {text}'.rstrip()
+    return f'  {label:<{LABEL_WIDTH}} {text}'.rstrip()
 
 
 def _scale_text(scale: result.Estimate) -> str:

@@ -9,7 +9,7 @@ frame is accepted only if ROS accepts it, since programs act on files that conta
 have the same type for every reader; untrusted YAML is read with limits.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, UTC
 from functools import cache
 import math
@@ -33,6 +33,12 @@ NODES = 30_000            # judgement: mappings, lists and values of a YAML text
 def one_line(text: object) -> str:
     """Return text as one line, invisible characters as escape sequences."""
     return _escaped(str(text))
+
+
+def indented_list(names: Sequence[str]) -> str:
+    """Return the lines of a list that follows a colon: one name on each, at most 100."""
+    shown = [*map(one_line, names[:100]), *[f'{len(names) - 100} more'] * (len(names) > 100)]
+    return '\n  ' + ',\n  '.join(shown)
 
 
 def brief_line(text: object) -> str:

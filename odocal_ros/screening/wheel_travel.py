@@ -130,11 +130,11 @@ def correct_rollovers(
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
     do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
     twice = times > 0.1 * len(step)     # judgement: few counters do so; the steps of two alternate
-    found = Reason(code, f'{name} rolls over at {about}, '
-                   f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
-                   f'this size against the travel, first at t = {t[span.rows[0] + 1]:.2f} s; '
-                   'corrected' + '; if the counter cannot roll over so often, check for two '
-                   'publishers on one topic' * twice, do)
+    found = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '
+                   f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
+                   f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
+                   + '. Check for two publishers on the topic if the counter cannot roll over so '
+                   'often' * twice, do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),

@@ -5,12 +5,11 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
-import difflib
 from functools import cache
 import math
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from odocal_ros.errors import BadConfig
+from odocal_ros.errors import BadConfig, similar_names
 from odocal_ros.safe_io.text_formats import is_frame, one_line
 
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
@@ -127,7 +126,7 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     settings = settings_of(type(config))
     for name, value in changes.items():
         if name not in settings:
-            similar = difflib.get_close_matches(name, settings, 3, 0.5)
+            similar = similar_names(name, settings)
             hint = (f'did you mean {" or ".join(similar)}?' if similar else
                     'docs/settings.md lists all')
             raise BadConfig(f'no setting {name!r}; {hint}')

@@ -174,7 +174,7 @@ def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
     argv = ['replay', str(town[1]), '--method', 'two_point', '--leg', '0:', '--output', str(out)]
     assert main([*argv, '--export', 'residual.csv']) == 2
     error = capsys.readouterr().err
-    assert 'did you mean residuals.csv or residuals.parquet? required: one of traj' in error
+    assert 'did you mean residuals.csv? required: one of traj' in error
     assert not out.exists()
     assert main([*argv, '--export', 'residuals.csv,track.kml', '--export', 'trajectory.csv']) == 2
     assert 'no leg has a result of the smoother' in capsys.readouterr().err

@@ -63,6 +63,9 @@ def test_wrong_use_is_one_line_and_exit_2(argv, capsys):
     err = capsys.readouterr().err
     assert err.count('\n') == 1
     assert '--help' in err
+    assert cli.main(['replya', 'x']) == 2
+    assert "no command 'replya'; did you mean replay? required: one of try, replay," in \
+        capsys.readouterr().err
 
 
 @pytest.mark.parametrize(('error', 'code'), [

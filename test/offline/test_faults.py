@@ -111,8 +111,10 @@ def test_what_is_said_of_it_is_one_line(evil, tmp_path, capsys):
         assert main(argv) == 2
         out, err = capsys.readouterr()
         assert out == ''
-        assert err.count('\n') == 1
-        assert err.rstrip('\n').isprintable()
+        first, *listed = err.splitlines()      # of the bag's topics, each on its line
+        assert first.startswith('odocal: ')
+        assert all(line.startswith('  /') for line in listed)
+        assert err.replace('\n', '').isprintable()
     assert main(['inspect', str(evil)]) == 0
     out = capsys.readouterr().out
     assert out.replace('\n', '').isprintable()

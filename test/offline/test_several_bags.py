@@ -54,7 +54,7 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
     assert line.startswith('odocal: 4 of 6 bags cannot be used; nothing was calibrated: ')
     for name, why in (('nofix', 'no fix: /fix has no messages'),
                       ('wheels', '2 topics can be the odometer'),
-                      ('foreign.txt', 'is not a bag'), ('nosuch', 'no such file')):
+                      ('foreign.txt', 'a text file'), ('nosuch', 'no such file')):
         assert f'{bags / name}: {why}' in line
     assert not (tmp_path / 'out').exists()
 

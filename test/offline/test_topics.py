@@ -49,18 +49,18 @@ def test_one_of_each():
 
 @pytest.mark.parametrize(('found', 'overrides', 'settings', 'match'), [
     (topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'), {}, {},
-     r'3 topics can be the odometer; choose one with --odometer-topic: /odometer '
-     r'\(std_msgs/msg/Int64\), /speed'),
+     r'3 topics can be the odometer; choose one with --odometer-topic:\n  /odometer '
+     r'\(std_msgs/msg/Int64\),\n  /speed'),
     (topics(imu__raw=IMU, phone=FIX), {}, {},       # all at once
-     'can be the IMU.*--imu-topic.*can be the fix.*--fix-topic'),
-    (topics(imu__data=None), {}, {}, r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag; '
-     r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'),
+     r'can be the IMU.*--imu-topic:(?s:.*)\);\n2 topics can be the fix.*--fix-topic'),
+    (topics(imu__data=None), {}, {}, r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag;\n'
+     r'the bag has:\n  /odometer \(std_msgs/msg/Int64\),\n  /fix'),
     (topics(), {'heading': '/imu/data'}, {},
      r'no IMU \(a topic of sensor_msgs/msg/Imu besides /imu/data\) in the bag'),
-    (topics(), {'fix': '/gps'}, {}, '--fix-topic /gps: no such topic; the bag has /imu/data'),
+    (topics(), {'fix': '/gps'}, {}, '--fix-topic /gps: no such topic; the bag has:\n  /imu/data'),
     # not as if the others were missing, which it would be taken from
     (topics(), {'imu': '/fix'}, {}, '^--imu-topic /fix: the topic is of sensor_msgs/msg/NavSatFix'
-     ', which cannot be used as IMU; the bag has /imu/data'),
+     ', which cannot be used as IMU; the bag has:\n  /imu/data'),
     *((topics(), {slot: topic}, {}, 'which cannot be used as ') for slot, topic in (
         ('odometer', '/imu/data'), ('odometer_right', '/fix'), ('fix', '/odometer'),
         ('heading', '/fix'), ('fix_velocity', '/odometer'))),
@@ -70,18 +70,18 @@ def test_one_of_each():
     (topics(odometer=None, cmd_vel='geometry_msgs/msg/Twist'), {}, {}, 'no odometer'),
     (topics(imu__data=None, imu=IMU), {'imu': '/imu'}, BY_TOPIC, 'no heading'),
     (topics(), {}, BY_TOPIC, r'^no heading \(a topic of sensor_msgs/msg/Imu besides the IMU\) in '
-     'the bag; the bag has /imu/data'),      # the IMU is there
+     'the bag;\nthe bag has:\n  /imu/data'),      # the IMU is there
     (SIDES, {}, {}, 'odometer.left and odometer.right to topic'),
     (topics(), {}, TWO, 'no right odometer'),
     (topics(fix=None, slam__pose=POSE, prism=POINT), {}, {},
-     r'^2 topics can be the fix; choose one with --fix-topic: /slam/pose '
-     r'\(geometry_msgs/msg/PoseStamped\), /prism \(geometry_msgs'),
+     r'^2 topics can be the fix; choose one with --fix-topic:\n  /slam/pose '
+     r'\(geometry_msgs/msg/PoseStamped\),\n  /prism \(geometry_msgs'),
     (topics(fix=None, tf='tf2_msgs/msg/TFMessage'), {}, {},
      'name a tf2_msgs/msg/TFMessage or nav_msgs/msg/Odometry with --fix-topic'),
     (topics(fix=None, lidar_odometry=ODOM), {'odometer': '/odometer'}, {},
      r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, gps_msgs/msg/GPSFix, .*'
-     r'geometry_msgs/msg/PoseStamped, .*\) in the bag; name .*/Odometry with --fix-topic; '
-     'the bag has'),
+     r'geometry_msgs/msg/PoseStamped, .*\) in the bag; name .*/Odometry with --fix-topic;\n'
+     'the bag has:'),
     (topics(fix=None, odometer=None, odom=ODOM), {'odometer': 'odom', 'fix': '/odom'}, {},
      '^/odom is both --odometer-topic and --fix-topic: an odometer cannot be calibrated against '
      'itself'),

@@ -217,7 +217,7 @@ def test_positions_in_a_local_frame_have_no_antenna(good):
     local = replace(seen, legs=tuple(replace(leg, reasons=leg.reasons + note)
                                      for leg in good.legs))
     assert '  antenna at x, y, z  +0.50' in screen(seen)
-    assert '  tracked point at x, y, z +0.50' in screen(local)
+    assert '  tracked point at    x, y, z: +0.500 ± 0.010, ' in screen(local)
     assert 'antenna' not in screen(local)
     assert [row['name'] for row in value_rows(local)[-3:]] == [
         f'tracked point lever arm {axis}' for axis in 'xyz']

@@ -124,6 +124,8 @@ def test_set_takes_nan_where_a_setting_may_be_unset():
     ('=5', BadUsage, 'required: key=value'),
     ('gnss.lever_arm=[1, 2', BadUsage, 'not valid YAML'),
     ('leg.min_dist=5', BadConfig, "^--set: no setting 'leg.min_dist'; did you mean leg.min_dist"),
+    ('imu.grde=tactical', BadConfig, r"no setting 'imu.grde'; did you mean imu.grade\?$"),
+    ('grade=tactical', BadConfig, r"no setting 'grade'; did you mean imu.grade\?$"),
     ('imu.gyro_scale=-1', BadConfig, '^--set imu.gyro_scale = -1: required: 0 to 1000$'),
     ('imu.gyro_noise=-1', BadConfig, 'required: 0 to 1 rad/s/sqrt'),
     ('leg.min_distance=', BadConfig, 'is not a number'),
