@@ -91,10 +91,10 @@ def relay(args) -> None:
     from std_msgs.msg import Int64
 
     from odocal_ros.live.messages import WaitingMessages
-    from odocal_ros.live.odometry import CHECK_PERIOD_S, EXECUTOR_PERIOD_S, NumbersPublisher
+    from odocal_ros.live.odometry import CHECK_PERIOD_S, EXECUTOR_PERIOD_S, TemplatePublisher
     rclpy.init()
     node = rclpy.create_node(args.role)
-    publishers = [(NumbersPublisher(node, f'{args.role}/{name}', kind()), bytes(8 * size))
+    publishers = [(TemplatePublisher(node, f'{args.role}/{name}', kind()), bytes(8 * size))
                   for name, kind, size in (('odometry', Odometry, 85),
                                            ('twist', TwistWithCovarianceStamped, 42))]
     qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)

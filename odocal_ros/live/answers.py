@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Words for the operator: what to do next, and the answers of the services."""
+"""
+Texts for the operator: the hint (next action) of the status, and the answers of the services.
+
+Each function takes a ``SessionView``, the snapshot of the node, and only returns text or numbers.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -20,7 +24,7 @@ from odocal_ros.safe_io.text_formats import error_text
 MOST_REASONS = 3     # judgement: in an answer
 KMH = 3.6    # definition: km/h per m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
-FEWEST_MARKS = 2         # judgement: marks after which the hint omits ~/mark
+FEWEST_MARKS = 2         # judgement: marks from which the hint no longer asks for ~/mark
 DRIVE = 'drive '
 DRIVE_ON = ('then drive on, with stops and left and right turns, until this hint shows OK for '
             'scale and yaw')
@@ -31,20 +35,21 @@ SPOT_TURNS = ('for the track width: turn on the spot in both directions, and dri
 
 
 def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
-                  good: str = '', advice: str = '') -> tuple[bool, str]:
+                  within_limits: str = '', advice: str = '') -> tuple[bool, str]:
     """
     Return (success, text) of a result: values, verdict, legs, cautions and the next action.
 
-    good, advice : quantities within their limits, and the next action, as in the status.
+    parts : results of the leg's sections.   within_limits, advice : texts on quantities that meet
+    their limits, and on the next action, as in the status.
     A rejected calibration is no success, so that a script does not use its values.
     """
     text = sentence(calibration)
     if parts and len(calibration.legs) > 1:
         verdict = Verdict.worst(one.verdict for one in parts)
-        cut = f' in {len(parts)} sections' if len(parts) > 1 else ''
-        text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
+        sections = f' in {len(parts)} sections' if len(parts) > 1 else ''
+        text = (f'leg {leg_id}{sections}, {sum(one.distance for one in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
-    parts_of_answer = [text, good]
+    parts_of_answer = [text, within_limits]
     for reason in cautions(calibration.reasons)[:MOST_REASONS]:
         parts_of_answer += [str(reason), reason.remedy]
     if advice and advice not in parts_of_answer:
@@ -74,9 +79,9 @@ def provisional_answer(at_stop: SessionView) -> str:
         'result.*; call ~/stop_leg again to wait for it'])
 
 
-def restored_answer(result: Restored, unit: str, good: str) -> tuple[bool, str]:
-    """Return the answer that carries a restored result; ``unit`` is that of its scale."""
-    return result.valid, _sentences([f'no leg is running; {result.words(unit)}', good,
+def restored_answer(result: Restored, unit: str, within_limits: str) -> tuple[bool, str]:
+    """Return (success, text) of a restored result; ``unit`` is that of its scale."""
+    return result.valid, _sentences([f'no leg is running; {result.words(unit)}', within_limits,
                                      'Next: drive a leg to update it'])
 
 
@@ -98,7 +103,7 @@ def hint(view: SessionView) -> str:
     """Return the action: provide missing inputs, or the next step."""
     session, state = view.session, view.session.state
     if state is State.COMPUTING:
-        return f'computing: {view.computed.words() or "started"}; the result follows on ~/status'
+        return f'computing: {view.stage.words() or "started"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.has_open_leg else 'call ~/reset')
@@ -112,7 +117,7 @@ def hint(view: SessionView) -> str:
         actions, facts = _recording_hint(view)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
-        if view.config.leg.automatic and view.imu:
+        if view.config.leg.automatic and view.has_imu:
             return 'start driving: a leg starts automatically'
         if view.still_s < PREDICTED_REST_S:
             return (f'stand still {PREDICTED_REST_S:.0f} s before ~/start_leg '
@@ -182,7 +187,7 @@ def _wheel_manoeuvres(view: SessionView) -> list[str]:
     if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= limit):
         required.append(STRAIGHT)
     if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
-        required.append(TURNS if view.imu else SPOT_TURNS)
+        required.append(TURNS if view.has_imu else SPOT_TURNS)
     return required
 
 
@@ -226,8 +231,7 @@ def _end_text(view: SessionView) -> str:
 
 def advice_after_result(view: SessionView) -> str:
     """Return the advice after a result: the largest improvement, then the other quantities."""
-    reasons = view.session.calibration.reasons if view.session.calibration else ()
-    config = view.config
+    reasons, config = view.session.reasons, view.config
     lacking = config.verdict.min_legs - len(view.session.legs)
     if lacking > 0:
         return f'drive {counted(lacking, "more leg")}'

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Console log of the node: missing inputs, readiness, failures."""
+"""
+Console log of a node: missing inputs, readiness, problems of the leg, lost messages.
+
+Each text is logged when it is new; missing inputs are repeated at growing intervals.
+"""
 
 import re
 from typing import Any
@@ -24,7 +28,7 @@ class PlainLog:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
 
-    # rclpy identifies callers by their lines, and requires one severity for each
+    # one method each: rclpy requires that a line of the caller always has the same severity
     def debug(self, text: str) -> None:
         self._logger.debug(brief_line(text))
 
@@ -42,11 +46,11 @@ class PlainLog:
 
 
 class TopicReport:
-    """Reports mixed and lost messages; a loss again at LOSS_FACTOR times the reported count."""
+    """Reports topics with several publishers once, and losses when they are LOSS_FACTOR larger."""
 
     def __init__(self) -> None:
         self._reported_counts: dict[str, int] = {}
-        self._reported_duplicates: set[str] = set()      # reported
+        self._reported_duplicates: set[str] = set()
 
     def new_texts(self, lost: dict[str, int], duplicate_publishers: list[str]) -> list[str]:
         """
@@ -83,11 +87,10 @@ class Console:
 
     def __init__(self, log: PlainLog) -> None:
         self._log = log
-        self._ready = False          # has been logged
+        self._ready_logged = self._missing_logged = False
         self._topics = TopicReport()
-        self._missing_logged = False        # has been logged
         self._due_ns = 0             # time of the next log of missing inputs
-        self._pause_ns = SILENCE_FIRST_NS
+        self._pause_ns = SILENCE_FIRST_NS      # until the one after it
         self._missing_text = ''      # missing inputs of the last view, numbers removed
         self._leg_id = 0             # the leg whose faults are logged
         self._reported: set[Code] = set()      # logged faults of this leg
@@ -109,23 +112,23 @@ class Console:
             self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
         self._missing_text = text
         if not self._due_ns:     # an input lost after the start is logged at once
-            self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
+            self._due_ns = steady_ns + (0 if self._ready_logged else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:
-            self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(view.missing))
+            self._log.warning('waiting: ' * (not self._ready_logged) + '; '.join(view.missing))
             self._missing_logged = True
             self._pause_ns = min(2 * self._pause_ns, SILENCE_SELDOM_NS)
             self._due_ns = steady_ns + self._pause_ns
 
     def _log_complete(self, view: SessionView) -> None:
         self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
-        if not self._ready:
+        if not self._ready_logged:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in view.rates_hz.items() if hz)
             action = ('legs start and end automatically' if view.config.leg.automatic else
                     'stand still for 10 s, then call ~/start_leg')
             self._log.info(f'ready ({rates}): {action}' if rates else f'ready: {action}')
         elif self._missing_logged:
             self._log.info('all inputs are available again')
-        self._ready, self._missing_logged = True, False
+        self._ready_logged, self._missing_logged = True, False
 
     def _log_faults(self, view: SessionView) -> None:
         """Log the problems of the current leg, each once."""

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node that drives a robot along a pattern, from ``~/start`` to a stop condition."""
+"""
+The node that drives a robot along a pattern for a calibration, from ``~/start`` to a stop.
+
+``pattern/`` computes route, commands and stop conditions; this module receives poses and sends
+commands. At every stop it sends zero commands for a second.
+"""
 
 from functools import partial
 import math
@@ -19,7 +24,7 @@ from odocal_ros import pattern
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.messages import message_class
-from odocal_ros.live.process import run, SettledNode
+from odocal_ros.live.process import CheckedNode, run
 from odocal_ros.output.value_text import counted
 from odocal_ros.settings.node_configs import PatternConfig
 
@@ -39,8 +44,8 @@ services     ~/start, ~/stop   (std_srvs/srv/Trigger)
 settings     parameters, all described in config/drive_pattern.yaml"""
 
 
-class DrivePattern(SettledNode):
-    """Joins poses, ``pattern.follow`` and commands; it sends nothing unless it drives or stops."""
+class DrivePattern(CheckedNode):
+    """Sends velocity commands while it drives or stops the robot, nothing otherwise."""
 
     default_name = 'drive_pattern'
 
@@ -51,11 +56,11 @@ class DrivePattern(SettledNode):
         self._rectangle = pattern.rectangle_of(self.config)
         pattern.route_of(self.config, self._rectangle[:2])      # raises now, not at ~/start
         self._pose: pattern.Pose | None = None
-        self._pose_at = -math.inf       # all times: s, of the steady clock
+        self._pose_at = -math.inf       # time of its arrival; all times are s, steady clock
         self._bumped = self._ending = False
         self._route: tuple[pattern.Piece, ...] = ()     # empty: the robot is not driven
         self._progress, self._started_s, self._stop_commands_left = pattern.Progress(), 0.0, 0
-        # where and when the robot last moved
+        # pose and time at which the robot last moved
         self._last_motion: tuple[pattern.Pose, float] | None = None
         sensor = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(message_class(self.config.pose_type), 'pose', self._receive_pose,
@@ -162,6 +167,7 @@ class DrivePattern(SettledNode):
             self._send(speed, rate)
 
     def _is_stuck(self, commanded: float) -> bool:
+        """Return True if a commanded robot has not moved for STUCK_S."""
         pose, now = self._pose, time.monotonic()
         assert pose is not None
         if not commanded or self._last_motion is None \

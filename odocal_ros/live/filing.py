@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result files: written by the worker; a future has the answer."""
+"""
+Result folders of a node: writing, the link ``latest``, and removal of old automatic results.
+
+``Filing`` writes in the worker's thread and answers by a future; ``ResultFolders`` decides which
+folder ``latest`` points to.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,17 +33,17 @@ from odocal_ros.safe_io.atomic_files import locked, new_folder
 from odocal_ros.settings.config import Config
 
 LATEST = 'latest'
-REMAINS_AGE_S = 60.0      # judgement: age from which an empty folder or unfinished link is unused
+REMAINS_AGE_S = 60.0      # judgement: an older empty folder or temporary link is not in use
 RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # time, count
 
 
 @dataclass(frozen=True)
 class WrittenResult:
-    """A written folder, the start of its last leg, ns, and the earlier target of ``latest``."""
+    """A result folder that this node has written."""
 
     folder: Path
-    last_ns: int
-    before: str
+    last_ns: int     # start of its last leg
+    before: str      # earlier target of ``latest``, empty without one
 
 
 class ResultFolders:
@@ -140,7 +145,7 @@ def _set_link(link: Path, name: str) -> None:
 
 
 def output_root(config: Config, node: str) -> Path:
-    """Return the folder of results: the setting, else the node's own folder in the ROS home."""
+    """Return the folder of results: output.directory, else a folder in the ROS home."""
     default = Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal' / node.lstrip('/')
     return Path(config.output.directory or default).expanduser()
 
@@ -149,7 +154,8 @@ class Filing:
     """
     Saves and withdraws results.
 
-    saved : the newest folder that is not withdrawn.   trouble : error of the newest save.
+    show : called when ``saved`` (the newest folder that is not withdrawn) or ``trouble`` (error of
+    the newest save) has changed.   node : full name, for the default folder.
     """
 
     def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
@@ -157,7 +163,8 @@ class Filing:
         self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
-        self._warned: Calibration | None = None    # a requested save left latest unchanged
+        # result of a requested save that left ``latest`` unchanged
+        self._not_latest: Calibration | None = None
         self._saves_running = 0
         self._report_worker = Worker()        # separate: no leg waits for a report
 
@@ -178,7 +185,7 @@ class Filing:
                 folder, unchanged_reason = outcome
                 self.saved, self.trouble = str(folder), ''
                 if unchanged_reason and by_operator:
-                    self._warned = calibration
+                    self._not_latest = calibration
                 text = f'saved to {folder}'
                 if unchanged_reason:
                     text += (f'; latest is unchanged: {unchanged_reason}; call ~/save'
@@ -194,7 +201,7 @@ class Filing:
         self._worker.submit(partial(
             self._write, calibration, config, [{'bag': '', 'sha256': None, 'node': self._node,
                                                'topics': topics}],
-            imu_frame, now_ns, by_operator and calibration is self._warned), on_done)
+            imu_frame, now_ns, by_operator and calibration is self._not_latest), on_done)
         return future
 
     @property
@@ -225,10 +232,10 @@ class Filing:
             raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                               'output.directory to a writable folder') from None
         if results.has_report:      # drawing it takes long
-            self._report_worker.submit(results.draw, self._drawn)
+            self._report_worker.submit(results.draw, self._report_drawn)
         return folder, unchanged_reason
 
-    def _drawn(self, drawing_error: str, error: Exception | None) -> None:
+    def _report_drawn(self, drawing_error: str, error: Exception | None) -> None:
         if error is not None or drawing_error:
             self._log.warning('the report could not be drawn: '
                               f'{answers.error_line(error) if error else drawing_error}')

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Health of one topic: counts, rate, gaps, losses; without ROS."""
+"""
+Health of one topic, from the stamps and sequence numbers of its messages; without ROS.
+
+Counts messages, gaps and losses, estimates rate and delay, and detects implausible stamps and a
+restart of time (a bag that is played again, a clock that was set).
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,7 +18,7 @@ from odocal_ros.settings.levels import TIME_RESTART_NS, TIME_RESTART_ROWS
 # judgement: time span and number of blocks of a rate; silence of a lost topic
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
-# judgement: a stamp further ahead is accepted if TIME_ANEW_ROWS of them follow
+# judgement: a stamp further ahead is accepted as the last of TIME_RESTART_ROWS such stamps
 STAMP_JUMP_NS = 30 * 10**9
 
 
@@ -28,15 +33,15 @@ class Health:
     def __init__(self) -> None:
         self.count = 0
         self.unusable = 0      # messages that could not be read
-        self.lost = 0          # by the middleware's sequence numbers
-        self.lost_before = 0   # of them before the leg
-        self.gaps = 0
+        self.lost = 0          # messages missing in the middleware's sequence numbers
+        self.lost_before = 0   # ``lost`` at the begin of the leg
+        self.gaps = 0          # steps of the stamps beyond the limit
         self.stampless = False    # no stamp in the last messages
         self.received_ns = 0
-        self.delay_s = 0.0     # arrival minus stamp of the newest row
-        self.fix_status: int | None = None
+        self.delay_s = 0.0     # send time minus stamp of the newest row
+        self.fix_status: int | None = None      # NavSatStatus of the newest fix
         self._last_sequence: int | None = None
-        self._interval_s = 0.0
+        self._interval_s = 0.0    # smoothed interval of the stamps
         self.reset_times()
 
     def reset_times(self) -> None:
@@ -45,7 +50,7 @@ class Health:
         self.jumped_back = False
         self._ahead: list[int] = []      # unconfirmed stamps far ahead
         self._behind = 0                 # stale rows at the end of the last block
-        # count and stamp after each block
+        # count of messages and newest stamp after each block
         self._block_ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
 
     def register_arrival(self, sequences: Sequence[int | None], now_ns: int) -> None:
@@ -59,12 +64,13 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def check_stamps(self, stamps: list[int], received_ns: Sequence[int] | Ints,
+    def check_stamps(self, stamps: list[int], sent_ns: Sequence[int] | Ints,
                      max_gap_s: float | None = None) -> list[bool]:
         """
-        Process the stamps of some rows, ns; a gap is a step beyond the limit (or 5 intervals).
+        Process the stamps and send times of some rows, ns.
 
-        Returns a mask of rows with a plausible stamp: not zero, not far ahead or behind.
+        max_gap_s : longer steps are gaps; None: steps above 5 intervals. Returns a mask of rows
+        with a plausible stamp: not zero, not far ahead or behind.
         """
         self.count += len(stamps)
         self.stampless = bool(stamps) and max(stamps) <= 0
@@ -73,7 +79,7 @@ class Health:
         if rows:
             newest = self.newest_ns
             self._update_times([stamps[row] for row in rows], max_gap_s)
-            self.delay_s = (int(received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
+            self.delay_s = (int(sent_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
             for row in rows:
                 newest = max(newest, stamps[row])
                 plausible[row] = stamps[row] >= newest - TIME_RESTART_NS
@@ -110,19 +116,20 @@ class Health:
 
     def _newest_after(self, stamps_with_last: list[int], steps: list[int]) -> int:
         """Return the newest stamp after a block, and note whether time has restarted."""
-        # one or two stale stamps are a driver error, more a restart of time; if a block ends with
-        # few of them, or has one row only, the next block decides
+        # one or two stamps far behind are a driver error, more are a restart of time; if a block
+        # ends with few of them, or has one row only, the next block decides
         stale_before, self._behind = self._behind, 0
         if not steps or min(steps) >= -TIME_RESTART_NS:
             return stamps_with_last[-1]
         step_row = steps.index(min(steps))
         after = max(stamps_with_last[step_row + 1:])
         has_restarted = after < stamps_with_last[step_row] - TIME_RESTART_NS
-        # back to the stamps before a wild one
-        after_wild = (steps[step_row - 1] > TIME_RESTART_NS
-                      and after >= stamps_with_last[step_row - 1] - TIME_RESTART_NS
-                      if step_row else not self.newest_ns)
-        if not has_restarted or after_wild:
+        # a stamp far ahead was a single error: the stamps after it continue those before it
+        continues_before = (
+            steps[step_row - 1] > TIME_RESTART_NS
+            and after >= stamps_with_last[step_row - 1] - TIME_RESTART_NS
+            if step_row else not self.newest_ns)
+        if not has_restarted or continues_before:
             return stamps_with_last[-1]
         rows = len(stamps_with_last) - 1 - step_row
         if rows < TIME_RESTART_ROWS if step_row else rows + stale_before < 2:

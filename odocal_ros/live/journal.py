@@ -4,7 +4,8 @@
 """
 The journal: each leg is written to disk as a bag while it is driven, to survive a crash.
 
-This module runs with the callbacks and only collects; ``JournalWriter`` has its own thread.
+This module runs in the thread of the callbacks: it collects messages and hands them about once a
+second to ``JournalWriter``, which packs and writes them in a thread of its own.
 """
 
 from datetime import datetime, UTC
@@ -38,25 +39,26 @@ HEAD = """\
 
 class Journal:
     """
-    Collects raw messages and marks, and hands them to the thread about once a second.
+    Collects raw messages, and the statuses that contain the marks of the legs.
 
-    ``topic`` is the resolved name of ``~/status``. A leg's journal has exactly the messages of the
+    status_topic : resolved name of ``~/status``. A leg's journal has exactly the messages of the
     recorder, so that its replay gives the same result.
     """
 
-    def __init__(self, node: Node, topic: str) -> None:
-        self._log, self._clock, self._topic = node.get_logger(), node.get_clock(), topic
-        self._node = node.get_fully_qualified_name()
+    def __init__(self, node: Node, status_topic: str) -> None:
+        self._log, self._clock = node.get_logger(), node.get_clock()
+        self._node, self._status_topic = node.get_fully_qualified_name(), status_topic
         self._writer = JournalWriter()
         self._batch: dict[str, Received] = {}
         self._marks: Received | None = None
-        self._due_ns = 0
-        self._limit, self._reach_ns = 0, 0
+        self._due_ns = 0                 # steady time of the next batch
+        self._limit = 0                  # bytes of all journals; 0: no journal is written
+        self._reach_ns = 0               # duration of the messages kept for later legs
         self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
         self._ended = False              # its samples are complete
-        self._last_event = ''
+        self._last_event = ''            # event of its last stored status
         self._dropped: set[int] = set()  # legs reported as dropped
-        self._reported = ''
+        self._reported = ''              # the logged trouble
 
     @property
     def trouble(self) -> str:
@@ -125,8 +127,8 @@ class Journal:
             journal_text(config, session.leg_id, session.start_ns, topics, self._node),
             config.journal.max_bytes))
 
-    def receive(self, session: Session, array: DiagnosticArray) -> None:
-        """Store a published status: it contains the marks of the leg."""
+    def store_status(self, session: Session, array: DiagnosticArray) -> None:
+        """Store a published status, by which a replay finds the marks of the leg."""
         leg_id, event = session.leg_id, session.event
         dropped = event in DROPPED_EVENTS and leg_id not in self._dropped
         if event in DROPPED_EVENTS:
@@ -134,7 +136,7 @@ class Journal:
         if leg_id != self._leg_id and not dropped:
             return
         marks = self._marks if leg_id == self._leg_id else None
-        marks = marks or Received(self._topic, STATUS_TYPE, DiagnosticArray)
+        marks = marks or Received(self._status_topic, STATUS_TYPE, DiagnosticArray)
         marks.raws.append(serialize_message(array))
         marks.sent_ns.append(self._clock.now().nanoseconds)
         if leg_id != self._leg_id:      # of a journal that is closed

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal of one leg, written by the journal's thread."""
+"""
+The journal of one leg: a bag that is written while the leg is driven, by the journal's thread.
+
+Old journals are deleted if all of them together would exceed the limit of the folder.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -25,6 +29,7 @@ HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 
 def journal_folders(root: Path) -> list[Path]:
+    """Return the folders of journals, the oldest first."""
     found = []
     with suppress(FileNotFoundError):
         for folder in root.iterdir():
@@ -40,13 +45,14 @@ def clear_empty(root: Path) -> None:
         with suppress(OSError):
             named = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
             old = named and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
-            # files that certainly contain no message
+            # these files never contain a message
             if old and all(path.name == JOURNAL or path.name.endswith(PART)
                            for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
 
 
 def folder_size(folder: Path) -> int:
+    """Return the bytes of the files in a folder, which another process may delete now."""
     total = 0
     with suppress(FileNotFoundError):
         for path in folder.iterdir():
@@ -118,7 +124,7 @@ class LegJournal:
         self._bag: SegmentedBag | None = None
         self._lock: TextIO | None = None
         self._others = 0              # bytes of the other journals
-        self._over = False            # given up, or finished
+        self._is_closed = False       # given up, or finished
         self.late: list[PackedChunk] = []  # marks that came after the end, not written yet
 
     @property
@@ -127,25 +133,25 @@ class LegJournal:
 
     def put(self, chunks: list[PackedChunk]) -> None:
         """Write chunks, after the waiting ones."""
-        if self._over:
+        if self._is_closed:
             return
         self._waiting += chunks
         if self._waiting:
             self._try(self._write)
-        if self.trouble and not self._over and sum(
+        if self.trouble and not self._is_closed and sum(
                 chunk.size for chunk in self._waiting) > WAITING_BYTES:
             self._give_up(f'{self.trouble}; no further attempt in this leg')
 
     def finish(self) -> None:
         """Join the files to one complete bag."""
-        if not self._over:
+        if not self._is_closed:
             self.put([])
             if self._bag is not None and not self._waiting:
                 self._try(self._finish)
             elif self._bag is not None and not self._bag.segments:     # nothing was written
                 shutil.rmtree(self._bag.folder, ignore_errors=True)
                 self._bag = None
-        self._over, self._waiting = True, []
+        self._is_closed, self._waiting = True, []
         if self._lock is not None:
             self._lock.close()
 
@@ -206,7 +212,7 @@ class LegJournal:
         self._bag.finish(room=self.plan.limit - taken - HEADS_BYTES)
 
     def _give_up(self, trouble: str) -> None:
-        self.trouble, self._over, self._waiting = trouble, True, []
+        self.trouble, self._is_closed, self._waiting = trouble, True, []
 
     def _try(self, act: Callable[[], object]) -> None:
         try:
@@ -216,5 +222,5 @@ class LegJournal:
             self.trouble = (f'{where}: {error.strerror or error}; free disk space or set '
                             'output.directory to a writable folder')
         else:
-            if not self._over:
+            if not self._is_closed:
                 self.trouble = ''

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal's thread: packs received messages, keeps the pre-roll, writes legs."""
+"""
+The thread of the journal: packs received messages into chunks of mcap, and writes legs.
+
+Packed chunks of the last seconds are kept as the pre-roll of the next leg.
+"""
 
 from collections import deque
 from collections.abc import Callable
@@ -27,8 +31,8 @@ class Received:
     msgtype: str
     kind: type                                          # the message class
     raws: list[bytes] = field(default_factory=list)
-    sent_ns: list[int] = field(default_factory=list)    # bag times: when they were sent
-    newest_ns: int = 0                                  # stamp of the last one
+    sent_ns: list[int] = field(default_factory=list)    # send times: bag times of the journal
+    newest_ns: int = 0                                  # stamp of the last message
 
 
 class PreRoll:
@@ -67,7 +71,7 @@ class JournalWriter:
     """
     The jobs of the journal's thread; other threads call only ``submit`` and ``close``.
 
-    Any thread may read ``trouble`` and ``folder``.
+    Any thread may read ``trouble`` (why writing fails) and ``folder`` of the newest leg.
     """
 
     def __init__(self) -> None:
@@ -77,8 +81,8 @@ class JournalWriter:
         self._counts: dict[str, int] = {}             # topic -> messages packed
         self._preroll = PreRoll()
         self._leg: LegJournal | None = None
-        self._listening = False                       # samples of that leg continue
-        self._closed: dict[int, LegJournal] = {}
+        self._is_recording = False                    # samples of that leg continue
+        self._closed: dict[int, LegJournal] = {}      # finished journals, by leg
         self._jobs: queue.SimpleQueue[tuple[Callable[..., None], Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_journal', daemon=True)
         self._thread.start()
@@ -118,24 +122,26 @@ class JournalWriter:
             chunk = self._packed(received)
             chunks.append(chunk)
             self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, reach_ns)
-        for leg in self._closed.values():     # so that dropped legs stay dropped
+        for leg in self._closed.values():     # a mark that drops a leg must reach its journal
             if leg.late:
                 leg.retry()
                 self.trouble = leg.trouble
         if self._leg is not None:
-            self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
+            self._leg.put(chunks * self._is_recording + ([self._packed(marks)] if marks else []))
 
     def restart(self) -> None:
+        """Discard the pre-roll, after a jump of time."""
         self._preroll.clear()
 
     def begin(self, plan: Plan) -> None:
         """Open the journal of a leg; its pre-roll is written with the first mark."""
         self.finish()
-        self._leg, self._listening = LegJournal(plan, self._channels, self._preroll.chunks()), True
+        self._leg = LegJournal(plan, self._channels, self._preroll.chunks())
+        self._is_recording = True
 
     def end(self) -> None:
         """Write only marks to the open leg from now on."""
-        self._listening = False
+        self._is_recording = False
 
     def add(self, leg_id: int, marks: Received) -> None:
         """Add a mark to the journal of a leg that is closed."""
@@ -154,6 +160,7 @@ class JournalWriter:
             self._leg = None
 
     def _packed(self, received: Received) -> PackedChunk:
+        """Return messages as a chunk of their channel, which is created with the first ones."""
         number = self._numbers.get(received.topic)
         if number is None:
             number = self._numbers[received.topic] = len(self._numbers) + 1

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Completion of a leg: close, compute, combine, answer, save."""
+"""
+A leg from its start mark to the answer: record, close, compute, combine with others, save.
+
+``operation.py`` adds automatic legs and the commands of the operator.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,7 +25,7 @@ from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
-from odocal_ros.live.process import SettledNode
+from odocal_ros.live.process import CheckedNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
@@ -35,12 +39,12 @@ LATE_TOPIC_S = 1.0   # judgement: longest wait for late topics at the stop mark
 
 class LegCompletion:
     """
-    Process a leg from mark to answer; the operator's commands are in ``Operation``.
+    Processes a leg. Nothing blocks: the worker computes, and ``tick`` handles its results.
 
-    Nothing blocks: the computations run in the worker thread; ``tick`` takes their results.
+    config : returns the configuration in force; a running leg keeps that of its start.
     """
 
-    def __init__(self, node: SettledNode, recording: Recording, publishing: Publishing,
+    def __init__(self, node: CheckedNode, recording: Recording, publishing: Publishing,
                  journal: Journal, config: Callable[[], Config]) -> None:
         self.session = Session()
         self.session.restored = restored_from(publishing.results())
@@ -54,11 +58,10 @@ class LegCompletion:
                                            node.context.ok)
         self._observability: Observability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
-        self._snapshot: LegRecorder | None = None  # of the open leg, kept for a retry
-        # of the open leg: its last running estimate
-        self._view_at_stop: SessionView | None = None
-        self._distance_m = 0.0                # of the leg last touched
-        self._silent = False                  # the IMU is silent in the leg
+        self._snapshot: LegRecorder | None = None  # samples of the stopped leg, kept for a retry
+        self._view_at_stop: SessionView | None = None     # of the stopped leg
+        self._distance_m = 0.0                # of the leg that changed last
+        self._imu_silent = False              # in the recorded leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
 
@@ -71,7 +74,7 @@ class LegCompletion:
         """Process finished jobs, new messages and timeouts."""
         self._worker.poll()
         self._filing.poll()
-        self.pump()
+        self.decode_new_messages()
         if self._recording.has_time_jumped:
             self._restart_after_jump()
         self._stop_when_too_long()
@@ -86,17 +89,20 @@ class LegCompletion:
 
     def _report_silence(self) -> None:
         """Publish the status immediately when the IMU falls silent or returns."""
-        before, self._silent = self._silent, self._recording.imu_silent_s() > SILENT_TIME
-        if self._silent is not before:
+        before, self._imu_silent = self._imu_silent, self._recording.imu_silent_s() > SILENT_TIME
+        if self._imu_silent is not before:
             self.show_status()
 
-    def pump(self) -> None:
+    def decode_new_messages(self) -> None:
+        """Decode; the distance is computed with the running estimate of the scale, or a result."""
         forecast = self._running_estimate.forecast
         estimate = forecast.estimates.get('scale_factor') if forecast else None
         scale = estimate.value if estimate else None
-        self._recording.pump(self._config(), scale or self._publishing.scale_factor())
+        self._recording.decode_new_messages(self._config(),
+                                            scale or self._publishing.scale_factor())
 
     def close(self) -> bool:
+        """Wait briefly for running jobs and files; return True if all are done."""
         self._running_estimate.end()
         grace_s = worker.FILES_GRACE_S if self._filing.is_busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
@@ -128,6 +134,7 @@ class LegCompletion:
         self._journal.restart()
 
     def view(self) -> SessionView:
+        """Return a snapshot of everything that status and answers state."""
         session, recording = self.session, self._recording
         inputs, progress = recording.inputs, recording.progress
         in_leg = session.state is State.RECORDING
@@ -150,21 +157,19 @@ class LegCompletion:
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg_text(),
+            stage=self._computing.stage, saved=self._filing.saved, lost=self._lost_leg_text(),
             save_trouble=self._filing.trouble, journal=self._journal.folder,
-            journal_trouble=self._journal.trouble, received=recording.received(),
-            local=recording.local, imu=not inputs.without_imu)
+            journal_trouble=self._journal.trouble, has_received=recording.has_received(),
+            is_local=recording.is_local, has_imu=not inputs.without_imu)
 
     def show_status(self) -> None:
         view = self.view()
         self._console.report(view, time.monotonic_ns())
-        self._journal.receive(self.session, self._publishing.show_status(view))
-
-    # the processing of a leg
+        self._journal.store_status(self.session, self._publishing.show_status(view))
 
     def _mark_ns(self) -> int:
         """Return the newest stamp of the IMU, or else of the odometer, on the sensors' clock."""
-        self.pump()
+        self.decode_new_messages()
         return self._recording.newest_ns
 
     def _stop_when_too_long(self) -> None:
@@ -177,13 +182,13 @@ class LegCompletion:
             self.end_leg_now()
 
     def _start_refusal(self) -> str:
-        """Return the explanation why no leg can start, empty if one can."""
+        """Return the reason why no leg can start, as text; empty if one can."""
         missing = self._recording.inputs.missing(self._config())
         clocks = self._recording.progress.clocks.differing(self._config())
         return '; '.join(missing) or (clock_difference_text(clocks) if clocks else '')
 
     def _begin_leg(self, mark_ns: int, is_automatic: bool = False) -> str:
-        """Open a leg at a mark and return the text for log and answer."""
+        """Open a leg at a mark, a stamp in ns; return the text for log and answer."""
         session = self.session
         config = self._config()
         session.start(mark_ns, settings_with_marks(config) if config.reference.points else config,
@@ -234,6 +239,7 @@ class LegCompletion:
             self._handle_leg_result)
 
     def _fail(self, trouble: str) -> None:
+        """Report that the computation of a leg, or the publication of its result, failed."""
         if self.session.state is State.COMPUTING:      # else the result is available
             self.session.fail(trouble)
         self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
@@ -251,7 +257,7 @@ class LegCompletion:
             self._computing.answer(False, text)
             return
         self.session.finish(done.results, done.calibration)
-        self.session.set_carried(done.carried, done.folded)
+        self.session.set_carried(done.carried, done.released)
         success, text = self._publish_result(done.calibration, done.paths, done.results)
         if success and self._config().output.autosave:
             self._save(done.calibration)
@@ -276,6 +282,7 @@ class LegCompletion:
             f'{self._data_location(session.start_ns)}; call ~/start_leg for a new leg')
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
+        """Drop the open leg; text : answer for waiting callers.   lost : cause, if automatic."""
         self.session.cancel(lost)
         self._running_estimate.end()
         self._close_by_ns = self._snapshot = self._view_at_stop = None

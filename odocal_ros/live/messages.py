@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Message classes by name with their definitions, and messages that wait until they are taken.
+Message classes by name with their definitions, and queues of serialised messages.
 
-They stay serialised in the middleware's queue: waking the executor for every message is nine
-tenths of a node's CPU load at 1 kHz. The executor therefore skips the subscription, and ``take``
-reads the queue by ``take_message`` of rclpy's handle, as the executor itself does. This method
-is undocumented: if it is missing or behaves differently, the executor takes the messages from
-then on. Only the CPU load changes.
+Waking the executor for every message is nine tenths of a node's CPU load at 1 kHz. Messages
+therefore stay in the middleware's queue: the executor skips the subscription, and ``take`` reads
+the queue by ``take_message`` of rclpy's handle, as the executor itself does. This method is
+undocumented: if it is missing or behaves differently, the executor takes the messages from then
+on, at a higher CPU load.
 """
 
 import importlib
@@ -27,11 +27,13 @@ from rclpy.subscription import Subscription
 from odocal_ros.errors import BadConfig
 
 MESSAGE_TYPE = re.compile(r'(?P<package>[a-z][a-z0-9_]*)/msg/(?P<name>[A-Z][A-Za-z0-9]*)')
-NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
+# names of types in .msg, by that in the classes of rclpy
+MSG_NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
 # definition: of latched topics, publisher and subscriber
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-KIND = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
+# type of a field in the classes of rclpy: sequence<base<bound>, longest>, or base<bound>[count]
+FIELD_TYPE = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
 Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
 
 
@@ -75,15 +77,15 @@ def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
 
 
 def _in_msg(about: str) -> tuple[str, str]:
-    """Return the base type and the field's type in .msg syntax."""
-    match = KIND.fullmatch(about)
+    """Return base type and type of a field in .msg: 'double[9]' is float64 and float64[9]."""
+    match = FIELD_TYPE.fullmatch(about)
     if match is None:
         raise ValueError(f'a field of type {about}')
-    sequence, base, bound, most, _, array = match.groups()
-    base = NAMES.get(base, base)
+    sequence, base, bound, longest, _, array = match.groups()
+    base = MSG_NAMES.get(base, base)
     text = base + (f'<={bound[1:-1]}' if bound else '')
     if sequence:
-        return base, f'{text}[<={most}]' if most else f'{text}[]'
+        return base, f'{text}[<={longest}]' if longest else f'{text}[]'
     return base, text + (array or '')
 
 
@@ -101,29 +103,29 @@ class Gate(MutuallyExclusiveCallbackGroup):
 
 class WaitingMessages:
     """
-    The messages of one topic, in order of arrival.
+    The messages of one topic that were not taken yet, in order of arrival.
 
-    In simulated time a message is stamped with the node's clock on arrival, so the executor takes
-    it then, too.
+    In simulated time the send time of a message is that of the node's clock on its arrival, so the
+    executor must take it at once.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._subscription: Subscription | None = None
         self._pending: list[Message] = []
-        self._most = 0                # the depth of the queue
-        self._carried = False         # taken by the executor, without take_message
+        self._queue_depth = 0
+        self._uses_executor = False   # take_message of this rclpy is not usable
         self.gate = Gate()
         self.follow_clock()
 
     def follow_clock(self) -> None:
-        """Update whether the node uses simulated time."""
+        """Let the executor take the messages while the node uses simulated time."""
         clock = self._node.get_clock()
-        self._simulated: bool = clock.ros_time_is_active  # type: ignore[attr-defined]
-        self.gate.is_open = self._simulated or self._carried
+        self._is_simulated: bool = clock.ros_time_is_active  # type: ignore[attr-defined]
+        self.gate.is_open = self._is_simulated or self._uses_executor
 
     def subscribe(self, kind: type, topic: str, qos: QoSProfile) -> None:
-        self._most = qos.depth
+        self._queue_depth = qos.depth
         self._subscription = self._node.create_subscription(
             kind, topic, self._receive, qos,  # type: ignore[arg-type]
             raw=True, callback_group=self.gate,
@@ -133,11 +135,11 @@ class WaitingMessages:
 
     def take(self) -> tuple[list[bytes], list[int], list[int | None]]:
         """Return messages since the last call: serialised, send times (ns), sequence numbers."""
-        if self._subscription is not None and not self._carried:
+        if self._subscription is not None and not self._uses_executor:
             try:
                 self._fetch(self._subscription)
             except (AttributeError, TypeError, ValueError) as error:
-                self._carried = self.gate.is_open = True
+                self._uses_executor = self.gate.is_open = True
                 self._node.get_logger().warning(
                     f'this rclpy has no usable take_message ({error}): the executor takes the '
                     'messages, at several times the CPU load')
@@ -152,7 +154,7 @@ class WaitingMessages:
         # the IMU would lag most
         handle, kind = subscription.handle, subscription.msg_type
         with handle:
-            for _ in range(self._most):
+            for _ in range(self._queue_depth):
                 message = handle.take_message(kind, True)
                 if message is None:
                     return
@@ -160,6 +162,6 @@ class WaitingMessages:
                 self._receive(raw, info)
 
     def _receive(self, raw: bytes, info: dict[str, Any]) -> None:
-        if self._simulated:
+        if self._is_simulated:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))

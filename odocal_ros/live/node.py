@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The live node: declares settings, records, computes on a mark, publishes."""
+"""
+The calibration node: services, parameters and a timer around ``Operation``.
+
+Five times a second the timer decodes the received messages, handles finished computations and
+publishes the status. A leg is computed after ``~/stop_leg``.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +24,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
-from odocal_ros.live.process import print_error, run, SettledNode
+from odocal_ros.live.process import CheckedNode, print_error, run
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import SEARCH_PERIOD_S
@@ -28,7 +33,7 @@ from odocal_ros.pipeline.floor_marks import check_points
 
 # tuned by benchmarks/live_load.py: period of ``_tick``, s, and while a caller waits. 0.05 s at all
 # times would double the CPU load; a queue holds 25 periods of 0.2 s
-TURN_S, AWAITED_TURN_S = 0.2, 0.05
+TICK_S, AWAITED_TICK_S = 0.2, 0.05
 HELP = """\
 usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]
 
@@ -49,17 +54,16 @@ settings     parameters, all described in config/calibrator.yaml:
 SERVICES = ('start_leg', 'stop_leg', 'mark', 'cancel_leg', 'undo_leg', 'reset', 'save')
 
 
-class Calibrator(SettledNode):
+class Calibrator(CheckedNode):
     """
     Calibrates an odometer over legs that the operator marks by service.
 
-    Works in any executor; SingleThreadedExecutor is recommended. ``Session`` stores legs,
-    ``Recording`` samples; the node only connects them. ``at_work``: one of its threads still ran
-    when the node was destroyed; it ends with the process.
+    Works in any executor; SingleThreadedExecutor is recommended. ``has_running_thread``: when the
+    node was destroyed, one of its threads still ran; it ends with the process.
     """
 
     default_name = 'calibrator'
-    at_work = False
+    has_running_thread = False
 
     def _build(self) -> None:
         self.config = params.declare_settings(self)
@@ -79,20 +83,18 @@ class Calibrator(SettledNode):
         self.add_post_set_parameters_callback(self._take_parameters)
         group = ReentrantCallbackGroup()  # a delayed answer must not block callbacks
         for name in SERVICES:
-            act = getattr(self.operation, name)
-            self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
+            command = getattr(self.operation, name)
+            self.create_service(Trigger, f'~/{name}', partial(self._serve, command),
                                 callback_group=group)
-        self._timer = self.steady_timer(TURN_S, self._tick)
+        self._timer = self.steady_timer(TICK_S, self._tick)
 
     def destroy_node(self) -> None:
         for part in ('operation', 'journal', 'recording'):
             if hasattr(self, part) and getattr(self, part).close() is False:
-                self.at_work = True
-        if hasattr(self, 'operation') and (left := self.operation.unstopped_leg_text()):
-            print_error('calibrator', left)      # a context that is shut down cannot log
+                self.has_running_thread = True
+        if hasattr(self, 'operation') and (text := self.operation.unstopped_leg_text()):
+            print_error('calibrator', text)      # a context that is shut down cannot log
         super().destroy_node()  # type: ignore[no-untyped-call]
-
-    # parameters
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse parameters that cannot be set now; changes nothing."""
@@ -112,15 +114,13 @@ class Calibrator(SettledNode):
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.with_parameters(self.config, parameters)
 
-    # called five times a second
-
     def _tick(self) -> None:
         with self._lock:
             self.operation.tick()
             if self._due('search', SEARCH_PERIOD_S):
                 self.recording.inputs.update(self.config)
                 session = self.operation.session
-                self.recording.forget(self.config.leg.preroll,
+                self.recording.drop_old_samples(self.config.leg.preroll,
                                       session.start_ns if session.has_open_leg else 0)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
                 self.publishing.show_diagnostics(self.recording, self.config)
@@ -131,32 +131,33 @@ class Calibrator(SettledNode):
     def _pace(self) -> None:
         """Set the period of ``_tick``: shorter while a caller waits."""
         is_awaited = self.operation.is_awaited
-        period_s = AWAITED_TURN_S if is_awaited else min(TURN_S, 1 / self.config.publish.rate)
+        period_s = AWAITED_TICK_S if is_awaited else min(TICK_S, 1 / self.config.publish.rate)
         period_ns = round(period_s * 1e9)
         if period_ns != self._timer.timer_period_ns:
             self._timer.timer_period_ns = period_ns
             self._timer.reset()
 
     def _due(self, task: str, period_s: float) -> bool:
+        """Return True if a task is due, and set the time at which it is due next."""
         now_ns, period_ns = time.monotonic_ns(), round(period_s * 1e9)
         if now_ns < self._due_ns[task]:
             return False
-        # from the time it was due, so that the mean rate is right; but never make up for a pause
-        on_time = self._due_ns[task] + period_ns
-        self._due_ns[task] = on_time if on_time > now_ns else now_ns + period_ns
+        # a period after it was due, for the right mean rate; after a pause, a period from now
+        next_ns = self._due_ns[task] + period_ns
+        self._due_ns[task] = next_ns if next_ns > now_ns else now_ns + period_ns
         return True
 
-    async def _serve(self, act: Callable[[], tuple[bool, str] | Future], _request: Trigger.Request,
-                     response: Trigger.Response) -> Trigger.Response:
-        """Answer a Trigger with the result of ``act``, or of the future that it returns."""
+    async def _serve(self, command: Callable[[], tuple[bool, str] | Future],
+                     _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Answer a Trigger with the result of a command, or of the future that it returns."""
         try:
             with self._lock:
-                answer = act()
+                answer = command()
                 self._pace()
             response.success, response.message = (
                 await answer if isinstance(answer, Future) else answer)
         except OdocalError as refused:
-            self.get_logger().warning(f'~/{act.__name__} refused: {refused}')
+            self.get_logger().warning(f'~/{command.__name__} refused: {refused}')
             response.success, response.message = False, str(refused)
         return response
 

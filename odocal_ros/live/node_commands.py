@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Commands that start or watch a node; without ROS 2 they print what is missing."""
+"""Console scripts that start a node, and ``odocal watch``; both name a missing package."""
 
 from argparse import ArgumentParser, Namespace
 from functools import partial

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node that applies a calibration: counter and IMU in, odometry and twist out."""
+"""
+The node that applies a calibration: dead reckoning from odometer and IMU, published as odometry.
+
+``apply/odometry.py`` computes the poses. This module feeds it with messages, in the order that it
+needs, and publishes as soon as a pose can be computed.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,7 +31,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS, TopicReport
 from odocal_ros.live.messages import message_class
-from odocal_ros.live.process import run, SettledNode
+from odocal_ros.live.process import CheckedNode, run
 from odocal_ros.live.topic_input import Input, SEARCH_PERIOD_S
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.message_fields import types_of
@@ -50,12 +55,12 @@ publishes    odometry (nav_msgs/Odometry), odometry/twist
 settings     parameters, all described in config/odometry.yaml"""
 
 
-class NumbersPublisher:
+class TemplatePublisher:
     """
-    Publishes copies of one message with new stamps and numbers.
+    Publishes copies of a serialised message with another stamp and other numbers.
 
-    Setting the fields of a message object and serialising it takes many times as long.
-    ``message``: template with the frame; only 64-bit floats follow its last string.
+    Setting the fields of a message object and serialising it takes many times as long. message :
+    the template with its frames; only 64-bit floats follow its last string.
     """
 
     def __init__(self, node: Node, topic: str, message: Any) -> None:
@@ -69,12 +74,12 @@ class NumbersPublisher:
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
 
     def send(self, stamp_ns: int, values: bytes) -> None:
-        """Publish with a stamp, ns, and all its floats in order."""
+        """Publish with a stamp, ns, and ``values``: all floats in order, little endian."""
         stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
         self._publisher.publish(self._raw[:4] + stamp + self._raw[12:-len(values)] + values)
 
 
-class OdometryNode(SettledNode):
+class OdometryNode(CheckedNode):
     """Feeds the inputs of the calibrator to ``Odometry`` and publishes its poses on two topics."""
 
     default_name = 'odometry'
@@ -98,23 +103,24 @@ class OdometryNode(SettledNode):
         for source in self._inputs.values():
             source.check(self.config)
         frames = self.config.frames
-        self._pose = NumbersPublisher(self, 'odometry', OdometryMessage(
+        self._pose = TemplatePublisher(self, 'odometry', OdometryMessage(
             header=Header(frame_id=frames.odom), child_frame_id=frames.base))
-        self._twist = NumbersPublisher(self, 'odometry/twist', TwistWithCovarianceStamped(
+        self._twist = TemplatePublisher(self, 'odometry/twist', TwistWithCovarianceStamped(
             header=Header(frame_id=frames.base)))
-        self._searched_ns = self._silent_ns = 0
-        self._begun, self._pause_ns = False, SILENCE_FIRST_NS
-        self._logged_ns: dict[str, int] = {}      # last log by kind of text
+        # steady times, ns: last search for publishers, next log of missing inputs (0: none is due)
+        self._searched_ns = self._log_due_ns = 0
+        self._has_published, self._pause_ns = False, SILENCE_FIRST_NS
+        self._logged_ns: dict[str, int] = {}      # last log of each kind of text
         self._topics = TopicReport()
         self.add_on_set_parameters_callback(params.refuse_after_start(ApplyConfig))
-        self._tf = self._transforms() if self.config.publish_tf else None
-        self._due_ns = self._reckoned_ns = 0
+        self._send_transform = self._transform_sender() if self.config.publish_tf else None
+        self._due_ns = self._reckoned_ns = 0      # next possible pose, last computation
         self._timer = self.steady_timer(CHECK_PERIOD_S, self._run_cycle)
         self.get_logger().info(f'applies the {calibration.words("")}')
 
     def spin(self, executor: Executor) -> None:
         """Take messages when a pose may be due; the executor handles the rest at a low rate."""
-        self.destroy_timer(self._timer)      # only for other executors
+        self.destroy_timer(self._timer)      # it is only for nodes in other executors
         next_executor_s = 0.0
         while self.context.ok():
             next_check_s = time.monotonic() + CHECK_PERIOD_S
@@ -130,6 +136,7 @@ class OdometryNode(SettledNode):
             time.sleep(max(0.0, until - time.monotonic()))
 
     def _run_cycle(self) -> None:
+        """Publish the poses that are due."""
         now_ns = time.monotonic_ns()
         if now_ns - self._searched_ns > SEARCH_PERIOD_S * 1e9:
             self._searched_ns = now_ns
@@ -147,8 +154,8 @@ class OdometryNode(SettledNode):
         if poses:
             wait_s = min(self._odometry.wait_s(), 1 / self.config.publish.rate)
             self._due_ns = now_ns + round(wait_s * 1e9)
-            if not self._begun:
-                self._begun = True
+            if not self._has_published:
+                self._has_published = True
                 self.get_logger().info('odometry starts')
         for text in self._odometry.take_notes():
             self._log_text(text, now_ns)
@@ -157,22 +164,23 @@ class OdometryNode(SettledNode):
         """Return the poses that are due; IMU messages wait for those of the odometer."""
         for slot, source in self._inputs.items():
             if slot != 'imu':
-                self._pump(source)
+                self._feed(source)
         is_recent = now_ns - self._reckoned_ns < RECKONING_PERIOD_S * 1e9
         if self._odometry.missing_odometer_s() > 0 and is_recent:
             return []
         self._reckoned_ns = now_ns
-        self._pump(self._inputs['imu'])
+        self._feed(self._inputs['imu'])
         return self._odometry.poses()
 
     def _log_text(self, text: str, now_ns: int) -> None:
-        """Log the findings: every restart, other kinds of text at a limited rate."""
+        """Log a note of the dead reckoning: every restart, other kinds at a limited rate."""
         kind = re.sub(r'[-+.\de]*\d', '#', text)
         if text.startswith(RESTARTS) or now_ns - self._logged_ns.get(kind, 0) > LOG_INTERVAL_NS:
             self._logged_ns[kind] = now_ns
             self.get_logger().warning(text)
 
-    def _pump(self, source: Input) -> None:
+    def _feed(self, source: Input) -> None:
+        """Hand the new messages of an input to the dead reckoning."""
         raws, sent_ns = source.take()
         for slot, rows in source.readings(raws, sent_ns) if raws else ():
             if slot != 'imu_other':
@@ -195,21 +203,21 @@ class OdometryNode(SettledNode):
         if not missing and clock_difference_s:
             missing = [clock_difference_text(clock_difference_s)]
         if not missing:
-            self._silent_ns, self._pause_ns = 0, SILENCE_FIRST_NS
-        elif not self._silent_ns:
-            self._silent_ns = now_ns + self._pause_ns
-        elif now_ns > self._silent_ns:
+            self._log_due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
+        elif not self._log_due_ns:
+            self._log_due_ns = now_ns + self._pause_ns
+        elif now_ns > self._log_due_ns:
             self.get_logger().warning('nothing is published: ' + '; '.join(missing))
             self._pause_ns = SILENCE_SELDOM_NS
-            self._silent_ns = now_ns + self._pause_ns
+            self._log_due_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:
         self._twist.send(pose.stamp_ns, pose.raw[TWIST:])
         self._pose.send(pose.stamp_ns, pose.raw)
-        if self._tf is not None:
-            self._tf(transform_of(pose, self.config.frames))
+        if self._send_transform is not None:
+            self._send_transform(transform_of(pose, self.config.frames))
 
-    def _transforms(self) -> Callable[[TransformStamped], None]:
+    def _transform_sender(self) -> Callable[[TransformStamped], None]:
         try:
             kind = message_class('tf2_msgs/msg/TFMessage')
         except BadConfig:
@@ -220,6 +228,7 @@ class OdometryNode(SettledNode):
 
 
 def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
+    """Return a pose as the transform from the frame odom to the frame base."""
     out = TransformStamped(child_frame_id=frames.base, header=Header(frame_id=frames.odom))
     out.header.stamp.sec, out.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
     move, turn = out.transform.translation, out.transform.rotation

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The operator's commands, and automatic legs with leg.automatic."""
+"""The commands of the operator (services of the node), and automatic legs (leg.automatic)."""
 
 from functools import partial
 from typing import Any
@@ -22,14 +22,14 @@ from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITH
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# the positions of a mark extend WITHIN to both sides; 0.5 s more are for the odometer's delay.
-# Judgement
+# judgement: standstill before a mark, s. Its positions extend WITHIN s before and after it; 0.5 s
+# more are for the odometer's delay
 MARK_STILL_S = 2 * WITHIN + 0.5
 
 
 class AutomaticLegs(LegCompletion):
     """
-    Handle automatic legs: ``LegSearch`` finds them from the samples.
+    Starts and ends legs automatically, at the standstills that ``LegSearch`` finds.
 
     A leg of the operator takes precedence; the search continues after it.
     """
@@ -38,9 +38,9 @@ class AutomaticLegs(LegCompletion):
         super().__init__(*args)
         self._search: LegSearch | None = None
         self._search_settings: LegConfig | None = None      # the settings of the search
-        self._counted_ns = 0                  # start of the leg whose metres are counted
-        self._warned: set[str] = set()        # changes of the scale that were logged
-        self._recording.tap = self._receive
+        self._counted_ns = 0                  # start of the leg whose distance is counted
+        self._logged_changes: set[str] = set()      # changes of the scale that were logged
+        self._recording.block_listener = self._receive
 
     def tick(self) -> None:
         super().tick()
@@ -49,6 +49,7 @@ class AutomaticLegs(LegCompletion):
             self._control_automatic_leg(self._search)
 
     def _receive(self, slot: str, block: Samples) -> None:
+        """Hand a received block to the running estimate and to the search for legs."""
         self._running_estimate.feed(slot, block)
         if self._search is not None:
             self._search.feed(slot, block, self._recording.inputs.form)
@@ -65,7 +66,7 @@ class AutomaticLegs(LegCompletion):
             self._load_carried()
 
     def _load_carried(self) -> None:
-        """Continue with the carried result of earlier runs of the node."""
+        """Continue with the information that earlier runs of the node stored in ``latest``."""
         found = stored_in(output_root(self._config(), self._node_name) / LATEST)
         if not found or not found.carried:
             return
@@ -78,6 +79,7 @@ class AutomaticLegs(LegCompletion):
                            f'{iso(found.carried.last_ns)}')
 
     def _control_automatic_leg(self, search: LegSearch) -> None:
+        """Start or end a leg if the search has found its begin or its end."""
         session, span, newest = self.session, search.spans[0], search.spans[-1]
         if session.state is not State.RECORDING and newest.start_ns != self._counted_ns:
             self._counted_ns = newest.start_ns      # the leg before may still be computed
@@ -115,13 +117,13 @@ class AutomaticLegs(LegCompletion):
     def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
         super()._handle_leg_result(done)
         for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
-            if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
-                self._warned.add(reason.text)
+            if reason.code is Code.SCALE_CHANGED and reason.text not in self._logged_changes:
+                self._logged_changes.add(reason.text)
                 self._log.warning(f'{reason}. {reason.remedy}')
 
 
 def _foreign_result_reason(found: Stored, config: Config) -> str:
-    """Return the explanation why a result belongs to another vehicle or mounting, else empty."""
+    """Return the reason why a result is not of this vehicle and mounting, as text, or ''."""
     if found.vehicle != config.vehicle:
         return f'it belongs to vehicle {found.vehicle!r}'
     if list(found.config.get('imu.mounting_rpy', ())) != list(config.imu.mounting_rpy):
@@ -177,7 +179,7 @@ class Operation(AutomaticLegs):
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             return self._last_result()
-        return self._computing.create_future(worker.PATIENCE_S)
+        return self._computing.create_future(worker.STOP_ANSWER_S)
 
     def _last_result(self) -> tuple[bool, str]:
         session, view = self.session, self.view()
@@ -185,7 +187,7 @@ class Operation(AutomaticLegs):
             raise Refused(view.lost)
         good = quantities_text(answers.quantities_ok(view))
         if session.calibration is not None:
-            success, text = answers.result_answer(session.calibration, good=good,
+            success, text = answers.result_answer(session.calibration, within_limits=good,
                                                   advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
@@ -200,12 +202,12 @@ class Operation(AutomaticLegs):
         return True, text
 
     def undo_leg(self) -> tuple[bool, str] | Future:
-        left = [one for leg in self.session.begin_undo() for one in leg.results]
+        remaining = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
         self._filing.withdraw(self.session.start_ns)
         self.show_status()
-        if not left:
+        if not remaining:
             self._publishing.set_results(None)
             self._publishing.show_paths(worker.leg_paths(None, self._config()))
             self._computing.drop()      # an earlier undo may still be computed
@@ -213,12 +215,12 @@ class Operation(AutomaticLegs):
             self.show_status()
             return True, f'{text}; no leg is left'
 
-        def take(outcome: tuple[Calibration, worker.Paths]) -> None:
+        def handle(outcome: tuple[Calibration, worker.Paths]) -> None:
             self.session.settle(outcome[0])
             self._publish_result(*outcome)
 
         self._computing.submit(
-            partial(worker.recombine, left, self._config(), self.session.carried), take)
+            partial(worker.recombine, remaining, self._config(), self.session.carried), handle)
         return self._computing.create_future()
 
     def reset(self) -> tuple[bool, str]:
@@ -227,7 +229,7 @@ class Operation(AutomaticLegs):
         dropped = self.session.begin_reset()
         self._publishing.forget_restored()
         for leg in dropped:  # each is published as undone: a replay of the bag omits it too
-            self.session.note_undone(leg)
+            self.session.mark_undone(leg)
             self.show_status()
         self._publishing.set_results(None)
         self._publishing.show_paths(worker.leg_paths(None, self._config()))

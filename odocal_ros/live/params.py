@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings as ROS parameters, and the result as parameters that only the node may set."""
+"""
+Settings and results as ROS parameters.
+
+Settings are declared with range and description. The result is in the parameters ``result.*``,
+which only the node sets; given at the start (a calibration.yaml), they restore an earlier result.
+"""
 
 from collections.abc import Callable, Iterable
 import difflib
@@ -24,19 +29,21 @@ from odocal_ros.settings.config import Config, SETTINGS, settings_of, with_setti
 from odocal_ros.settings.setting import Setting
 
 SCALE = 'm/pulse, m/rad or 1'
+# estimates among the results of the calibrator, and their units
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
-# further values that dead reckoning uses
+# those that dead reckoning uses
 APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'
+# values that rclpy accepts for each policy in an override of QoS; none listed: a whole number
 QOS: dict[str, tuple[str, ...]] = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
     'history': ('keep_last', 'keep_all', 'system_default'), 'depth': ()}
-NO_STAMP = 'an unknown date'
-TAKE = 'use the file that ~/save wrote'
+UNKNOWN_DATE = 'an unknown date'
+FILE_REMEDY = 'use the file that ~/save wrote'
 
 
 def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
@@ -53,10 +60,10 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     """
     Return the descriptor of a setting.
 
-    rclpy refuses NaN in a declared range, checks no arrays and has no choices. Such limits are in
-    the constraints text only, and the on-set callback checks them. Lists that may be empty are
-    typed dynamically, since an empty list in YAML has no type. Settings fixed at start-up are not
-    declared read-only: the on-set callback refuses them with a remedy, rclpy without.
+    Limits that rclpy cannot check (NaN as default, arrays, choices) are text in the descriptor: the
+    on-set callback checks them. Lists that may be empty are typed dynamically, since an empty list
+    in YAML has no type. Settings fixed at start-up are not declared read-only: the on-set callback
+    refuses them with a remedy, rclpy without.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     about += ' Fixed at start-up.' if setting.ro else ''
@@ -104,14 +111,14 @@ def declare_settings(node: Node, kind: type = Config) -> Any:
 
 
 def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
-    """Warn of unknown overrides in our groups or with similar names, which ROS ignores."""
+    """Warn of overrides that ROS ignores: unknown ones in a group or with a similar name."""
     groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
         similar = difflib.get_close_matches(name, settings, 1, 0.8)
         if name not in settings and (similar or dot and group in groups):
-            mean = f': did you mean {similar[0]}?' if similar else ''
-            node.get_logger().warning(f'no parameter {name}{mean or "."} It is ignored.')
+            suggestion = f': did you mean {similar[0]}?' if similar else '.'
+            node.get_logger().warning(f'no parameter {name}{suggestion} It is ignored.')
 
 
 def check_qos(node: Node, topics: Iterable[str]) -> None:
@@ -154,7 +161,7 @@ def change_refusal(config: Config, results: dict[str, Any], parameters: list[Par
 
 
 def refuse_after_start(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
-    """Return the on-set callback of a node that reads settings of a kind only at start-up."""
+    """Return the on-set callback of a node that reads its settings, a ``kind``, at start-up."""
     def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
         own_parameters = [p.name for p in parameters
                           if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
@@ -174,7 +181,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
         kind = type(default)
         is_whole = kind is float and type(value) is int
         if type(value) is not kind and not is_whole:
-            raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {TAKE}')
+            raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {FILE_REMEDY}')
         if is_whole:
             node.set_parameters([Parameter(name, value=float(value))])
     kept = restored_from({name: node.get_parameter(name).value
@@ -188,6 +195,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
 
 
 def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
+    """Return the parameters ``result.*`` of a calibration; NaN for what it does not determine."""
     values = RESULTS | {
         PREFIX + 'legs': len(calibration.legs), PREFIX + 'stamp': stamp,
         PREFIX + 'valid': calibration.verdict is not Verdict.REJECTED, PREFIX + 'vehicle': vehicle}
@@ -207,9 +215,9 @@ def restored_from(results: dict[str, Any],
     """
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
-        raise BadConfig(f'result.legs: {legs} is not a number of legs; {TAKE}')
+        raise BadConfig(f'result.legs: {legs} is not a number of legs; {FILE_REMEDY}')
     if one_line(stamp) != stamp:
-        raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {TAKE}")
+        raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {FILE_REMEDY}")
     found = {}
     for name, unit in estimates.items():
         value, sigma = (None if math.isnan(x) else x for x in (
@@ -217,15 +225,16 @@ def restored_from(results: dict[str, Any],
         try:
             check_estimate(name, value, sigma)
         except ValueError as error:
-            raise BadConfig(f'{error}; {TAKE}') from None
+            raise BadConfig(f'{error}; {FILE_REMEDY}') from None
         found[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
     if all(e.value is None for e in found.values()):
         return None
-    return Restored(found, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
+    return Restored(found, legs, results[PREFIX + 'valid'], stamp or UNKNOWN_DATE,
                     results[PREFIX + 'vehicle'])
 
 
 def _python_value(value: Any) -> Any:
+    """Return a parameter's value, an array as a tuple."""
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value
     return tuple(value)

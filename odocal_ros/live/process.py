@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node as a process: start, end, and one line of error if it cannot start."""
+"""A node as a process: command line, start, end, and one line of error if it cannot start."""
 
 from collections.abc import Callable
 import os
@@ -29,8 +29,13 @@ from odocal_ros.safe_io.text_formats import brief_line, error_text
 NAMESAKE_PERIOD_S = 5.0      # judgement: s between searches for another node of the same name
 
 
-class SettledNode(Node):
-    """A node that raises BadConfig, as one line, if a parameter is wrong."""
+class CheckedNode(Node):
+    """
+    Base of the nodes: a wrong parameter raises BadConfig with a text of one line.
+
+    A subclass has the name ``default_name``, creates its parts in ``_build``, and may replace
+    ``spin``.
+    """
 
     default_name = ''
 
@@ -49,9 +54,9 @@ class SettledNode(Node):
     def _build(self) -> None:
         raise NotImplementedError
 
-    def steady_timer(self, period_s: float, turn: Callable[[], None]) -> Timer:
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Create a timer that also runs while /clock is paused or missing."""
-        return self.create_timer(period_s, turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return self.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def spin(self, executor: Executor) -> None:
         executor.spin()
@@ -69,7 +74,7 @@ class SettledNode(Node):
         return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
 
-def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> int:
+def run(kind: type[CheckedNode], about: str, args: list[str] | None = None) -> int:
     """
     Run a node until it must stop.
 
@@ -115,7 +120,7 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
         if node is not None:
             node.destroy_node()  # type: ignore[no-untyped-call]
         rclpy.try_shutdown()
-    if getattr(node, 'at_work', False):
+    if getattr(node, 'has_running_thread', False):
         # Python aborts if it ends while a thread runs C++ code; the files on disk are complete
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Status, diagnostics, paths and result parameters of the node: their content and publishers."""
+"""What the calibration node publishes: status, diagnostics, paths and result parameters."""
 
 from functools import partial
 import math
@@ -34,8 +34,9 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
 
-SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fault
-# judgement: significant decimals
+# causes for which an automatic leg is not used without a warning: short moves are not a fault
+SHORT_MOVE_CODES = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)
+# judgement: decimals of the values in the status; other values are published in full
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'distance_to_minimum_m', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
@@ -48,12 +49,16 @@ UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle
 VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
           for name, unit in UNITS.items() for end in ('', '_sigma')}
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
-PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
+# names of inputs in /diagnostics, if not those of the slots
+SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 
 def calibration_status(view: SessionView) -> DiagnosticStatus:
+    """Return the content of ``~/status``; docs/interface.md describes each key."""
     session, results = view.session, view.results
-    text, ok, found = answers.hint(view), answers.quantities_ok(view), view.observability
+    hint, ok, found = answers.hint(view), answers.quantities_ok(view), view.observability
+    reasons = view.faults if session.state is State.RECORDING else session.reasons
+    stage = view.stage if session.state is State.COMPUTING else Stage()
     keys = {
         'state': view.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
         'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
@@ -63,7 +68,7 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'odometer_rate_hz': view.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': view.rates_hz.get('fix', 0.0),
     } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(view) | {
-        'verdict': session.verdict(), 'hint': text,
+        'verdict': session.verdict(), 'hint': hint,
         'legs': results['result.legs'] if view.restored else len(session.legs),
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': view.restored, 'standstill_s': view.still_s, 'max_speed_mps': view.max_speed,
@@ -75,21 +80,22 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'observable': ', '.join(found.observable) if found else '',
         'not_observable': '; '.join(found.not_observable) if found else '',
         'messages_lost': sum(view.lost_messages.values()),
-        'missing': '; '.join(view.missing), 'reasons': _reason_codes(view), 'saved': view.saved,
-        'save_trouble': view.save_trouble, 'lost': view.lost,
+        'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
+        'saved': view.saved, 'save_trouble': view.save_trouble, 'lost': view.lost,
         'automatic': _automatic(view), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': view.journal, 'journal_trouble': view.journal_trouble,
-    } | _computing(view) | quantities.status_keys(ok) | status_keys(view.forecast,
-                                                                   view.forecast_age_s)
+        'computing_stage': stage.name, 'computing_passes': stage.passes,
+        'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done,
+    } | quantities.status_keys(ok) | status_keys(view.forecast, view.forecast_age_s)
     return DiagnosticStatus(
-        level=level(view), name=STATUS_NAME, message=sentence(view, text, ok),
+        level=level(view), name=STATUS_NAME, message=sentence(view, hint, ok),
         hardware_id='odocal',
         values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
 
 
 def _wheel_factors(view: SessionView) -> dict[str, object]:
-    """Return the keys of more than two wheels: factor and sigma of each by its name."""
+    """Return key -> factor or sigma of each wheel of a vehicle with more than two."""
     calibration = view.session.calibration
     estimates = calibration.estimates if calibration else {}
     return {f'{name}{end}': math.nan if value is None else value
@@ -113,19 +119,23 @@ def level(view: SessionView) -> Any:
     state = view.session.state
     if state in (State.FAILED, State.REJECTED) or view.is_rejected_so_far:
         return DiagnosticStatus.ERROR
-    if state is State.IDLE and not view.received:
+    if state is State.IDLE and not view.has_received:
         return DiagnosticStatus.STALE
     unused = view.session.unused
     has_warning = (
         state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
         or view.missing or view.clocks or view.journal_trouble or view.save_trouble or view.lost
         or view.faults or view.duplicate_publishers or _changes(view.session)
-        or unused and unused.code not in SHORT)
+        or unused and unused.code not in SHORT_MOVE_CODES)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
-def sentence(view: SessionView, text: str, ok: dict[str, str]) -> str:
-    """Return one sentence: the state, the accuracy, and the next action."""
+def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
+    """
+    Return the message of the status as one line: state, accuracy, next action, problems.
+
+    hint : the next action.   ok : whether each quantity meets its limit.
+    """
     session = view.session
     legs = counted(len(session.legs), 'leg')
     if session.carried:
@@ -146,25 +156,18 @@ def sentence(view: SessionView, text: str, ok: dict[str, str]) -> str:
     troubles = [f'{statement}: {trouble}' for statement, trouble in (
         ('the result is not saved', view.save_trouble),
         ('the journal cannot be written', view.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (state_text, *_changes(session), good, view.lost, text,
+    return '; '.join(filter(None, (state_text, *_changes(session), good, view.lost, hint,
                                    _unused(session), *view.duplicate_publishers,
                                    losses_text(view.lost_messages), *troubles)))
 
 
-def _computing(view: SessionView) -> dict[str, object]:
-    stage = view.computed if view.session.state is State.COMPUTING else Stage()
-    return {'computing_stage': stage.name, 'computing_passes': stage.passes,
-            'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}
-
-
 def _changes(session: Session) -> list[str]:
-    reasons = session.calibration.reasons if session.calibration else ()
-    return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
+    """Return the texts on changes of the scale between the legs."""
+    return [r.text for r in session.reasons if r.code is Code.SCALE_CHANGED]
 
 
 def _unused(session: Session) -> str:
-    reason = session.unused
-    return f'a leg was not used: {reason}' if reason else ''
+    return f'a leg was not used: {session.unused}' if session.unused else ''
 
 
 def _automatic(view: SessionView) -> str:
@@ -173,13 +176,6 @@ def _automatic(view: SessionView) -> str:
     if view.session.state is not State.RECORDING:
         return 'waiting'
     return 'leg' if view.session.is_automatic else 'started by the operator'
-
-
-def _reason_codes(view: SessionView) -> str:
-    if view.session.state is State.RECORDING:
-        return ','.join(r.code.name for r in view.faults)
-    calibration = view.session.calibration
-    return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
 
 def _value_text(value: object, places: int | None = None) -> str:
@@ -289,7 +285,7 @@ class Publishing:
             node = node.lstrip('/')      # with its namespace, to separate vehicles
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
-            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.missing_reason(),
+            input_status(f'{node}: {SLOT_NAMES.get(slot, slot)}', one.health, one.missing_reason(),
                          one in needed, time.monotonic_ns())
             for slot, one in recording.inputs.by_slot.items()
             if one in needed or slot in recording.inputs.topics]))

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The receiving side of the node: inputs, recorder, and progress of the drive."""
+"""
+Reception of the calibration node: from subscribed topics to samples of a leg.
+
+``Inputs`` are the topics that the settings use; ``Recording`` decodes their messages in blocks and
+hands each block to the recorder of legs, to the progress of the drive and to the journal.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +27,7 @@ from odocal_ros.messages.message_fields import types_of
 from odocal_ros.settings.config import Config
 
 CLOCK_BACK_S = 0.1         # judgement: a clock that steps back by more has jumped
-PREROLL_MARGIN_S = 1.0     # judgement: kept beyond the pre-roll; whole blocks are dropped
+PREROLL_MARGIN_S = 1.0     # judgement: kept before the pre-roll, since whole blocks are dropped
 
 
 class Inputs:
@@ -59,10 +64,10 @@ class Inputs:
 
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""
-        surveyed = config.reference.start and config.reference.end
+        has_surveyed_ends = config.reference.start and config.reference.end
         slots = ['imu'] * (not self.without_imu) + ['odometer']
         slots += ['odometer_right'] * config.odometer.own_topics
-        slots += [] if surveyed else ['fix']
+        slots += [] if has_surveyed_ends else ['fix']
         slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
         return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
 
@@ -126,10 +131,11 @@ def _used_inputs(config: Config) -> dict[str, tuple[str, ...]]:
 
 class Recording:
     """
-    Samples so far, in order of arrival.
+    The samples so far, in order of arrival.
 
     ``store_messages(input, raws, sent_ns)`` is called with every decoded batch of raw messages, in
-    order of arrival, for the journal.
+    order of arrival, for the journal. ``block_listener(slot, block)``, if set, is called with each
+    block of samples whose stamps are plausible.
     """
 
     def __init__(self, node: Node, config: Config,
@@ -138,7 +144,7 @@ class Recording:
         self.inputs = Inputs(node, config)
         self.recorder = LegRecorder()
         self._store_messages = store_messages
-        self.tap: Callable[[str, Samples], None] | None = None  # also receives every block
+        self.block_listener: Callable[[str, Samples], None] | None = None
         self._clock = node.get_clock()
         self.progress = self._no_progress()
         self._clock_jumped = False
@@ -149,8 +155,12 @@ class Recording:
     def _no_progress(self) -> Progress:
         return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
-    def pump(self, config: Config, found_scale: float) -> None:
-        """Decode the messages since the last call, in blocks."""
+    def decode_new_messages(self, config: Config, found_scale: float) -> None:
+        """
+        Decode the messages since the last call, in blocks.
+
+        found_scale : scale factor of an earlier result or estimate, for the distance; NaN without.
+        """
         fix = self.inputs.by_slot.get('fix')
         static = fix.static if fix else None     # a TF reference has two topics
         if static is not None:
@@ -168,7 +178,7 @@ class Recording:
                 self.recorder.feed(slot, block)
                 if slot == 'imu_other':
                     continue
-                if not source.plausible.all():     # the recorder has all: the pipeline screens
+                if not source.plausible.all():     # the recorder keeps all: the pipeline screens
                     block = take(block, source.plausible)
                 self._distribute(slot, block, config, found_scale)
             if not self.has_time_jumped:     # after a jump: no sample of an earlier leg
@@ -181,16 +191,17 @@ class Recording:
 
     def _distribute(self, slot: str, block: Samples, config: Config, found_scale: float) -> None:
         self.progress.feed(slot, block, config, self.inputs.form, found_scale)
-        if self.tap is not None:
-            self.tap(slot, block)
+        if self.block_listener is not None:
+            self.block_listener(slot, block)
 
     @property
-    def local(self) -> bool:
+    def is_local(self) -> bool:
+        """Return True if positions are in a local frame, or from marks only."""
         fix = self.inputs.by_slot.get('fix')
         return fix is None or fix.health.fix_status == LOCAL
 
-    def forget(self, preroll_s: float, start_ns: int) -> None:
-        """Drop samples older than the pre-roll of a leg from ``start_ns``, 0: from now."""
+    def drop_old_samples(self, preroll_s: float, start_ns: int) -> None:
+        """Drop samples before the pre-roll of a leg that starts at ``start_ns``; 0: now."""
         # by the topic's own stamps: a topic on another clock must not grow without limit
         for source in self.inputs.by_slot.values():
             slots = (source.slot, *self._additional_slots(source))
@@ -253,7 +264,7 @@ class Recording:
         return {slot: source.health.rate_hz(now_ns)
                 for slot, source in self.inputs.by_slot.items()}
 
-    def received(self) -> bool:
+    def has_received(self) -> bool:
         return any(source.health.received_ns for source in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The running estimate: updated in the worker every few seconds while a leg is recorded."""
+"""
+The running estimate: values and problems of the leg that is being recorded, every few seconds.
+
+Samples are thinned, and an update estimates with them in the worker's thread what the result of
+the leg would be: values, predicted sigmas, and reasons for a rejection.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -46,11 +51,11 @@ class RunningEstimate:
     """
     Keeps the newest forecast of the recorded leg, None without one.
 
-    If a gap cuts the leg, each quantity is from the section that is better for it.
+    If a gap of the IMU cuts the leg, each quantity is from the section that is better for it.
 
-    The callback thread only collects blocks; cells and forecast are computed in the worker, one
-    update at a time. ``end`` stops a running update at its next step, so that the result of the
-    leg does not wait for it. Errors of an update are only logged.
+    The callback thread only collects blocks; the worker computes, one update at a time. ``end``
+    stops a running update at its next step, so that the result of the leg does not wait for it.
+    Errors of an update are only logged.
     """
 
     def __init__(self, worker: Worker, log: PlainLog) -> None:
@@ -65,7 +70,7 @@ class RunningEstimate:
         self._forget()
         self._thinned: ThinnedLeg | None = None
         self._gaps: leg_so_far.ImuGaps | None = None
-        self._earlier: Forecast | None = None    # of earlier sections
+        self._earlier: Forecast | None = None    # best of the earlier sections
 
     def _forget(self) -> None:
         """Stop a running update, and discard its data."""
@@ -78,7 +83,7 @@ class RunningEstimate:
         self._pause_until = 0.0
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
-        """Watch a leg that starts at a mark; ``recorder`` has the samples so far."""
+        """Start with a leg from a mark, ns; ``recorder`` has the samples so far."""
         self.end()
         self._config, self._pre_roll = config, recorder
         self._start_section(start_ns, recorder.form)
@@ -175,6 +180,7 @@ def _compute_update(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_block
 
 def _add_rows(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_blocks: list[Block],
               stop_event: threading.Event) -> None:
+    """Add the pre-roll, if any, and the new blocks to the thinned leg."""
     for slot in (slot for slot in SLOTS if slot != 'imu_other'):
         if stop_event.is_set():
             raise Abandoned

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The session of legs, and its snapshot, from which status, hint and answers are made."""
+"""
+State of the calibration node: the open leg, the kept legs and their combined result.
+
+``Session`` changes with the services and refuses those that do not fit its state. ``SessionView``
+is a snapshot of session, inputs and files: status, hint and answers are texts made from it.
+"""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -21,8 +26,9 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: newest legs kept with their tracks, for plots, or at all with leg.automatic; legs of
-# the operator kept. A day of legs must not fill the memory
+# judgement: newest legs that keep their tracks, for plots; with leg.automatic, older legs are
+# released. Legs of the operator are released beyond the second number: a day of legs must not
+# fill the memory
 LEGS_HELD, MARKED_LEGS_HELD = 20, 50
 
 
@@ -43,20 +49,20 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeptLeg:
-    """A leg of the result; it has several parts if the IMU had a gap."""
+    """A leg that the combined result contains; times on the sensors' clock."""
 
     leg_id: int
     start_ns: int
     stop_ns: int
-    results: tuple[LegResult, ...]
+    results: tuple[LegResult, ...]      # one, or one per part if gaps of the IMU cut the leg
 
 
 @dataclass(frozen=True, eq=False)
 class Restored:
-    """The result of the parameters ``result.*`` at the start, without the unit of the scale."""
+    """Result of an earlier run, from the parameters ``result.*``; they lack the scale's unit."""
 
     estimates: dict[str, Estimate]
-    legs: int
+    legs: int       # number of legs of the result
     valid: bool
     stamp: str
     vehicle: str = ''
@@ -73,10 +79,11 @@ class Restored:
 
 class Session:
     """
-    Legs and their results.
+    The legs since the start or the last reset, and their combined result ``calibration``.
 
     ``leg_id``, ``start_ns``, ``stop_ns`` (0: open) and ``event`` belong to the leg that changed
-    last. Every status contains them, and replay finds the marks there.
+    last. Every status contains them, and replay finds the marks there. Times are stamps on the
+    sensors' clock, ns.
     """
 
     def __init__(self) -> None:
@@ -88,12 +95,13 @@ class Session:
         self.legs: list[KeptLeg] = []
         self.calibration: Calibration | None = None
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
-        self.trouble = ''
+        self.trouble = ''   # why the computation of the open leg failed
         self.lost = ''      # why the last leg was dropped automatically
         self.is_automatic = False      # leg.automatic started the last leg
         self.unused: Reason | None = None      # why the last automatic leg is not used
-        self.carried: CarriedInformation | None = None    # of released and earlier legs
-        self.marks: list[FloorMark] = []       # since the pre-roll of the last leg
+        # information of released legs, and of those of earlier runs of the node
+        self.carried: CarriedInformation | None = None
+        self.marks: list[FloorMark] = []       # on reference.points, since the last leg's pre-roll
         self._last_id = 0
 
     @property
@@ -127,7 +135,7 @@ class Session:
         return [mark for mark in self.marks if mark.stamp_ns >= self.start_ns]
 
     def mark(self, stamp_ns: int, received_ns: int) -> FloorMark:
-        """Record that the robot is on the next point of the running leg."""
+        """Record that the robot stands on the next of ``reference.points``."""
         if self.state is not State.RECORDING:
             raise Refused('no leg is running: call ~/start_leg first, then ~/mark on each point')
         point = next_point(self.config, len(self.marks_of_leg()))
@@ -148,11 +156,12 @@ class Session:
         self.state, self.trouble = State.COMPUTING, ''
 
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
+        """Keep the computed leg; ``calibration`` combines all kept legs."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
         if len(self.legs) > LEGS_HELD:
             old = self.legs[-LEGS_HELD - 1]
             self.legs[-LEGS_HELD - 1] = replace(
-                old, results=tuple(one.numbers() for one in old.results))
+                old, results=tuple(one.numbers() for one in old.results))     # no track
         self.unused = None
         self.settle(calibration)
 
@@ -161,12 +170,12 @@ class Session:
         self.event, self.unused = 'cancelled', reason
         self.settle(self.calibration)
 
-    def set_carried(self, carried: CarriedInformation | None, legs: int) -> None:
-        """Release the first kept legs: their information is carried over."""
-        self.carried, self.legs = carried, self.legs[legs:]
+    def set_carried(self, carried: CarriedInformation | None, released: int) -> None:
+        """Release this number of the oldest kept legs; ``carried`` has their information."""
+        self.carried, self.legs = carried, self.legs[released:]
 
     def fail(self, trouble: str) -> None:
-        """Note that the computation failed; the leg stays open."""
+        """Record that the computation failed; the leg stays open."""
         self.state, self.trouble = State.FAILED, trouble
 
     def cancel(self, lost: str = '') -> None:
@@ -184,7 +193,7 @@ class Session:
                           'before ~/undo_leg')
         if not self.legs:
             raise Refused('no leg to undo')
-        self.note_undone(self.legs.pop())
+        self.mark_undone(self.legs.pop())
         self.lost = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None
@@ -201,7 +210,8 @@ class Session:
         self.carried = self.unused = None
         return dropped
 
-    def note_undone(self, leg: KeptLeg) -> None:
+    def mark_undone(self, leg: KeptLeg) -> None:
+        """Make a dropped leg the last one that changed, so that the next status contains it."""
         self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
         self.event = 'undone'
 
@@ -210,6 +220,11 @@ class Session:
         if self.restored is None or self.calibration is not None or self.legs:
             return ''
         return self.restored.stamp
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Return the reasons of the combined result."""
+        return self.calibration.reasons if self.calibration else ()
 
     def verdict(self) -> str:
         """Return the verdict in force, empty before the first."""
@@ -232,31 +247,31 @@ class SessionView:
 
     session: Session
     config: Config
-    missing: list[str] = field(default_factory=list)
-    duplicate_publishers: list[str] = field(default_factory=list)     # texts, one per topic
-    lost_messages: dict[str, int] = field(default_factory=dict)      # topic -> since the leg began
-    clocks: list[tuple[str, float]] = field(default_factory=list)
-    rates_hz: dict[str, float] = field(default_factory=dict)
-    results: dict[str, Any] = field(default_factory=dict)  # result.* parameters
-    restored: str = ''                           # date of the restored result
-    distance_m: float = 0.0
-    duration_s: float = 0.0
-    max_speed: float = 0.0
-    still_s: float = 0.0
-    two_wheels: bool = False                     # left and right wheel are known
-    observability: Observability | None = None   # of the recorded leg
-    forecast: Forecast | None = None               # of the recorded or computed leg
-    faults: tuple[Reason, ...] = ()              # of the recorded leg, most severe first
-    forecast_age_s: float = nan                   # since its newest sample
-    computed: Stage = Stage()                    # progress of the computation
-    saved: str = ''
-    lost: str = ''                               # why a leg was dropped automatically
-    save_trouble: str = ''                       # why the newest result is not saved
-    journal: str = ''                            # folder of the newest leg's journal
-    journal_trouble: str = ''                    # why it cannot be written
-    received: bool = True                           # any message on any topic so far
-    local: bool = False                          # positions are in a local frame
-    imu: bool = True                             # it is needed or published
+    missing: list[str] = field(default_factory=list)                # texts, one per missing input
+    duplicate_publishers: list[str] = field(default_factory=list)   # texts, one per topic
+    lost_messages: dict[str, int] = field(default_factory=dict)     # by topic, since the leg began
+    clocks: list[tuple[str, float]] = field(default_factory=list)   # (slot, s ahead of the IMU)
+    rates_hz: dict[str, float] = field(default_factory=dict)        # by slot of the input
+    results: dict[str, Any] = field(default_factory=dict)           # result.* parameters
+    restored: str = ''                          # date of the restored result
+    distance_m: float = 0.0                     # path length of the leg so far
+    duration_s: float = 0.0                     # of the leg
+    max_speed: float = 0.0                      # m/s, in the leg
+    still_s: float = 0.0                        # duration of the present standstill
+    two_wheels: bool = False                    # left and right wheel are known
+    observability: Observability | None = None  # of the recorded leg
+    forecast: Forecast | None = None            # of the recorded or computed leg
+    faults: tuple[Reason, ...] = ()             # of the recorded leg, most severe first
+    forecast_age_s: float = nan                 # since its newest sample
+    stage: Stage = Stage()                      # progress of the computation
+    saved: str = ''                             # folder of the newest saved result
+    lost: str = ''                              # why a leg was dropped automatically
+    save_trouble: str = ''                      # why the newest result is not saved
+    journal: str = ''                           # folder of the newest leg's journal
+    journal_trouble: str = ''                   # why it cannot be written
+    has_received: bool = True                   # any message on any topic so far
+    is_local: bool = False                      # positions are in a local frame
+    has_imu: bool = True                        # it is needed or published
 
     @property
     def state(self) -> str:
@@ -267,8 +282,9 @@ class SessionView:
 
     @property
     def leg(self) -> LegConfig:
+        """Return the settings of the leg; its defaults are smaller in a local frame."""
         config = self.session.config
-        return (config.in_local_frame() if self.local else config).leg
+        return (config.in_local_frame() if self.is_local else config).leg
 
     @property
     def is_rejected_so_far(self) -> bool:

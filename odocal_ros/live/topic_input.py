@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One topic of the node: waiting raw messages, decoded in blocks by the readers of bags."""
+"""
+One input topic of a node: search for its publishers, subscription, decoding, and its health.
+
+Messages wait serialised in a queue, and are decoded in blocks by the same readers as bags.
+"""
 
 from collections.abc import Callable, Sequence
 import difflib
@@ -36,6 +40,7 @@ MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4
 SEARCH_PERIOD_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: queue, one message per publisher of static transforms
+# method of a reader: serialised messages, send times, deserialiser -> (slot, rows) pairs
 Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
@@ -72,7 +77,8 @@ class Input:
     """
     One topic, from raw messages to blocks of samples.
 
-    ``allowed`` are the accepted message types; empty: all that ``make_reader`` can read.
+    slot : name of the input, such as imu or fix.   allowed : accepted message types; empty: all
+    that ``make_reader`` can read. The reader and the subscription exist once the type is known.
     """
 
     def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
@@ -82,14 +88,14 @@ class Input:
         self.msgtype = ''
         self.reader: Reader | None = None
         self.health = Health()
-        self.trouble = ''
+        self.trouble = ''      # why the topic or its last messages cannot be used
         self.plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
-        self.frame = ''        # of the IMU's header, once a message has come
+        self.frame = ''        # frame_id of the IMU's messages, once one has come
         self.publishers: list[TopicEndpointInfo] = []
         self.suggestions: list[str] = []     # suggested topics if this one has no publisher
-        self._failed = 0
-        self._unreported: list[Reading] = []     # stamps and arrivals not yet in ``health``
-        self._frame_id = ''
+        self._failed = 0       # messages whose block raised an error
+        self._unreported: list[Reading] = []     # stamps and send times not yet in ``health``
+        self._configured_frame = ''     # imu.frame_id at the subscription
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
         self.waiting = WaitingMessages(node)
@@ -124,7 +130,7 @@ class Input:
     def duplicate_publishers(self) -> str:
         """Return a warning if the topic has several publishers or IMUs, else an empty text."""
         frames = self.reader.frames if self.reader is not None else None
-        if frames is not None and frames.other and not self._frame_id:
+        if frames is not None and frames.other and not self._configured_frame:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
                     f'{one_line(frames.other)!r}): set imu.frame_id to the one to use')
         same_type = [p for p in self.publishers if p.topic_type == self.msgtype]
@@ -152,13 +158,13 @@ class Input:
             self.trouble = trouble
 
     def subscribe(self, msgtype: str, config: Config) -> None:
-        """Create the reader and the subscription; an OdocalError is raised for a wrong type."""
+        """Create the reader and the subscription; raise OdocalError for a wrong type."""
         if self.allowed and msgtype not in self.allowed:
             raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
                           f'remap {self.name} to another topic')
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
-        self._frame_id = config.imu.frame_id
+        self._configured_frame = config.imu.frame_id
         # wait for a publisher: increments need its QoS, and an optional topic may never have one,
         # but its subscription would cost CPU time
         if not self.publishers and (self.slot in EXTERNAL_SLOTS
@@ -190,15 +196,15 @@ class Input:
             self.health.register_arrival(numbers, time.monotonic_ns())
         return raws, sent_ns
 
-    def decode(self, raws: list[bytes], received_ns: list[int],
+    def decode(self, raws: list[bytes], sent_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
         """
         Return (slot, block) pairs of messages; unreadable messages are counted.
 
-        received_ns : their send times, from ``take``.   max_gap_s : longer steps are counted as
-        gaps; None: steps above five intervals.
+        sent_ns : send times of the messages, from ``take``.   max_gap_s : longer steps between
+        stamps are counted as gaps; None: steps above five intervals.
         """
-        pairs = self._read(self.reader.rows if self.reader else None, raws, received_ns)
+        pairs = self._read(self.reader.rows if self.reader else None, raws, sent_ns)
         for slot, block in pairs:
             if slot == self.slot:
                 self.plausible = np.array(self.health.check_stamps(
@@ -208,9 +214,9 @@ class Input:
         return pairs
 
     def readings(self, raws: list[bytes],
-                 received_ns: list[int]) -> list[tuple[str, list[Reading]]]:
+                 sent_ns: list[int]) -> list[tuple[str, list[Reading]]]:
         """Return (slot, readings) pairs of a few messages: as ``decode``, but faster."""
-        pairs = self._read(self.reader.readings if self.reader else None, raws, received_ns)
+        pairs = self._read(self.reader.readings if self.reader else None, raws, sent_ns)
         for slot, rows in pairs:
             self._unreported += [row[:2] for row in rows] if slot == self.slot else []
         if len(self._unreported) > HEALTH_ROWS:
@@ -218,20 +224,20 @@ class Input:
         return pairs
 
     def _update_health(self) -> None:
-        """Update the health by the readings since the last time."""
+        """Add the readings since the last call to the health."""
         if self._unreported:
-            stamps, received = zip(*self._unreported, strict=True)
-            self.health.check_stamps(list(stamps), received)
+            stamps, sent_ns = zip(*self._unreported, strict=True)
+            self.health.check_stamps(list(stamps), sent_ns)
             self._unreported = []
 
     def _read(self, read: Read | None, raws: list[bytes],
-              received_ns: list[int]) -> list[tuple[str, Any]]:
+              sent_ns: list[int]) -> list[tuple[str, Any]]:
         """Return (slot, rows) pairs of messages by a function of the reader."""
         reader, deserialize = self.reader, self._deserialize
         if reader is None or deserialize is None or read is None:
             return []
         try:
-            pairs = list(read(raws, received_ns, deserialize))
+            pairs = list(read(raws, sent_ns, deserialize))
             if self.slot == 'imu':
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node
@@ -253,9 +259,9 @@ class Input:
 
     def missing_reason(self) -> str:
         """Return the reason why no usable message arrives, as text; empty if one does."""
-        silent = self.health.silent_s(time.monotonic_ns())
         if self.is_flowing():
             return ''
+        silent = self.health.silent_s(time.monotonic_ns())
         if self.trouble:
             return self.trouble
         if self.health.stampless:

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Listener to the status of a calibrator, and its terminal panel for ``odocal watch``.
+``odocal watch``: subscribes to the status of a calibration node, and shows it in the terminal.
 
-The panel shows state, next action and progress bars towards the limits. Statuses are untrusted.
+The panel shows state, next action and progress bars towards the limits. Text of a status is from
+the network: control characters are escaped, and its length is limited.
 """
 
 from collections.abc import Iterator
@@ -27,9 +28,10 @@ from odocal_ros.live.messages import LATCHED
 from odocal_ros.output.value_text import with_sigma
 from odocal_ros.safe_io.text_formats import brief_line
 
+# of each level of a DiagnosticStatus: OK, WARN, ERROR, STALE
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
 MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
-HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arrives
+HINT_S = 0.1      # judgement: s in which the hint that is sent with a status arrives
 
 
 def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:

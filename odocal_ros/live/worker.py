@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The computations, the thread that runs one at a time, and callers that wait for its result."""
+"""
+Computations of the calibration node, and the thread that runs them one at a time.
+
+``compute`` makes a leg's result from the recorded samples. ``Worker`` is the thread; ``Computing``
+also answers the services that wait for the result.
+"""
 
 from collections.abc import Callable
 import ctypes
@@ -37,16 +42,17 @@ Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, refere
 # signal after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
-Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
+# called with the result of a job and None, or with None and its error
+OnDone: TypeAlias = Callable[[Any, Exception | None], None]
 # By default glibc has an arena for every thread and, once one was freed, takes arrays of up to 32
 # MiB from it: a node kept 100 MiB unused after a leg of an hour at 1 kHz. judgement, of
 # mallopt(3): M_ARENA_MAX, number of arenas of all threads, and M_MMAP_THRESHOLD, bytes from which
 # a block is mapped separately
 MALLOC_OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
-# judgement: s that ~/stop_leg waits for the result. It must answer within 5 s, 1 s of it is for a
-# busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
-PATIENCE_S = 4.0
+# judgement: s after which ~/stop_leg answers without the result. Callers wait 5 s, of which 1 s is
+# for a busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
+STOP_ANSWER_S = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,16 +60,16 @@ class Computed:
     """
     Result of a leg.
 
-    results : one for each part; gaps of the IMU separate parts.
-    carried : information of the legs that are no longer kept.   folded : number of kept legs, the
-    oldest, that were added to it now.
+    results : one for each part; gaps of the IMU separate parts.   paths : of the longest part.
+    calibration : combination with all other legs.   carried : information of the legs that are no
+    longer kept.   released : number of kept legs, the oldest, that were added to it now.
     """
 
     results: tuple[LegResult, ...]
     paths: Paths
     calibration: Calibration
     carried: CarriedInformation | None
-    folded: int
+    released: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +84,27 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
             kept: list[tuple[LegResult, ...]], config: Config,
             carried: CarriedInformation | None = None, is_automatic: bool = False,
             progress: Callable[[Stage], None] | None = None) -> Computed | UnusedLeg:
-    """Return a leg's result, its combination with the kept legs, and the paths to publish."""
+    """
+    Return a leg's result, its combination with the kept legs, and the paths to publish.
+
+    start_ns, stop_ns : stamps of the marks.   kept : results of each kept leg.   carried :
+    information of earlier legs.   progress : called with each stage of the computation.
+    """
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
     if is_automatic and (reason := rejecting_reason(results[0])):
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
-    folded = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
-    carried_before, carried = carried, add_to_carried([result for leg in kept[:folded]
+    released = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
+    carried_before, carried = carried, add_to_carried([result for leg in kept[:released]
                                                        for result in leg],
                                                       config, carried)
     # results of the two-point method cannot be added to ``carried``: all legs are kept
     if carried is carried_before and not is_automatic:
-        folded = 0
-    current = [result for leg in kept[folded:] for result in leg]
+        released = 0
+    current = [result for leg in kept[released:] for result in leg]
     calibration = combine([*current, *results], config, carried, known_imu(config))
-    return Computed(results, paths, calibration, carried, folded)
+    return Computed(results, paths, calibration, carried, released)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,
@@ -132,8 +143,8 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._jobs: queue.Queue[tuple[Job, Then] | None] = queue.Queue()
-        self._done: queue.SimpleQueue[tuple[Then, Any, Exception | None]] = queue.SimpleQueue()
+        self._jobs: queue.Queue[tuple[Job, OnDone] | None] = queue.Queue()
+        self._done: queue.SimpleQueue[tuple[OnDone, Any, Exception | None]] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
@@ -141,15 +152,15 @@ class Worker:
     def is_busy(self) -> bool:
         return self._jobs.unfinished_tasks > 0
 
-    def submit(self, job: Job, then: Then) -> None:
-        """Run ``job()``; ``poll`` will call ``then(result, error)`` with one of them None."""
-        self._jobs.put((job, then))
+    def submit(self, job: Job, on_done: OnDone) -> None:
+        """Run ``job()``; ``poll`` will call ``on_done(result, error)`` with one of them None."""
+        self._jobs.put((job, on_done))
 
     def poll(self) -> None:
         """Deliver the results of finished jobs."""
         while not self._done.empty():
-            then, result, error = self._done.get()
-            then(result, error)
+            on_done, result, error = self._done.get()
+            on_done(result, error)
 
     def close(self, grace_s: float = JOB_GRACE_S) -> bool:
         """Let the thread end after its queue; return True if it ended within ``grace_s``."""
@@ -159,12 +170,12 @@ class Worker:
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
-            job, then = entry
+            job, on_done = entry
             try:
-                self._done.put((then, job(), None))
+                self._done.put((on_done, job(), None))
             except Exception as error:
-                self._done.put((then, None, error))
-            del entry, job, then      # release the job's leg now, not at the next job
+                self._done.put((on_done, None, error))
+            del entry, job, on_done      # release the job's leg now, not at the next job
             release_memory()
             self._jobs.task_done()
 
@@ -184,53 +195,54 @@ def release_memory() -> None:
 
 class Computing:
     """
-    At most one active job; the result of a dropped one is ignored.
+    At most one active job of the worker, and the callers that wait for its result.
 
-    ``failed(trouble)`` is called if a job, or ``take`` of its result, raises; ``done()`` after
-    each job that was not dropped. ``alive()`` is false during shutdown: an error of ``take`` is
-    then no failure.
+    on_failure : called with the cause if a job raises, or the handling of its result.   on_end :
+    called after each job that was not dropped.   is_alive : false during shutdown, when an error
+    of the handling is no failure. ``stage`` is the progress of the active job.
     """
 
-    def __init__(self, worker: Worker, failed: Callable[[str], None],
-                 done: Callable[[], None], alive: Callable[[], bool]) -> None:
-        self._worker, self._failed, self._done, self._alive = worker, failed, done, alive
-        self._job: object | None = None
+    def __init__(self, worker: Worker, on_failure: Callable[[str], None],
+                 on_end: Callable[[], None], is_alive: Callable[[], bool]) -> None:
+        self._worker, self._on_failure = worker, on_failure
+        self._on_end, self._is_alive = on_end, is_alive
+        self._active_job: object | None = None
         self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
-        self.at = Stage()
+        self.stage = Stage()
 
     def report(self, stage: Stage) -> None:
         """Store the progress of the job; called by the worker's thread."""
-        self.at = stage
+        self.stage = stage
         release_memory()      # memory of the pass before
 
-    def submit(self, job: Job, take: Callable[[Any], object]) -> None:
-        """Run a job in the worker and hand its result to ``take``."""
-        self._job = token = object()
-        self.at = Stage()
+    def submit(self, job: Job, handle: Callable[[Any], object]) -> None:
+        """Run a job in the worker and hand its result to ``handle``, unless it is dropped."""
+        self._active_job = token = object()
+        self.stage = Stage()
 
-        def then(result: Any, error: Exception | None) -> None:
-            if token is not self._job:
+        def on_done(result: Any, error: Exception | None) -> None:
+            if token is not self._active_job:
                 return
-            self._job = None
+            self._active_job = None
             try:
                 if error is None:
-                    take(result)
+                    handle(result)
             except Exception as failure:      # so that waiting callers are answered
-                if not self._alive():
+                if not self._is_alive():
                     raise
                 error = failure
             if error is not None:
-                self._failed(answers.error_line(error))
-            self._done()
+                self._on_failure(answers.error_line(error))
+            self._on_end()
 
-        self._worker.submit(job, then)
+        self._worker.submit(job, on_done)
 
     def drop(self) -> None:
         """Ignore the result of the active job."""
-        self._job = None
+        self._active_job = None
 
     def create_future(self, patience_s: float = math.inf) -> Future:
-        """Return a future that the next ``answer`` or ``answer_late`` completes."""
+        """Return a future of (success, text), which ``answer`` or ``answer_late`` completes."""
         future = Future()
         self._waiting.append((future, time.monotonic() + patience_s))
         return future

@@ -17,7 +17,7 @@ import pytest
 from std_msgs.msg import Bool
 
 from odocal_ros.live.drive_pattern import DrivePattern, FINAL_STOP_COMMANDS
-from odocal_ros.live.process import SettledNode
+from odocal_ros.live.process import CheckedNode
 
 BOX = (-1.0, -1.0, 2.0, 1.0)
 SETTINGS = {'speed': 1.0, 'rectangle': f'[{", ".join(map(str, BOX))}]', 'pattern': 'straight',
@@ -172,7 +172,7 @@ def test_a_node_that_ends_while_it_stops_repeats_zeros(monkeypatch, commands_lef
     node._context = SimpleNamespace(ok=lambda: True)
     node._route, node._stop_commands_left = (), commands_left
     node._send = lambda *command: sent.append(command)
-    monkeypatch.setattr(SettledNode, 'destroy_node', lambda self: None, raising=False)
+    monkeypatch.setattr(CheckedNode, 'destroy_node', lambda self: None, raising=False)
     node.destroy_node()
     assert sent == [(0.0, 0.0)] * zeros
 

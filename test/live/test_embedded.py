@@ -16,7 +16,7 @@ from std_msgs.msg import String
 
 from odocal_ros.live import answers, worker
 from odocal_ros.live.messages import WaitingMessages
-from odocal_ros.live.node import AWAITED_TURN_S, TURN_S
+from odocal_ros.live.node import AWAITED_TICK_S, TICK_S
 from odocal_ros.live.topic_input import Input
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -101,13 +101,13 @@ def test_without_take_message_the_executor_carries_all(embedded):
 
 def test_turns_are_long_unless_somebody_waits(embedded):
     node, client = embedded
-    wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns')
+    wait_for(lambda: node._timer.timer_period_ns == round(TICK_S * 1e9), 'long turns')
     gate = threading.Event()
     report_worker = node.operation._filing._report_worker
     report_worker.submit(gate.wait, lambda *_: None)      # a report to be drawn
-    wait_for(lambda: node._timer.timer_period_ns == round(AWAITED_TURN_S * 1e9), 'short turns')
+    wait_for(lambda: node._timer.timer_period_ns == round(AWAITED_TICK_S * 1e9), 'short turns')
     gate.set()
-    wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns again')
+    wait_for(lambda: node._timer.timer_period_ns == round(TICK_S * 1e9), 'long turns again')
 
 
 def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):

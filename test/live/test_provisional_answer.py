@@ -14,7 +14,7 @@ import pytest
 
 from odocal_ros.live import answers
 from odocal_ros.live.session import Session, SessionView
-from odocal_ros.live.worker import PATIENCE_S
+from odocal_ros.live.worker import STOP_ANSWER_S
 from odocal_ros.output.value_text import with_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -98,7 +98,7 @@ def _answered(leg, stop_s=0.0):
 
 def test_the_answer_does_not_wait_for_a_fit_that_takes_long(seen):
     for one in (seen.first, seen.again, seen.short):
-        assert PATIENCE_S <= one.seconds < MOST_S
+        assert STOP_ANSWER_S <= one.seconds < MOST_S
         assert one.answer.success
         assert one.answer.message.startswith('provisional: leg ')
 

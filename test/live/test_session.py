@@ -177,7 +177,7 @@ def test_legs_beyond_those_kept_stay_in_the_result(town, monkeypatch):
         return worker.compute(SimpleNamespace(close=lambda *_: None), 0, 1,
                               [(one,) for one in every[:-1]], config)
     done = computed()
-    assert done.folded == 1
+    assert done.released == 1
     assert done.carried.legs == 1
     assert done.calibration.legs == tuple(every[1:])
     for name, expected in combine(every, config).estimates.items():
@@ -188,5 +188,5 @@ def test_legs_beyond_those_kept_stay_in_the_result(town, monkeypatch):
     for one in every:      # two-point results have no information to carry over
         del one.methods['smoother']
     done = computed()
-    assert (done.folded, done.carried) == (0, None)
+    assert (done.released, done.carried) == (0, None)
     assert done.calibration.legs == tuple(every)
