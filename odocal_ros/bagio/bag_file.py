@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Base class of the files of a bag: topics, messages as CDR, and their number."""
+"""
+Base class of the files of a bag: their topics, and their messages as CDR in order of time.
+
+Subclasses read mcap (``mcap_file``), sqlite3 (``sqlite_file``) and rosbag1 (``rosbags_readers``).
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,8 +24,9 @@ from odocal_ros.messages.raws import RawMessages
 from odocal_ros.safe_io.limits import Allowance, LATEST_NS, LimitReached
 
 PREALLOCATED_BYTES = 2**23      # judgement: bytes
-BATCH_MESSAGES = 20_000         # judgement
+BATCH_MESSAGES = 20_000         # judgement: most messages of a batch
 ZSTD = b'\x28\xb5\x2f\xfd'      # format: first bytes of compressed data
+# language of a message definition, by its name in a bag
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
 
 
@@ -57,7 +62,7 @@ class FileBytes:
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic of a bag file; ``definition`` is (format 'msg', 'idl' or '', text)."""
+    """A topic of a bag file; ``definition`` is (language: 'msg', 'idl' or '', text)."""
 
     topic: str
     msgtype: str
@@ -135,9 +140,11 @@ class BagFile:
         raise NotImplementedError
 
     def _scan(self) -> Iterator[tuple[int, int]]:
+        """Yield channel number and time, ns, of every message."""
         raise NotImplementedError
 
     def _count(self) -> None:
+        """Count the messages by a scan, for files whose index is missing or wrong."""
         counts: Counter[int] = Counter()
         start_ns, end_ns = 2**63 - 1, 0
         for key, time_ns in self._scan():

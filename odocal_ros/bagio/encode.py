@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Encoding of samples as ROS 2 messages (CDR, little endian), many at once in numpy.
+Encoding of samples as ROS 2 messages (CDR, little endian), for simulated bags.
 
 Messages of one topic all have the same length (one frame_id, one set of joint names), so a block
-of them is one structured array; no message objects are created.
+of them is one structured array in numpy; no message objects are created.
 """
 
 from collections.abc import Callable, Mapping
@@ -45,7 +45,11 @@ class Topic:
 
 def _message_template(msgtype: str, parts: Mapping[str, Any]
                       ) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
-    """Return a message of zeros with these texts and lengths, and type, shape, offset by path."""
+    """
+    Return a message of zeros, and (type, shape), offset of each number by path.
+
+    parts : texts, lists of texts and lengths of lists by path.
+    """
     raw, places = bytearray((0, 1, 0, 0)), {}      # little-endian
 
     def add(align: int, content: bytes) -> int:
@@ -55,30 +59,30 @@ def _message_template(msgtype: str, parts: Mapping[str, Any]
         base, _, size = kind.partition('[')
         part = parts.get(path, '' if base == 'string' else 0)
         if size == ']':
-            add(4, struct.pack('<I', part if base in cdr.KINDS else len(part)))
+            add(4, struct.pack('<I', part if base in cdr.NUMPY_TYPES else len(part)))
         if base == 'string':
             for text in part if size else [part]:
                 add(4, struct.pack('<I', len(text.encode()) + 1))
                 add(1, text.encode() + b'\0')
         else:
             count = 1 if not size else part if size == ']' else int(size[:-1])
-            item = np.dtype(cdr.KINDS[base]).itemsize
-            at = add(item if count else 1, bytes(item * count))
-            places[path] = (cdr.KINDS[base], (count,) if size else ()), at
+            item = np.dtype(cdr.NUMPY_TYPES[base]).itemsize
+            offset = add(item if count else 1, bytes(item * count))
+            places[path] = (cdr.NUMPY_TYPES[base], (count,) if size else ()), offset
     return bytes(raw), places
 
 
 def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
            parts: Mapping[str, Any]) -> Topic:
-    """Return a topic; ``values`` by path, of x, y, z (and w) together by that of their parent."""
+    """Return a topic; x, y, z (and w) together have the path of their parent in ``values``."""
     raw, places = _message_template(msgtype, parts)
     kinds, offsets = [], []
     for path in values:
         found = [one for known, one in places.items() if f'{known}.'.startswith(f'{path}.')]
-        (kind, shape), at = found[0]
+        (kind, shape), offset = found[0]
         kinds.append((kind, shape if len(found) == 1 else (len(found),)))
-        offsets.append(at)
-    # with a field of all bytes, so that a copy has those without a value too
+        offsets.append(offset)
+    # the field of all bytes is copied with the others, so that bytes without a value are, too
     dtype = np.dtype({'names': [*values, 'message'], 'formats': [*kinds, f'V{len(raw)}'],
                       'offsets': [*offsets, 0]})
 

@@ -4,10 +4,9 @@
 """
 Messages of an mcap file as columns: a block of chunks at a time, without a loop over messages.
 
-The offsets of the records in a chunk are from the message index after it
-(mcap.dev/spec#message-index-op0x07), and are verified: each must be a message (op 0x05) that ends
-at the begin of the next one, the last of them at the end of the chunk, as in a sequential scan of
-the records. Other chunks are read by such a scan.
+The message index after each chunk (mcap.dev/spec#message-index-op0x07) has the offsets of the
+records. They are verified: each record must be a message (op 0x05) that ends at the begin of the
+next one, or at the end of the chunk. Chunks that differ are read by a sequential scan.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -26,14 +25,14 @@ from odocal_ros.safe_io.limits import Damaged, LATEST_NS
 BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
                  ('time_ns', '<i8'), ('published_ns', '<i8')])
-BODY = 22              # format: bytes of HEAD in a record's size: mcap.dev/spec
+BODY = 22              # format: bytes of HEAD that a record's size includes: mcap.dev/spec
 
 
 class Columns(NamedTuple):
-    """Messages: their times, channels and bytes."""
+    """Times, channel numbers and bytes of n messages."""
 
-    time_ns: Ints
-    channel: NDArray[np.uint16]
+    time_ns: Ints                  # (n,)
+    channel: NDArray[np.uint16]    # (n,)
     raws: RawMessages
 
     def take(self, rows: Rows) -> 'Columns':
@@ -41,8 +40,8 @@ class Columns(NamedTuple):
 
 
 Block = list[Chunk | Damaged]
-ReadChunks = Callable[[Sequence[ChunkIndex]], Block]     # of adjacent chunks
-# returns time, channel and message of each, or raises Damaged
+ReadChunks = Callable[[Sequence[ChunkIndex]], Block]     # reads adjacent chunks
+# returns time, channel and bytes of each message, or raises Damaged
 ScanChunk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]
 ReportDamage = Callable[[Damaged], None]
 
@@ -58,14 +57,14 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
     """
     is_requested, is_known = _table(channels), _table(known_channels)
     later: Columns | None = None         # messages that may be later than those of the next chunk
-    at, size = 0, 1                      # the first block is one chunk, which is often sufficient
-    while at < len(index):
-        block, at = _read_block(index, at, size, read_chunks)
+    number, size = 0, 1           # the first block is one chunk, which is often sufficient
+    while number < len(index):
+        block, number = _read_block(index, number, size, read_chunks)
         found = _columns(block, is_known, scan, report_damage)
         if len(channels) < len(known_channels):
             found = found.take(is_requested[found.channel])
         found = _by_time(_join(later, found) if later else found)
-        end = int(np.searchsorted(found.time_ns, index[at].start_ns)) if at < len(
+        end = int(np.searchsorted(found.time_ns, index[number].start_ns)) if number < len(
             index) else len(found.time_ns)
         later = found.take(slice(end, None)) if end < len(found.time_ns) else None
         if end:
@@ -73,20 +72,20 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
         size = BLOCK + int(later.raws.size.sum() if later else 0)
 
 
-def _read_block(index: Sequence[ChunkIndex], at: int, size: int,
+def _read_block(index: Sequence[ChunkIndex], number: int, size: int,
                 read_chunks: ReadChunks) -> tuple[Block, int]:
-    """Read chunks from number ``at``, of ``size`` bytes or more; return them and the next one."""
+    """Return chunks from a number on, of ``size`` bytes or more, and the number after them."""
     block: Block = []
-    end_ns, first, adjacent = 0, at, 0
-    while at < len(index) and (size > 0 or index[at].start_ns < end_ns and size > -BLOCK):
-        entry = index[at]
-        if entry.at != adjacent:
-            block += read_chunks(index[first:at]) if at > first else []
-            first = at
-        adjacent = entry.at + entry.size + entry.index_size
+    end_ns, first, adjacent = 0, number, 0
+    while number < len(index) and (size > 0 or index[number].start_ns < end_ns and size > -BLOCK):
+        entry = index[number]
+        if entry.offset != adjacent:
+            block += read_chunks(index[first:number]) if number > first else []
+            first = number
+        adjacent = entry.offset + entry.size + entry.index_size
         size -= max(entry.size, entry.unpacked_size)
-        end_ns, at = max(end_ns, entry.end_ns), at + 1
-    return block + read_chunks(index[first:at]), at
+        end_ns, number = max(end_ns, entry.end_ns), number + 1
+    return block + read_chunks(index[first:number]), number
 
 
 def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
@@ -132,10 +131,11 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
     stop = np.append(start[1:], 0)
     stop[end - 1] = [chunk.stop for chunk in chunks]
     size = stop - start - 9
-    chain = ((head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
-             and start[first].tolist() == [chunk.at for chunk in chunks])
+    is_chain = (
+        (head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
+        and start[first].tolist() == [chunk.begin for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
-    if not chain or not known_channels[channel].all():
+    if not is_chain or not known_channels[channel].all():
         return None
     least, most = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
     for chunk, a, b in zip(chunks, least.tolist(), most.tolist(), strict=True):
@@ -145,28 +145,29 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
 
 
 def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
+    """Return the chunks with their records in one buffer."""
     if len({id(chunk.data) for chunk in chunks}) <= 1:
         return chunks
-    data, at, found = b''.join([chunk.records for chunk in chunks]), 0, []
+    data, begin, found = b''.join([chunk.records for chunk in chunks]), 0, []
     for chunk in chunks:
-        stop = at + chunk.stop - chunk.at
-        found.append(chunk._replace(data=data, at=at, stop=stop))
-        at = stop
+        stop = begin + chunk.stop - chunk.begin
+        found.append(chunk._replace(data=data, begin=begin, stop=stop))
+        begin = stop
     return found
 
 
 def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
-    found, at, index = [np.empty(0, np.int64)], 0, chunk.message_index
-    while at + 15 <= len(index):
-        op, size = RECORD.unpack_from(index, at)
-        (length,) = struct.unpack_from('<I', index, at + 11)
+    found, offset, index = [np.empty(0, np.int64)], 0, chunk.message_index
+    while offset + 15 <= len(index):
+        op, size = RECORD.unpack_from(index, offset)
+        (length,) = struct.unpack_from('<I', index, offset + 11)
         if op != MESSAGE_INDEX or size != length + 6 or length % 16 or (
-                at + 15 + length > len(index)):
+                offset + 15 + length > len(index)):
             break
-        found.append(np.frombuffer(index, '<i8', length // 8, at + 15)[1::2])
-        at += 9 + size
-    return np.concatenate(found) + chunk.at
+        found.append(np.frombuffer(index, '<i8', length // 8, offset + 15)[1::2])
+        offset += 9 + size
+    return np.concatenate(found) + chunk.begin
 
 
 def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
@@ -176,6 +177,7 @@ def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
 
 
 def _join(*parts: Columns) -> Columns:
+    """Return the messages of several columns in one buffer."""
     if not parts:
         return _columns_of_messages([])
     packed = [part.raws.packed() for part in parts]
@@ -184,8 +186,8 @@ def _join(*parts: Columns) -> Columns:
         np.concatenate([part.time_ns for part in parts]),
         np.concatenate([part.channel for part in parts]),
         RawMessages(b''.join([raws.data for raws in packed]),
-                    np.concatenate([raws.start + at for raws,
-                                    at in zip(packed, base, strict=False)]),
+                    np.concatenate([raws.start + offset for raws,
+                                    offset in zip(packed, base, strict=False)]),
                     np.concatenate([raws.size for raws in packed])))
 
 
@@ -196,6 +198,7 @@ def _by_time(found: Columns) -> Columns:
 
 
 def _batch(found: Columns, channels: Mapping[int, Channel]) -> Batch:
+    """Return messages by topic, which may have several channels."""
     batch: Batch = {}
     for topic in dict.fromkeys(channel.topic for channel in channels.values()):
         of_topic = [found.channel == key for key, channel in channels.items()

@@ -30,15 +30,15 @@ class McapFile(BagFile):
     A file of messages in chunks.
 
     The size, the checksum (if any), the channels and the times of each chunk are checked. A chunk
-    with any error is left out completely, since other errors in it may be undetected; of a chunk
-    truncated by the end of the file, complete messages are used.
+    with any error is skipped, since other errors in it may be undetected; of a chunk truncated by
+    the end of the file, complete messages are used.
     """
 
     def __init__(self, path: Path, allowance: Allowance) -> None:
         super().__init__(path, allowance)
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._chunks: list[mcap.ChunkIndex] = []
-        self._counted_damage = ''         # known damage when messages were counted
+        self._counted_damage = ''         # the damage known when messages were counted
         self._file = FileBytes(path)
         try:
             self._open()
@@ -47,6 +47,7 @@ class McapFile(BagFile):
             raise
 
     def _open(self) -> None:
+        """Read the index, or else count the messages by a scan."""
         try:
             if self._read_index():
                 return
@@ -55,8 +56,6 @@ class McapFile(BagFile):
         self._chunks = []
         self._count()
         self._counted_damage = self.damage
-
-    # ---- the index -------------------------------------------------------------------------
 
     def _read_index(self) -> bool:
         """Read the index; return False if the file has none, or raise Damaged."""
@@ -89,8 +88,6 @@ class McapFile(BagFile):
         self._set_counts(counts, start_ns, end_ns)
         return True
 
-    # ---- messages --------------------------------------------------------------------------
-
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
         """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
         channels = self._channels_of(topics)
@@ -104,32 +101,37 @@ class McapFile(BagFile):
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
         """Return the messages in batches; None if the index is missing or of other chunks."""
         channels = self._channels_of(topics)
-        chunks = [chunk for chunk in self._chunks
-                  if not chunk.channels or chunk.channels & channels.keys()]
-        if not self._chunks or any(self._file[chunk.at + 9:chunk.at + 25] != mcap.TIMES.pack(
-                chunk.start_ns, chunk.end_ns) for chunk in chunks):
+        chunks = self._chunks_with(channels)
+        if not self._chunks or any(
+                self._file[chunk.offset + 9:chunk.offset + 25] != mcap.TIMES.pack(
+                    chunk.start_ns, chunk.end_ns) for chunk in chunks):
             return None
         return self._indexed_batches(chunks, channels)
+
+    def _chunks_with(self, channels: Mapping[int, Channel]) -> list[mcap.ChunkIndex]:
+        """Return the chunks that may have messages of some channels."""
+        return [chunk for chunk in self._chunks
+                if not chunk.channels or chunk.channels & channels.keys()]
 
     def _indexed_batches(self, chunks: list[mcap.ChunkIndex],
                          channels: Mapping[int, Channel]) -> Iterator[Batch]:
         self._allowance.restart()
-        yield from batches(chunks, channels, self._channels, self._read, self._messages_by_scan,
-                           self._report_damage)
+        yield from batches(chunks, channels, self._channels, self._read_chunks,
+                           self._messages_by_scan, self._report_damage)
         self._recount()
 
-    def _read(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
+    def _read_chunks(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
         """Return adjacent chunks of the index, each with its message index."""
-        begin, end = chunks[0].at, chunks[-1].at + chunks[-1].size + chunks[-1].index_size
+        begin, end = chunks[0].offset, chunks[-1].offset + chunks[-1].size + chunks[-1].index_size
         data = self._file[begin:end]
         found: list[mcap.Chunk | Damaged] = []
         for chunk in chunks:
-            at = chunk.at - begin
-            stop = at + chunk.size
+            offset = chunk.offset - begin
+            stop = offset + chunk.size
             try:
-                if data[at:at + 9] != mcap.RECORD.pack(mcap.CHUNK, chunk.size - 9):
+                if data[offset:offset + 9] != mcap.RECORD.pack(mcap.CHUNK, chunk.size - 9):
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append(mcap.unpack_chunk(data, at + 9, stop, self._allowance)._replace(
+                found.append(mcap.unpack_chunk(data, offset + 9, stop, self._allowance)._replace(
                     message_index=memoryview(data)[stop:stop + chunk.index_size]))
             except Damaged as error:
                 found.append(error)
@@ -145,9 +147,8 @@ class McapFile(BagFile):
             self._counted_damage = self.damage
 
     def _by_time(self, channels: Mapping[int, Channel]) -> Iterator[Entry]:
-        chunks = (chunk for chunk in self._chunks
-                  if not chunk.channels or chunk.channels & channels.keys())
-        for group in group_overlapping(chunks):
+        """Yield messages in order of time, with the chunks that overlap unpacked at once."""
+        for group in group_overlapping(self._chunks_with(channels)):
             yield from self._merged(group, channels)
 
     def _merged(self, chunks: list[mcap.ChunkIndex],
@@ -161,7 +162,7 @@ class McapFile(BagFile):
     def _messages_of(self, index: mcap.ChunkIndex, channels: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; [] if it is damaged."""
         try:
-            (chunk,) = self._read([index])
+            (chunk,) = self._read_chunks([index])
             if isinstance(chunk, Damaged):
                 raise chunk
             found = self._messages_by_scan(chunk)
@@ -195,8 +196,6 @@ class McapFile(BagFile):
                 self.damage = self.damage or (
                     str(error) if isinstance(error, Damaged) else 'a damaged record')
 
-    # ---- records one by one ----------------------------------------------------------------
-
     def _messages_by_scan(self, chunk: mcap.Chunk, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
         found = self._entries(bytes(chunk.records), cut)
@@ -209,41 +208,41 @@ class McapFile(BagFile):
     def _entries(self, records: bytes, cut: bool) -> list[Entry]:
         """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
         found = []
-        channels, head, at, end = self._channels, mcap.RECORD.unpack_from, 0, len(records)
-        while at + 9 <= end:
-            op, size = head(records, at)
-            stop = at + 9 + size
+        channels, head, offset, end = self._channels, mcap.RECORD.unpack_from, 0, len(records)
+        while offset + 9 <= end:
+            op, size = head(records, offset)
+            stop = offset + 9 + size
             if stop > end:
                 break
             if op == mcap.MESSAGE:
                 if size < mcap.MESSAGE_HEAD.size:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, at + 9)
+                key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, offset + 9)
                 if key not in channels or time_ns >= LATEST_NS:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append((time_ns, key, records[at + 31:stop]))
+                found.append((time_ns, key, records[offset + 31:stop]))
             elif op in (mcap.SCHEMA, mcap.CHANNEL):
                 try:
-                    self._add_definition(op, records[at + 9:stop])
+                    self._add_definition(op, records[offset + 9:stop])
                 except (struct.error, UnicodeDecodeError):
                     raise Damaged(mcap.CHUNK_DAMAGED) from None
             else:       # not allowed in a chunk
                 raise Damaged(mcap.CHUNK_DAMAGED)
-            at = stop
-        if at != end and not cut:
+            offset = stop
+        if offset != end and not cut:
             raise Damaged(mcap.CHUNK_DAMAGED)
         return found
 
     def _add_definition(self, op: int, body: bytes) -> None:
         (key,) = struct.unpack_from('<H', body)
         if op == mcap.SCHEMA:
-            name, at = mcap.text_at(body, 2)
-            form, at = mcap.text_at(body, at)
-            text, _ = mcap.text_at(body, at)
+            name, offset = mcap.text_at(body, 2)
+            form, offset = mcap.text_at(body, offset)
+            text, _ = mcap.text_at(body, offset)
             self._schemas[key] = name, (FORMATS.get(form, ''), text)
         elif key not in self._channels:
-            topic, at = mcap.text_at(body, 4)
-            form, _ = mcap.text_at(body, at)
+            topic, offset = mcap.text_at(body, 4)
+            form, _ = mcap.text_at(body, offset)
             (schema,) = struct.unpack_from('<H', body, 2)
             name, definition = self._schemas.get(schema, ('', ('', '')))
             self._channels[key] = Channel(topic, name, 0, form, definition)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of mcap files (mcap.dev/spec): their kinds and content; chunks unpacked and checked."""
+"""Records of mcap files (mcap.dev/spec): kinds and content; chunks are unpacked and checked."""
 
 from collections.abc import Iterator, Sequence
 from operator import attrgetter
@@ -21,14 +21,16 @@ USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
 CHUNK_DAMAGED = 'a damaged chunk'
 MOST_CUT = 2**26        # judgement: bytes used of a chunk that is truncated by the end of the file
+# first fields of the records: opcode and size of each record; channel, sequence and times of a
+# message; times, size and checksum of a chunk; times, offset and size of a chunk in the index
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
-FOOTER_SIZE = 9 + 20 + len(MAGIC)      # format: of the footer
+FOOTER_SIZE = 9 + 20 + len(MAGIC)      # format: bytes of the footer record and the magic
 
 
 class ChunkIndex(NamedTuple):
     """
-    Index entry of a chunk: times, position of its record, channels.
+    Index entry of a chunk: times, offset and size of its record in the file, channels.
 
     index_size : bytes of the message index after the chunk, limited by ``ordered_chunks`` to the
     space before the next chunk.   unpacked_size : bytes, as stated.
@@ -36,33 +38,34 @@ class ChunkIndex(NamedTuple):
 
     start_ns: int
     end_ns: int
-    at: int
+    offset: int
     size: int
     channels: frozenset[int]
     index_size: int = 0
     unpacked_size: int = 0
 
 
-def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
+def records_of(data: bytes | FileBytes, offset: int = 0) -> Iterator[tuple[int, bytes, bool]]:
     """Yield the records of a section, up to the footer: op, content, True if complete."""
-    while at + 9 <= len(data):
-        op, size = RECORD.unpack(data[at:at + 9])
+    while offset + 9 <= len(data):
+        op, size = RECORD.unpack(data[offset:offset + 9])
         if op == FOOTER:
             return
-        stop = at + 9 + size
+        stop = offset + 9 + size
         complete = stop <= len(data)
         if op in USED and complete or op == CHUNK:      # also a truncated last chunk
-            yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not complete else stop], complete
-        at = stop
+            end = stop if complete else min(stop, offset + 9 + MOST_CUT)
+            yield op, data[offset + 9:end], complete
+        offset = stop
 
 
 def chunk_index_of(body: bytes) -> ChunkIndex:
     """Return the chunk described by a record of the index."""
-    start_ns, end_ns, at, size = INDEX_HEAD.unpack_from(body)
+    start_ns, end_ns, offset, size = INDEX_HEAD.unpack_from(body)
     (length,) = struct.unpack_from('<I', body, INDEX_HEAD.size)
     stop = INDEX_HEAD.size + 4 + length
     pairs = body[INDEX_HEAD.size + 4:stop]
-    return ChunkIndex(start_ns, end_ns, at, size,
+    return ChunkIndex(start_ns, end_ns, offset, size,
                       frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
                       int.from_bytes(body[stop:stop + 8], 'little'),
                       int.from_bytes(body[-8:], 'little'))
@@ -74,12 +77,12 @@ def ordered_chunks(chunks: Sequence[ChunkIndex], end: int) -> list[ChunkIndex]:
 
     Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
-    chunks, found, at = sorted(chunks, key=attrgetter('at')), [], len(MAGIC)
-    for chunk, after in zip(chunks, [*(c.at for c in chunks[1:]), end], strict=True):
-        if chunk.at < at or chunk.size < 9 or chunk.at + chunk.size > end:
+    chunks, found, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
+    for chunk, after in zip(chunks, [*(c.offset for c in chunks[1:]), end], strict=True):
+        if chunk.offset < offset or chunk.size < 9 or chunk.offset + chunk.size > end:
             raise Damaged(INDEX_DAMAGED)
-        at = chunk.at + chunk.size
-        found.append(chunk._replace(index_size=min(chunk.index_size, max(after - at, 0))))
+        offset = chunk.offset + chunk.size
+        found.append(chunk._replace(index_size=min(chunk.index_size, max(after - offset, 0))))
     return sorted(found)
 
 
@@ -89,21 +92,22 @@ def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
     return count, start_ns, end_ns, dict(struct.iter_unpack('<HQ', body[46:46 + length]))
 
 
-def text_at(body: Bytes, at: int) -> tuple[str, int]:
+def text_at(body: Bytes, offset: int) -> tuple[str, int]:
     """Return the text at an offset of a record, and the offset after it."""
-    (size,) = struct.unpack_from('<I', body, at)
-    return bytes(body[at + 4:at + 4 + size]).decode(), at + 4 + size
+    (size,) = struct.unpack_from('<I', body, offset)
+    return bytes(body[offset + 4:offset + 4 + size]).decode(), offset + 4 + size
 
 
 class Chunk(NamedTuple):
     """
-    Position of its records, stated times, and the message index after it, unverified.
+    A decompressed chunk: its records ``data[begin:stop]``, and its stated times.
 
-    ``data`` may contain more than ``data[at:stop]``: several chunks that were read at once.
+    ``data`` may contain several chunks that were read at once. ``message_index`` is the index
+    after the chunk in the file, not verified.
     """
 
     data: Bytes
-    at: int
+    begin: int
     stop: int
     start_ns: int
     end_ns: int
@@ -111,17 +115,17 @@ class Chunk(NamedTuple):
 
     @property
     def records(self) -> memoryview:
-        return memoryview(self.data)[self.at:self.stop]
+        return memoryview(self.data)[self.begin:self.stop]
 
 
-def unpack_chunk(data: Bytes, at: int, stop: int, allowance: Allowance,
+def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
                  cut: bool = False) -> Chunk:
     """
     Return the chunk of a record, or raise Damaged.
 
-    at, stop : of the record's content in the data.   cut : it is truncated by the end of the file.
+    begin, stop : range of the record's content in the data.   cut : the file ends within it.
     """
-    body = memoryview(data)[at:stop]
+    body = memoryview(data)[begin:stop]
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
         packing, offset = text_at(body, CHUNK_HEAD.size)
@@ -136,4 +140,4 @@ def unpack_chunk(data: Bytes, at: int, stop: int, allowance: Allowance,
         raise Damaged(CHUNK_DAMAGED)
     if packing:
         return Chunk(records, 0, len(records), start_ns, end_ns)
-    return Chunk(data, at + offset + 8, at + offset + 8 + len(records), start_ns, end_ns)
+    return Chunk(data, begin + offset + 8, begin + offset + 8 + len(records), start_ns, end_ns)

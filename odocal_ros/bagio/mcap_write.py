@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and flushed to the disk.
+Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and synced to the disk.
 
-A chunk contains messages of one topic in the form of the file, so that joining files copies chunks
-without packing them again.
+A ``PackedChunk`` has the bytes of the file, so that joining files copies chunks without packing
+them again.
 """
 
 from collections import Counter
@@ -25,23 +25,19 @@ from odocal_ros.safe_io.atomic_files import whole_file, WholeFile
 from odocal_ros.safe_io.limits import zstd_module
 
 HEADER, DATA_END = 1, 15      # format: opcodes not in mcap_records: mcap.dev/spec
-MESSAGE_HEAD = struct.Struct('<BQHIQQ')
+MESSAGE_HEAD = struct.Struct('<BQHIQQ')     # opcode, size, channel, sequence, times
 
 
 @dataclass(frozen=True, eq=False)
 class PackedChunk:
-    """
-    Messages of one channel, packed.
-
-    ``record`` and ``index`` are the records of the file; times in ns.
-    """
+    """Messages of one channel in the form of the file."""
 
     channel: int
     start_ns: int
     end_ns: int
     count: int
-    record: bytes
-    index: bytes
+    record: bytes      # the chunk
+    index: bytes       # the message index that follows it
 
     @property
     def size(self) -> int:
@@ -111,12 +107,13 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
         + _record(mcap.CHANNEL, struct.pack('<HH', key, key) + _text(c.topic)
                   + _text(c.serialization) + struct.pack('<I', 0)) for key, c in channels.items())
-    at = file.write(mcap.MAGIC + _record(HEADER, _text('ros2') + _text('odocal_ros')) + described)
+    header = _record(HEADER, _text('ros2') + _text('odocal_ros'))
+    offset = file.write(mcap.MAGIC + header + described)
     indexes, counts, start_ns, end_ns = [], Counter(dict.fromkeys(channels, 0)), 2**63 - 1, 0
     for chunk in chunks:
-        indexes.append(_chunk_index(chunk, at))
-        at += file.write(chunk.record)
-        at += file.write(chunk.index)
+        indexes.append(_chunk_index(chunk, offset))
+        offset += file.write(chunk.record)
+        offset += file.write(chunk.index)
         counts[chunk.channel] += chunk.count
         start_ns, end_ns = min(start_ns, chunk.start_ns), max(end_ns, chunk.end_ns)
     end = _record(DATA_END, struct.pack('<I', 0))
@@ -124,24 +121,25 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
     statistics = struct.pack('<QHIIIIQQI', counts.total(), len(channels), len(channels), 0, 0,
                              len(indexes), start_ns, end_ns, len(tallies)) + tallies
     summary = described + _record(mcap.STATISTICS, statistics) + b''.join(indexes)
-    footer = struct.pack('<QQI', at + len(end), 0, 0)
-    at += file.write(end + summary + _record(mcap.FOOTER, footer) + mcap.MAGIC)
-    return Written(at, start_ns, end_ns, counts)
+    footer = struct.pack('<QQI', offset + len(end), 0, 0)
+    offset += file.write(end + summary + _record(mcap.FOOTER, footer) + mcap.MAGIC)
+    return Written(offset, start_ns, end_ns, counts)
 
 
-def _chunk_index(chunk: PackedChunk, at: int) -> bytes:
+def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
     """Return the index record of a chunk at an offset of the file."""
     _, _, size, _, form, packed = _chunk_body(chunk.record)
     return _record(mcap.CHUNK_INDEX, struct.pack(
-        '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, at, len(chunk.record), 10, chunk.channel,
-        at + len(chunk.record), len(chunk.index)) + _text(form) + struct.pack('<QQ', packed, size))
+        '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, offset, len(chunk.record), 10, chunk.channel,
+        offset + len(chunk.record), len(chunk.index)) + _text(form)
+        + struct.pack('<QQ', packed, size))
 
 
 def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
     """Return start, end, unpacked size, CRC, compression and packed size of a chunk record."""
     start_ns, end_ns, size, crc = mcap.CHUNK_HEAD.unpack_from(record, 9)
-    form, at = mcap.text_at(record, 9 + mcap.CHUNK_HEAD.size)
-    (packed,) = struct.unpack_from('<Q', record, at)
+    form, offset = mcap.text_at(record, 9 + mcap.CHUNK_HEAD.size)
+    (packed,) = struct.unpack_from('<Q', record, offset)
     return start_ns, end_ns, size, crc, form, packed
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read bags: rosbag1, rosbag2 (sqlite3, mcap), split, compressed, without metadata, cut off."""
+"""Read bags: rosbag1, rosbag2 (sqlite3, mcap); split, compressed, without metadata, damaged."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
@@ -30,6 +30,8 @@ LEAST_LOSS = 0.5   # s, judgement: shorter losses are not reported
 
 @dataclass(frozen=True)
 class TopicInfo:
+    """A topic of a bag, its type and its number of messages."""
+
     name: str
     msgtype: str
     count: int
@@ -54,6 +56,7 @@ class Bag:
         self.end_ns = max(p.end_ns for p in self._parts)
 
     def _collect(self) -> dict[str, TopicInfo]:
+        """Return the topics of all files, each with its most frequent type."""
         counts: dict[str, dict[str, int]] = {}
         for part in self._parts:
             for channel in part.channels:
@@ -156,8 +159,8 @@ class Bag:
         deserialize = self._types.deserializer(msgtype)
 
         def frame_of(raw: bytes) -> str:
-            note = cdr.frame_of(msgtype, raw)
-            return deserialize(raw).header.frame_id if note is None else note
+            frame = cdr.frame_of(msgtype, raw)
+            return deserialize(raw).header.frame_id if frame is None else frame
         return next((frame for _, frame in self._each(topic, frame_of)), '')
 
     def _each(self, topic: str, read: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:

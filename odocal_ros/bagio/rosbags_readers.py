@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Readers by the package rosbags: non-standard message types, and rosbag1 files.
+What the package rosbags reads: message types defined in a bag, and rosbag1 files.
 
-Both are limited, since rosbags trusts a file: a definition is parsed in bounded time, and sizes
-stated by index and chunks of a rosbag1 file are checked.
+rosbags trusts a file, so both are limited: a definition is parsed in bounded time, and the sizes
+that a rosbag1 file states for its index and chunks are checked.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -20,19 +20,12 @@ from typing import Any
 
 from odocal_ros.bagio.bag_file import BagFile, Channel
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
-from odocal_ros.safe_io.limits import (
-    Allowance,
-    check,
-    DEFINITION,
-    ELEMENTS,
-    factor,
-    LATEST_NS,
-    LimitReached,
-    SECONDS,
-)
+from odocal_ros.safe_io import limits
+from odocal_ros.safe_io.limits import Allowance, LATEST_NS, limit_factor, LimitReached
 
-# format: between definitions, of ros2msg in mcap.dev/spec/registry
+# format: line between two definitions, of ros2msg in mcap.dev/spec/registry
 IDL_SEPARATOR = '=' * 80 + '\n'
+# of IDL: string, comments, annotation, bracket, other text
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
 PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
@@ -40,7 +33,7 @@ PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 
 @contextmanager
 def require_rosbags(user: str) -> Iterator[None]:
-    """Raise BadUsage if an import of rosbags, which is optional, fails; ``what`` needs it."""
+    """Raise BadUsage if an import in the block fails; ``user``: what needs rosbags, as text."""
     try:
         yield
     except ModuleNotFoundError:
@@ -89,7 +82,7 @@ def strip_idl(text: str) -> str:
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError if the block runs longer; only has an effect in the main thread."""
+    """Raise TimeoutError if the block runs longer; without effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -106,13 +99,14 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 class Types:
-    """Deserialises messages; a type is loaded with its first message."""
+    """Deserialises messages of standard types and of those defined in a bag, by rosbags."""
 
     def __init__(self) -> None:
         self._store: Any = None
         self._definitions: dict[str, tuple[str, str]] = {}
 
     def define(self, msgtype: str, definition: tuple[str, str]) -> None:
+        """Store the definition of a type, (form, text); it is parsed when it is needed."""
         if definition[0]:
             self._definitions.setdefault(msgtype, definition)
 
@@ -149,14 +143,15 @@ class Types:
             raise BadData(f'{msgtype} is not a standard message type and the bag holds no '
                           'definition of it: record with a current rosbag2 (mcap), or use '
                           'another topic')
-        check(len(text), DEFINITION, f'{msgtype}: its definition in the bag', 'characters')
+        limits.check(len(text), limits.DEFINITION_CHARACTERS,
+                     f'{msgtype}: its definition in the bag', 'characters')
         try:
-            with time_limit(SECONDS * factor()):
+            with time_limit(limits.PARSE_SECONDS * limit_factor()):
                 known = self._store.fielddefs
                 parsed = parse_definition(msgtype, form, text)
                 found = {name: fields for name, fields in parsed.items() if name not in known}
-                check(_count_elements(msgtype, known | found), ELEMENTS, f'{msgtype}: a message',
-                      'values')
+                limits.check(_count_elements(msgtype, known | found), limits.MESSAGE_VALUES,
+                             f'{msgtype}: a message', 'values')
                 self._store.register(found)
         except (MemoryError, LimitReached):
             raise
@@ -180,14 +175,14 @@ def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> 
     total = 0
     for _, field in fielddefs[msgtype][1]:
         total += count_of(field)
-        if total > ELEMENTS * factor():
+        if total > limits.MESSAGE_VALUES * limit_factor():
             break
     return total
 
 
 class Rosbag1File(BagFile):
     """
-    A file of ROS 1; ``convert``: function of a message and its connection that returns CDR.
+    A file of ROS 1; ``convert`` returns a message of a connection as CDR.
 
     rosbags allocates the sizes that the file states for index and chunks. Here the bytes read for
     the index are counted, and its decompressors are replaced by limited ones.

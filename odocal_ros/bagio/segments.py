@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bag that grows by closed files, so that a kill at any moment only loses the newest second.
+A bag that grows by closed files (segments): a killed process only loses the newest second.
 
 While it grows it is a folder of numbered files without metadata.yaml; sixty of them are repeatedly
 joined into one, all of them at the end. A joined file is complete before the single files are
@@ -22,11 +22,11 @@ from odocal_ros.bagio.mcap_write import PackedChunk, read_chunks, write_file, Wr
 from odocal_ros.safe_io.atomic_files import disk, write_text
 
 JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
-# status of the node, by which a replay finds the marks; events of legs that it leaves out
+# the node's status, which contains the marks of legs; its events for legs that replay omits
 STATUS_NAME, STATUS_TYPE = 'calibrator: calibration', 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED_EVENTS = ('cancelled', 'undone')
 NUMBERED = re.compile(r'part_(\d+)(?:-(\d+))?\.mcap')
-FILES_JOINED = 60        # judgement: files joined while the bag grows: an hour has then 60 + 60
+FILES_JOINED = 60        # judgement: files joined at once: an hour then has at most 60 + 60
 
 
 def part_name(first: int, last: int) -> str:
@@ -125,8 +125,8 @@ class SegmentedBag:
     def _join(self, segments: list[Segment]) -> None:
         first, last = segments[0].first, segments[-1].last
         joined = self._write(part_name(first, last), first, last, _chunks_of(segments))
-        at = self.segments.index(segments[0])
-        self.segments[at:at + len(segments)] = [joined]
+        index = self.segments.index(segments[0])
+        self.segments[index:index + len(segments)] = [joined]
         for segment in segments:
             disk(os.unlink, segment.path)
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of a bag from a path of the user, decompressed if necessary."""
+"""Finds the files of a bag from a path that the user names, and decompresses them if needed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ from odocal_ros.safe_io.text_formats import safe_loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
-# judgement: bytes read at a time. Small: the rest is copied after each frame of 9 bytes or more
+# judgement: bytes read at a time. The rest of them is copied after each frame, which may be short
 READ_BYTES = 2**13
 ENDINGS = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 
@@ -38,7 +38,7 @@ class BagMetadata:
     """
     Content of metadata.yaml on a bag.
 
-    foreign_formats : serialization formats, if none is cdr.   fault : why it cannot be used.
+    foreign_formats : serialization formats, if none is cdr.   fault : why the file is not used.
     """
 
     file_names: tuple[str, ...] = ()

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sqlite3 bag, read by SQL, or from its leaf pages if inner pages are damaged."""
+"""
+A sqlite3 file of a bag, read by SQL, or from its leaf pages if the pages above them are damaged.
+
+A table of sqlite is a tree of pages (sqlite.org/fileformat2): its rows are in the leaf pages; the
+other pages only refer to them, so that rows can be found without them.
+"""
 
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
@@ -13,12 +18,13 @@ from urllib.parse import quote
 
 from odocal_ros.bagio.bag_file import BagFile, Channel, FileBytes, FORMATS, is_valid_time
 from odocal_ros.errors import BadBag
-from odocal_ros.safe_io.limits import Allowance, Damaged, factor, MESSAGE
+from odocal_ros.safe_io.limits import Allowance, Damaged, limit_factor, MESSAGE_BYTES
 
 LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
 # format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
 COLUMNS = 4
-INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}      # format: bytes, by serial type
+# format: bytes of an integer, by the type code in a row
+INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
 AS_STORED = 'SELECT rowid, topic_id, timestamp, data FROM messages ORDER BY rowid'
@@ -46,8 +52,8 @@ class LeafPages:
 
     def _first_row(self, page: int) -> int | None:
         """Return the number of the first row of a page of messages, None for other pages."""
-        at = page * self._size
-        is_leaf = self._map[at:at + 1] == bytes([LEAF])
+        offset = page * self._size
+        is_leaf = self._map[offset:offset + 1] == bytes([LEAF])
         return next((row for row, *_ in self._rows_of(page)), None) if is_leaf else None
 
     def rows(self, keys: Container[int] | None, last: int = -1
@@ -57,7 +63,8 @@ class LeafPages:
 
         keys : topics; None: all, without their data.   last : rows up to this one are skipped.
         """
-        left = 2 * len(self._map)            # bytes: large rows do not share overflow pages
+        # bytes that all rows together can have: large rows do not share overflow pages
+        left = 2 * len(self._map)
         for page in self._pages:
             for row, key, time_ns, payload in self._rows_of(page):
                 if row <= last:              # a stale copy of a page has earlier rows
@@ -81,25 +88,26 @@ class LeafPages:
         count = struct.unpack_from('>H', data, 3)[0]
         for i in range(min(count, (self._size - 8) // 2)):
             try:
-                at = struct.unpack_from('>H', data, 8 + 2 * i)[0]
-                size, at = _varint(data, at)
-                row, at = _varint(data, at)
-                key, time_ns, skip = _record(data, at)
+                offset = struct.unpack_from('>H', data, 8 + 2 * i)[0]
+                size, offset = _varint(data, offset)
+                row, offset = _varint(data, offset)
+                key, time_ns, skip = _record(data, offset)
             except (ValueError, IndexError, struct.error):
                 continue                     # not a row of messages
-            yield row, key, time_ns, partial(self._payload, data, at, size, skip)
+            yield row, key, time_ns, partial(self._payload, data, offset, size, skip)
 
-    def _payload(self, data: bytes, at: int, size: int, skip: int) -> bytes:
-        if size > min(len(self._map), MESSAGE * factor()):
+    def _payload(self, data: bytes, offset: int, size: int, skip: int) -> bytes:
+        if size > min(len(self._map), MESSAGE_BYTES * limit_factor()):
             raise ValueError('larger than the file')
+        # the part of a row in its page (fileformat2, 1.6); the rest is in a chain of other pages
         largest = self._usable - 35
         if size <= largest:
-            return data[at:at + size][skip:]
+            return data[offset:offset + size][skip:]
         least = (self._usable - 12) * 32 // 255 - 23
         local = least + (size - least) % (self._usable - 4)
         local = local if local <= largest else least
-        parts, have = [data[at:at + local]], local
-        page = struct.unpack_from('>I', data, at + local)[0]
+        parts, have = [data[offset:offset + local]], local
+        page = struct.unpack_from('>I', data, offset + local)[0]
         while have < size:
             start = (page - 1) * self._size
             if page < 2 or start + self._size > len(self._map):
@@ -114,36 +122,37 @@ class LeafPages:
         self._map.close()
 
 
-def _record(data: bytes, at: int) -> tuple[int, int, int]:
+def _record(data: bytes, offset: int) -> tuple[int, int, int]:
     """Return topic, time and offset of the data in a row of messages; ValueError if not one."""
-    length, pos = _varint(data, at)
+    length, pos = _varint(data, offset)
     if length > 10 * COLUMNS:      # a varint has nine bytes at most
         raise ValueError('not a message')
     kinds = []
-    while pos < at + length:
+    while pos < offset + length:
         kind, pos = _varint(data, pos)
         kinds.append(kind)
     if (len(kinds) != COLUMNS or kinds[0] or kinds[1] not in INTEGERS or kinds[2] not in INTEGERS
             or kinds[3] < 12 or kinds[3] % 2):
         raise ValueError('not a message')
     values = []
-    pos = at + length
+    pos = offset + length
     for kind in kinds[1:3]:
         size = INTEGERS[kind]
         values.append(int.from_bytes(data[pos:pos + size], 'big', signed=True)
                       if size else kind - 8)
         pos += size
-    return values[0], values[1], pos - at
+    return values[0], values[1], pos - offset
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _varint(data: bytes, offset: int) -> tuple[int, int]:
+    """Return the integer of variable length (fileformat2, 1.6) at an offset, and its end."""
     value = 0
     for i in range(8):
-        byte = data[at + i]
+        byte = data[offset + i]
         value = value << 7 | byte & 0x7F
         if byte < 0x80:
-            return value, at + i + 1
-    return value << 8 | data[at + 8], at + 9
+            return value, offset + i + 1
+    return value << 8 | data[offset + 8], offset + 9
 
 
 class SqliteFile(BagFile):
@@ -174,7 +183,7 @@ class SqliteFile(BagFile):
         db = self._db
         db.text_factory = lambda raw: raw.decode(errors='replace')
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH,
-                    min(max(self._size, 100_000), int(min(MESSAGE * factor(), 2**30))))
+                    min(max(self._size, 100_000), int(min(MESSAGE_BYTES * limit_factor(), 2**30))))
         # without it, sqlite refuses a file that is shorter than stated in its header
         db.execute('PRAGMA writable_schema=ON')
         db.execute('PRAGMA trusted_schema=OFF')
@@ -185,7 +194,7 @@ class SqliteFile(BagFile):
         """Yield the rows of a query, or raise Damaged."""
         steps = 10_000    # of sqlite's virtual machine between two checks of their number
         # for any file, plus a number for each byte: reading a row of ten bytes takes about 30
-        left = int((20_000_000 + 20 * self._size) * factor()) // steps
+        left = int((20_000_000 + 20 * self._size) * limit_factor()) // steps
 
         def stop() -> bool:
             nonlocal left

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write bags: topics merged by time, completely or not at all."""
+"""Write a bag of several topics in order of time, completely or not at all, with rosbags."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

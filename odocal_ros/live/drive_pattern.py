@@ -4,7 +4,7 @@
 """
 The node that drives a robot along a pattern for a calibration, from ``~/start`` to a stop.
 
-``pattern/`` computes route, commands and stop conditions; this module receives poses and sends
+``pattern.py`` computes route, commands and stop conditions; this module receives poses and sends
 commands. At every stop it sends zero commands for a second.
 """
 

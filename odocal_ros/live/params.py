@@ -60,10 +60,10 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     """
     Return the descriptor of a setting.
 
-    Limits that rclpy cannot check (NaN as default, arrays, choices) are text in the descriptor: the
-    on-set callback checks them. Lists that may be empty are typed dynamically, since an empty list
-    in YAML has no type. Settings fixed at start-up are not declared read-only: the on-set callback
-    refuses them with a remedy, rclpy without.
+    Limits that rclpy cannot check (arrays, choices, NaN as default) are only text here; the on-set
+    callback checks them. Lists that may be empty are typed dynamically: an empty list in YAML has
+    no type. Settings fixed at start-up are not declared read-only: the on-set callback refuses
+    them with a remedy, rclpy without.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     about += ' Fixed at start-up.' if setting.ro else ''

@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Offsets of the fields of a serialised message, without a ROS or rosbags import.
+Layout of serialised messages (CDR): type and offset of each field, without ROS or rosbags.
 
 Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same offsets: one message determines the layout for all of them.
+same offsets: one message determines the layout of all of them, which are then read as columns.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 import re
 import struct
 from typing import Any, NamedTuple
@@ -18,13 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
-         'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
-# format: of struct, by type of numpy; uint64 as int64
-UNPACKED = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': 'I', 'i8': 'q', 'u8': 'q',
-            'f4': 'f', 'f8': 'd'}
-NUMBERS = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')
-INDEXED = re.compile(r'(.+)\[(\d+)\]')
+# format: types of numpy by those of fields, in bytes; of struct by numpy (uint64 read as int64)
+NUMPY_TYPES = {f'{kind}{8 * size}': f'<{kind[0]}{size}' for kind, size in (
+    *product(('int', 'uint'), (1, 2, 4, 8)), ('float', 4), ('float', 8))}
+STRUCT_FORMATS = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': 'I', 'i8': 'q',
+                  'u8': 'q', 'f4': 'f', 'f8': 'd'}
+NUMBER_TYPES = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')
+Unpacker = Callable[[bytes], tuple[Any, ...]]      # returns adjacent values of a message
+ELEMENT_PATH = re.compile(r'(.+)\[(\d+)\]')
 
 
 def _vector_fields(prefix: str, names: str = 'xyz') -> tuple[str, ...]:
@@ -53,11 +55,11 @@ _GPS_FIX = (
         'tdop', 'err', 'err_horz', 'err_vert', 'err_track', 'err_speed', 'err_climb', 'err_time',
         'err_pitch', 'err_roll', 'err_dip')),
     'float64[9] position_covariance', 'uint8 position_covariance_type')
-FRAME_AT = 16       # format: offset of the text of HEADER in CDR
+FRAME_OFFSET = 16       # format: offset of the text of header.frame_id in CDR
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
 
-# 'kind path', in order; kind[n] is an array, kind[] a list
+# fields in order, each 'type path'; type[n] is an array, type[] a list
 SCHEMAS: dict[str, tuple[str, ...]] = {
     'sensor_msgs/msg/Imu': (
         *HEADER, *_vector_fields('orientation', 'xyzw'), 'float64[9] orientation_covariance',
@@ -90,35 +92,35 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
         'float32 heading_rate'),
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
-} | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in NUMBERS}
-
-
-Unpacker = Callable[[bytes], tuple[Any, ...]]
+} | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in NUMBER_TYPES}
 
 
 class AdjacentValues(NamedTuple):
-    """Adjacent values of one type: their bytes, type, type of all as one item, number."""
+    """Adjacent values of one type in a message."""
 
-    place: slice
-    dtype: np.dtype[Any]
-    packed_type: np.dtype[Any]
-    width: int
+    place: slice                      # their bytes
+    dtype: np.dtype[Any]              # of a value
+    packed_type: np.dtype[Any]        # of all of them as one item
+    width: int                        # number of values
 
 
 @dataclass
 class Layout:
     """Offsets of the fields of a message, and the bytes common to all messages of this layout."""
 
-    places: dict[str, tuple[int, str]] = field(default_factory=dict)       # offset, dtype
-    lists: dict[str, tuple[int, str, int]] = field(default_factory=dict)   # and how many values
-    texts: dict[str, list[str]] = field(default_factory=dict)              # lists of strings
+    # by path: offset and type of a value; of a list also its length; content of a list of strings
+    places: dict[str, tuple[int, str]] = field(default_factory=dict)
+    lists: dict[str, tuple[int, str, int]] = field(default_factory=dict)
+    texts: dict[str, list[str]] = field(default_factory=dict)
+    # ranges of the common bytes (encoding, lengths, texts), and their content
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
-    size: int = 4
-    values: list[bytes] = field(default_factory=list)      # content of the fixed bytes
-    _runs: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
+    values: list[bytes] = field(default_factory=list)
+    size: int = 4       # bytes of a message
+    _adjacent: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
+        """Return the names of joints, empty if the type has none."""
         return self.texts.get('name', [])
 
     def count(self, path: str) -> int:
@@ -129,23 +131,22 @@ class Layout:
         """Return offset and dtype of a value, ``path[i]`` in a list; None if it is missing."""
         if path in self.places:
             return self.places[path]
-        match = INDEXED.fullmatch(path)
+        match = ELEMENT_PATH.fullmatch(path)
         if match and int(match[2]) < self.count(match[1]):
             offset, dtype, _ = self.lists[match[1]]
             return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
         return None
 
     def _places(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
-        if paths not in self._runs:
-            self._runs[paths] = _adjacent_values([self.find(path) for path in paths])
-        return self._runs[paths]
+        if paths not in self._adjacent:
+            self._adjacent[paths] = _adjacent_values([self.find(path) for path in paths])
+        return self._adjacent[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
         """
         Return the values at some paths of messages of this layout, (n, size) bytes.
 
-        Returns (n, len(paths)) array of the first path's dtype; None if a path is not in the
-        layout.
+        The array is (n, len(paths)) of the first path's type; None if a path is missing.
         """
         runs = self._places(tuple(paths))
         if runs is None:
@@ -168,11 +169,11 @@ class Layout:
             'offsets': [run.place.start for run in single_runs]})
 
     def unpackers(self, columns: Sequence[Sequence[str] | None]) -> list[Unpacker]:
-        """Return functions for the values at some paths each, as ``record``; [] for its None."""
+        """Return a function for each field of ``record`` that returns its values; [] for None."""
         record = self.record(columns)
         fields = (record.fields or {}).values() if record is not None else ()
         return [partial(struct.Struct(
-            f'<{kind.shape[0]}{UNPACKED[kind.base.str[1:]]}').unpack_from,
+            f'<{kind.shape[0]}{STRUCT_FORMATS[kind.base.str[1:]]}').unpack_from,
             offset=offset) for kind, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:
@@ -180,29 +181,28 @@ class Layout:
             raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
 
-# newest layout of each type: most topics have only one
-_latest_layouts: dict[str, Layout] = {}
+_latest_layouts: dict[str, Layout] = {}      # by message type: most topics have only one
 
 
 def _adjacent_values(places: Sequence[tuple[int, str] | None]) -> list[AdjacentValues] | None:
-    """Return offsets of values as runs; None if one of them is missing."""
-    found: list[tuple[int, str, int]] = []
+    """Return values by offset and type, adjacent ones joined; None if one is missing."""
+    found: list[tuple[slice, str, int]] = []      # bytes, type and number of values
     for place in places:
         if place is None:
             return None
         offset, dtype = place
-        first, kind, count = found[-1] if found else (0, '', 0)
-        if kind == dtype and offset == first + count * np.dtype(dtype).itemsize:
-            found[-1] = first, kind, count + 1
+        span, kind, count = found[-1] if found else (slice(0), '', 0)
+        stop = offset + np.dtype(dtype).itemsize
+        if kind == dtype and span.stop == offset:
+            found[-1] = slice(span.start, stop), kind, count + 1
         else:
-            found.append((offset, dtype, 1))
-    return [AdjacentValues(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
-                           np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
-            for first, kind, count in found]
+            found.append((slice(offset, stop), dtype, 1))
+    return [AdjacentValues(span, np.dtype(kind), np.dtype((np.void, span.stop - span.start)), n)
+            for span, kind, n in found]
 
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
-    """Return the layout of one message; None if it cannot be read as columns."""
+    """Return the layout of one message, which may be longer; None if it has none."""
     if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
         return None
     before = _latest_layouts.get(msgtype)
@@ -214,8 +214,6 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
         scan.fields(SCHEMAS[msgtype], '')
     except (struct.error, ValueError):
         return None
-    if layout.size > len(raw):
-        return None     # longer is common: serialize_message leaves bytes after the message
     layout.values = [raw[a:b] for a, b in layout.fixed]
     _latest_layouts[msgtype] = layout
     return layout
@@ -225,8 +223,8 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
     """Return the frame_id of one message; None if it has no layout with a header."""
     if SCHEMAS.get(msgtype, ())[:3] != HEADER or layout_of(msgtype, raw) is None:
         return None
-    length = int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
-    return raw[FRAME_AT:FRAME_AT + max(length - 1, 0)].decode()
+    length = int.from_bytes(raw[FRAME_OFFSET - 4:FRAME_OFFSET], 'little')
+    return raw[FRAME_OFFSET:FRAME_OFFSET + max(length - 1, 0)].decode()
 
 
 def damaged_field(msgtype: str, raw: bytes) -> str:
@@ -243,8 +241,7 @@ class _LayoutScan:
     """Sequential scan of one message that stores the offsets of all fields."""
 
     def __init__(self, raw: bytes) -> None:
-        self.raw, self.path = raw, ''
-        self.layout = Layout()
+        self.raw, self.path, self.layout = raw, '', Layout()
 
     def fields(self, schema: Sequence[str], prefix: str) -> None:
         for line in schema:
@@ -264,37 +261,40 @@ class _LayoutScan:
             for i in range(count):
                 self.fields(_DIM, f'{path}[{i}].')
         else:
-            size = np.dtype(KINDS[kind]).itemsize
+            size = np.dtype(NUMPY_TYPES[kind]).itemsize
             if count:
                 self.align(size)
+            offset = self.advance(size * count)
             if listed:
-                layout.lists[path] = (layout.size, KINDS[kind], count)
+                layout.lists[path] = offset, NUMPY_TYPES[kind], count
             else:
-                layout.places[path] = (layout.size, KINDS[kind])
-            layout.size += size * count
-            if layout.size > len(self.raw):
-                raise ValueError(path)
+                layout.places[path] = offset, NUMPY_TYPES[kind]
+
+    def advance(self, count: int) -> int:
+        """Move on by a number of bytes; return the offset before."""
+        offset = self.layout.size
+        self.layout.size += count
+        if self.layout.size > len(self.raw):
+            raise ValueError(self.path)
+        return offset
 
     def align(self, size: int) -> None:
         self.layout.size += (4 - self.layout.size) % size      # relative to byte 4
 
     def length(self) -> int:
         self.align(4)
-        at = self.layout.size
-        length: int = struct.unpack_from('<I', self.raw, at)[0]
+        offset = self.advance(4)
+        length: int = struct.unpack_from('<I', self.raw, offset)[0]
         if length > len(self.raw):
-            raise ValueError('length')
-        self.layout.fixed.append((at, at + 4))
-        self.layout.size += 4
+            raise ValueError(self.path)
+        self.layout.fixed.append((offset, offset + 4))
         return length
 
     def text(self, keep: bool) -> str:
         """Skip a string; return it if ``keep``: the layout includes its content."""
         length = self.length()
-        at = self.layout.size
-        self.layout.size += length
-        if self.layout.size > len(self.raw):
-            raise ValueError('string')
-        if keep:
-            self.layout.fixed.append((at, at + length))
-        return self.raw[at:at + length - 1].decode() if keep and length else ''
+        begin = self.advance(length)
+        if not keep:
+            return ''
+        self.layout.fixed.append((begin, begin + length))
+        return self.raw[begin:begin + max(length - 1, 0)].decode()

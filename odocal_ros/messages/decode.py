@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Decoding of messages to samples: the same readers for live topics and for bags.
+Decoding of serialised messages to samples: the same readers for live topics and for bags.
 
-A reader takes serialised messages. Those of one layout are read as columns by ``messages.raws``;
-others are read by ``deserialize``, with bitwise equal rows.
+Messages of one layout (``messages/cdr.py``) are read as columns in numpy; others are deserialised
+one by one, with bitwise equal rows. A plan (``SensorPlan``, ``OdometerPlan``) states which fields
+are read and builds the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -67,9 +68,9 @@ class Reader:
         self.frames: FrameFilter | None = None      # of an IMU
         self.by_arrival = False      # the stamps of the messages are not used
         self._plan = plan
-        self._layout: cdr.Layout | None = None      # the last one of a few messages
-        self._record: np.dtype[Any] | None = None      # type with which they are read
-        self._unpackers: list[cdr.Unpacker] = []       # the same for plain numbers
+        self._layout: cdr.Layout | None = None      # the last one of ``_read_few``
+        self._record: np.dtype[Any] | None = None      # structured type of its messages
+        self._unpackers: list[cdr.Unpacker] = []       # functions that read its plain numbers
 
     @property
     def form(self) -> OdometerForm | None:
@@ -113,7 +114,7 @@ class Reader:
     def readings(self, raws: Sequence[bytes], received_ns: Sequence[int],
                  deserialize: Deserialize) -> list[tuple[str, list[Reading]]]:
         """
-        Decode messages as ``rows``, to plain numbers: a few take a fraction of the time.
+        Decode as ``rows``, but to plain numbers: a few messages take a fraction of the time.
 
         A reading has stamp and arrival, ns, then the first columns of the samples.
         """

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fields of messages by path, as bytes (a layout) or objects; those of IMU, fix and heading."""
+"""
+Fields of messages by path, and how the messages of each sensor but the odometer become samples.
+
+A message is read as bytes (``cdr.Layout``) or as an object (``MessageView``). A path is dotted,
+with [i] or [name] for an element of a list: ``pose.covariance[0]``, ``position[left_wheel]``.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +25,7 @@ from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config, OdometerConfig
 from odocal_ros.settings.levels import RAD_PER_DEG
 
-PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
+PATH_PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
 
 class View(Protocol):
@@ -87,7 +92,7 @@ class MessageView:
 @lru_cache
 def parts(path: str) -> tuple[tuple[str, str], ...]:
     """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
-    found = tuple(PART.findall(path))
+    found = tuple(PATH_PART.findall(path))
     rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
     return found if rebuilt.lstrip('.') == path else ()
 
@@ -95,9 +100,9 @@ def parts(path: str) -> tuple[tuple[str, str], ...]:
 @dataclass(frozen=True)
 class Column:
     """
-    Values to read from every message.
+    Values to read from every message: one column of samples, or several.
 
-    ``pick`` returns their paths in a message, None if they are missing.
+    width : number of values.   pick : returns their paths in a message, None if they are missing.
     """
 
     dtype: type
@@ -105,6 +110,7 @@ class Column:
     pick: Callable[[View], Sequence[str] | None]
 
     def of_message(self, view: MessageView) -> list[Any] | None:
+        """Return the values of an object; None if they are missing."""
         values = [view.value(path) for path in self.pick(view) or ()]
         if self.dtype is np.int64:
             values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
@@ -142,7 +148,8 @@ GEODETIC = (FIX, *GPS_FIXES)
 WAAS_FIX = 33
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
-Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
+# function of stamps, arrivals and the columns of a sensor
+Build = Callable[..., samples.Samples]
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
 NOT_SENT_BITS = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
@@ -159,7 +166,7 @@ LOCAL_TYPES: dict[str, Sequence[Column]] = {
 
 
 class SensorPlan:
-    """Fields to read from a stamped sensor message, and the function that makes samples."""
+    """Fields to read from a stamped sensor message, and the function that builds samples."""
 
     form: samples.OdometerForm | None = None
     is_known_type = True     # the layout is sufficient, no message is needed
@@ -183,30 +190,31 @@ class SensorPlan:
     def readings(self, received_ns: Sequence[int], values: list[Any]) -> list[Any]:
         """Return the rows of the IMU in plain numbers, without orientation, from its columns."""
         return [(self.slot, [
-            (sec * 10**9 + nanosec, received, w_i, f_i if of_force != -1 else samples.NO_FORCE)
-            for received, ((sec,), (nanosec,), *_, w_i, f_i, (of_force,)) in zip(
+            (sec * 10**9 + nanosec, received, w_i,
+             f_i if force_variance != -1 else samples.NO_FORCE)
+            for received, ((sec,), (nanosec,), *_, w_i, f_i, (force_variance,)) in zip(
                 received_ns, values, strict=True)])]
 
 
-def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
-         f_i: Floats, of_force: Floats) -> samples.ImuSamples:
-    has_no_force = of_force.view(np.int64)[:, 0] == NOT_SENT_BITS
+def _imu(stamps: Ints, received: Ints, q_ni: Floats, roll_variance: Floats, yaw_variance: Floats,
+         w_i: Floats, f_i: Floats, force_variance: Floats) -> samples.ImuSamples:
+    has_no_force = force_variance.view(np.int64)[:, 0] == NOT_SENT_BITS
     if has_no_force.any():
         f_i[has_no_force] = np.nan
     return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
-                              _yaw_variance(q_ni, of_roll, of_yaw))
+                              _yaw_variance(q_ni, roll_variance, yaw_variance))
 
 
-def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats
-             ) -> samples.HeadingSamples:
-    return samples.HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, of_roll, of_yaw))
+def _heading(stamps: Ints, received: Ints, q_ni: Floats,
+             *variances: Floats) -> samples.HeadingSamples:
+    return samples.HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, *variances))
 
 
-def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
-    """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
-    is_sent = of_roll.view(np.int64)[:, 0] != NOT_SENT_BITS
+def _yaw_variance(q_ni: Floats, roll_variance: Floats, yaw_variance: Floats) -> Floats:
+    """Return the yaw variance; NaN without orientation (REP-145: -1, or a quaternion of zeros)."""
+    is_sent = roll_variance.view(np.int64)[:, 0] != NOT_SENT_BITS
     has_orientation = reduce_columns(np.logical_or, q_ni != 0) & is_sent
-    return np.where(has_orientation, of_yaw[:, 0], np.nan)
+    return np.where(has_orientation, yaw_variance[:, 0], np.nan)
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
@@ -228,11 +236,11 @@ def _gps_fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
 def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
               *covariance: Floats) -> samples.VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    known = (variance > 0) & (variance < 1e12)       # else unknown
+    known = (variance > 0) & (variance < 1e12)       # drivers send 0 or huge values for unknown
     return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
-# format: of both
+# format: of NavSatFix and GPSFix
 _GEODETIC = (fixed_column(np.float64, 'latitude', 'longitude', 'altitude'),
              array_column('position_covariance', *range(9)),
              fixed_column(np.int64, 'position_covariance_type'),

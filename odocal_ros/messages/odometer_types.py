@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer messages: field of the value in each type, and its meaning."""
+"""
+Odometer messages: which field has the value, and whether it is a count, an angle or a speed.
+
+Any message type with a number can be an odometer. Settings, type and first message determine
+field, wheels and meaning.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -31,7 +36,7 @@ DEFAULT_FIELD = {
     'autoware_vehicle_msgs/msg/VelocityReport': 'longitudinal_velocity',
     'std_msgs/msg/Int32MultiArray': 'data',
     'std_msgs/msg/Int64MultiArray': 'data',
-} | {f'std_msgs/msg/{name}': 'data' for name in cdr.NUMBERS}
+} | {f'std_msgs/msg/{name}': 'data' for name in cdr.NUMBER_TYPES}
 TYPES = tuple(DEFAULT_FIELD)
 
 
@@ -117,6 +122,7 @@ class OdometerPlan:
         return False
 
     def _select_wheels(self, field: str, view: View) -> None:
+        """Select the wheels among the values of a list, by their names."""
         found = select_wheels(view.names, view.count(field))
         if isinstance(found, str):
             self.unclear_reason = found
@@ -162,6 +168,7 @@ class OdometerPlan:
         return _value_types(self.msgtype)[_split_key(field)[0]].split('[')[0]
 
     def _odometer_form(self, field: str, kind: str = '') -> OdometerForm:
+        """Return the meaning of a field; ``kind``: type of its values in unknown messages."""
         bits = 0
         if self.is_known_type:
             kind = self._kind(field)
@@ -177,6 +184,7 @@ class OdometerPlan:
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
+        """Return the path of a wheel's value: of a key in the field, or the key as path."""
         if not key:
             return field
         return f'{_split_key(field)[0]}[{key}]' if field else key
@@ -192,11 +200,12 @@ class OdometerPlan:
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)
             names = view.names
-            at = names.index(key) if key in names else int(key) if key.isdigit() else n
-            return (f'{base}[{at}]',) if at < n else None
+            index = names.index(key) if key in names else int(key) if key.isdigit() else n
+            return (f'{base}[{index}]',) if index < n else None
         return pick
 
     def missing(self, view: View) -> str:
+        """Return the reason why a message has no value, as text."""
         if self.unclear_reason and not self.columns:
             return self.unclear_reason
         required = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
@@ -242,6 +251,7 @@ def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
 
 
 def _value_types(msgtype: str) -> dict[str, str]:
+    """Return path -> type of the numbers of a known message type."""
     lines = (line.split() for line in cdr.SCHEMAS[msgtype])
     return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
 

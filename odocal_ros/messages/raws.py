@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialised messages in one buffer: tables of messages of one layout, selection by frame_id."""
+"""
+Serialised messages in one buffer, grouped into tables of equal layout, and selected by frame_id.
+
+A table, (n, size) bytes, has one message in each row, so that numpy reads a field of all at once.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 import struct
@@ -17,11 +21,11 @@ from odocal_ros.messages import cdr
 Bytes = bytes | bytearray | memoryview
 Rows = Ints | Bools | slice
 Table = NDArray[np.uint8]
-# judgement: per call; further layouts are read message by message
+# judgement: layouts per message length; messages of further ones are read one by one
 MAX_LAYOUTS = 16
 FEW_ROWS = 8      # judgement: messages up to which single reads take less time than a table
-FRAME_MESSAGES = 3     # judgement: messages that determine the frame, more than a damaged one
-TEXT_AT = cdr.FRAME_AT - 4      # format: offset of the length of the text
+FRAME_MESSAGES = 3     # judgement: messages that determine the frame; one may be damaged
+TEXT_OFFSET = cdr.FRAME_OFFSET - 4      # format: offset of the length of the frame_id
 
 
 class RawMessages(Sequence[bytes]):
@@ -68,11 +72,12 @@ class RawMessages(Sequence[bytes]):
         return views[start].view(np.uint8).reshape(-1, size)
 
     def packed(self) -> 'RawMessages':
-        data, start, at = [], np.empty(len(self), np.int64), 0
+        """Return a copy whose buffer has only these messages, grouped by length."""
+        data, start, offset = [], np.empty(len(self), np.int64), 0
         for rows in self.by_size():
             data.append(self.table(rows).tobytes())
-            start[rows] = at + np.arange(len(rows)) * int(self.size[rows[0]])
-            at += len(data[-1])
+            start[rows] = offset + np.arange(len(rows)) * int(self.size[rows[0]])
+            offset += len(data[-1])
         return RawMessages(b''.join(data), start, self.size)
 
     def by_size(self) -> list[Ints]:
@@ -129,9 +134,10 @@ def _same_layout(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
 
 class FrameFilter:
     """
-    Keeps messages of one frame_id: the configured one, else the first in SETTLED messages.
+    Keeps messages of one IMU on a topic that carries several.
 
-    Until then all messages are kept, so that block sizes have no effect.
+    The frame_id is the configured one, else the first one that FRAME_MESSAGES messages have. Until
+    it is determined all messages are kept, so that block sizes have no effect.
     """
 
     def __init__(self, msgtype: str, configured_frame: str) -> None:
@@ -173,9 +179,10 @@ class FrameFilter:
         return self._is_determined and self._has_frame(raw)
 
     def _has_frame(self, raw: bytes) -> bool:
-        return raw[:2] + raw[TEXT_AT:TEXT_AT + len(self._prefix) - 2] == self._prefix
+        return raw[:2] + raw[TEXT_OFFSET:TEXT_OFFSET + len(self._prefix) - 2] == self._prefix
 
     def _count_frame(self, frame: str | None) -> None:
+        """Count the frame of a message; determine the one to use once it has enough."""
         if frame is None:
             return
         self._frame_counts[frame] = self._frame_counts.get(frame, 0) + 1
@@ -194,13 +201,14 @@ class FrameFilter:
             return np.array([self._has_frame(raw) for raw in raws], bool)
         pattern = self._prefix
         packed = RawMessages.of(raws)
-        at = np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)])
-        matches: Bools = packed.size > at[-1]
+        offsets = np.concatenate([[0, 1], TEXT_OFFSET + np.arange(len(pattern) - 2)])
+        matches: Bools = packed.size > offsets[-1]
         data, expected = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
-        matches[matches] = (data[packed.start[matches][:, None] + at] == expected).all(axis=1)
+        matches[matches] = (data[packed.start[matches][:, None] + offsets] == expected).all(axis=1)
         return matches
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
+        """Return the frame_id of a message, None if it is damaged."""
         try:
             frame = cdr.frame_of(self._msgtype, raw)
             return str(deserialize(raw).header.frame_id) if frame is None else frame

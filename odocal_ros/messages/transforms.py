@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""TF as a position reference: the transform between two frames, from /tf and /tf_static."""
+"""
+TF as a position reference: positions of a robot from the transforms on /tf and /tf_static.
+
+The transform from ``reference.frames[0]`` to ``[1]`` may consist of several, which different nodes
+send at different times; ``nav/frame_chain.py`` interpolates and multiplies them.
+"""
 
 from collections.abc import Callable, Container, Mapping, Sequence
 import struct
@@ -17,7 +22,7 @@ from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config
 
 STATIC = '_static'      # suffix of the topic of static transforms
-MOST_NAMES, MOST_LETTERS = 12, 40     # judgement: frames in a sentence, and letters of a frame
+MOST_NAMES, MOST_LETTERS = 12, 40     # judgement: in a text: frames, and characters of each
 Transform = tuple[str, str, int, tuple[float, ...]]     # child, parent, stamp ns, values
 
 

@@ -28,10 +28,11 @@ import uuid
 
 from odocal_ros.errors import BadUsage
 
-MOST_SAME_NAME = 1000             # judgement: folders of one name
+MOST_SAME_NAME = 1000         # judgement: folders of one name
 PART = '.part'                # suffix of files being written; no result or bag has it
+# errors after which files are written into the folder one by one
 RENAME_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
-ASIDE = '.old'
+ASIDE = '.old'                # suffix of the earlier folder while two folders are swapped
 LEFTOVER = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?')
 
 
@@ -47,7 +48,7 @@ disk = Disk()
 
 
 class WholeFile:
-    """A file being written; each write can fail, and no library closes it."""
+    """A file being written, as libraries expect it; only ``whole_file`` closes it."""
 
     closed = False
 
@@ -162,7 +163,7 @@ class ResultFolder:
     def __init__(self, place: Path, main: str, result_names: frozenset[str]) -> None:
         self.place = Path(os.path.realpath(place))
         self._main, self._result_names = main, result_names
-        self._main_file: tuple[Any, ...] = ()       # identity of the written main file
+        self._main_file: tuple[Any, ...] = ()       # inode and time of the written main file
 
     @property
     def written(self) -> bool:
@@ -231,7 +232,7 @@ class ResultFolder:
                            'or --force to replace it')
 
     def _is_replaceable(self) -> bool:
-        """Return True if the folder is private and unused by this process."""
+        """Return True if all its files are of a result, and it is not the working folder."""
         if not self.place.is_dir():
             return True
         return self.place != Path.cwd() and all(
@@ -261,8 +262,8 @@ class ResultFolder:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    about = path.stat()
-    return about.st_ino, about.st_mtime_ns
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def _swap(one: Path, other: Path) -> None:

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits of reading untrusted files, and how a user raises them."""
+"""
+Limits of reading untrusted files, so that a small file cannot fill memory or disk.
+
+Each limit is multiplied by the number in the environment variable ODOCAL_LIMITS, if it is set.
+"""
 
 from functools import cache
 import os
@@ -12,39 +16,40 @@ from typing import Any
 
 from odocal_ros.errors import BadBag
 
-RAISE = 'ODOCAL_LIMITS'      # environment variable: factor of all limits
-DEFINITION = 2**16           # judgement: characters of a message definition
-MESSAGE = 2**26              # judgement: bytes of one requested message
-ELEMENTS = 100_000           # judgement: values in the fixed arrays of one message
-SECONDS = 20                 # judgement: to understand a definition
-# judgement: bytes first given to a decompressor: after each frame, possibly one in 9 bytes, the
-# rest of them is copied
-LEAST_PIECE = 2**10
+FACTOR_VARIABLE = 'ODOCAL_LIMITS'
+DEFINITION_CHARACTERS = 2**16     # judgement: of a message definition
+MESSAGE_BYTES = 2**26             # judgement: of one requested message
+MESSAGE_VALUES = 100_000          # judgement: in the fixed arrays of one message
+PARSE_SECONDS = 20                # judgement: to parse a message definition
+# judgement: bytes first given to a decompressor. It copies the rest of them after each frame, and
+# a frame may have 9 bytes
+FIRST_PIECE = 2**10
 LATEST_NS = 2**62            # judgement: the year 2116: a later time is invalid
 
 
 class LimitReached(BadBag):
-    """A file needs more than its size can explain."""
+    """A file exceeds a limit, such as the decompressed bytes for its size."""
 
 
 class Damaged(Exception):
     """A part of a file is damaged; the text goes into the notes."""
 
 
-def factor() -> float:
+def limit_factor() -> float:
     """Return the user's factor of all limits, 1 by default."""
     try:
-        return max(float(os.environ.get(RAISE, '')), 1.0)
+        return max(float(os.environ.get(FACTOR_VARIABLE, '')), 1.0)
     except ValueError:
         return 1.0
 
 
 def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
-    """Raise LimitReached if an amount is above a limit; ``what`` names the file."""
-    limit *= factor()
+    """Raise LimitReached if an amount exceeds a limit; ``what`` begins the text with the file."""
+    limit *= limit_factor()
     if amount > limit:
         raise LimitReached(f'{what} exceeds the limit of {limit:.0f} {unit}; if the file is '
-                           f'valid, set {RAISE}=10 in the environment for ten times the limit')
+                           f'valid, set {FACTOR_VARIABLE}=10 in the environment for ten times '
+                           'the limit')
 
 
 class Allowance:
@@ -79,7 +84,7 @@ class Allowance:
     @property
     def left(self) -> int:
         """Return the number of bytes that are still allowed."""
-        return int(self.most * factor()) - self._used
+        return int(self.most * limit_factor()) - self._used
 
     def unpack(self, packing: str, data: bytes | bytearray | memoryview, size: int | None = None
                ) -> bytes | bytearray | memoryview:
@@ -98,7 +103,7 @@ class Allowance:
         while at < len(packed) and have <= most:
             frames += 1
             self.check_frames(frames, at)
-            stream, piece = opener(packing)(), LEAST_PIECE
+            stream, piece = opener(packing)(), FIRST_PIECE
             while at < len(packed) and have <= most and not stream.eof:
                 parts.append(stream.decompress(packed[at:at + piece], most + 1 - have))
                 have += len(parts[-1])
@@ -155,6 +160,6 @@ def read_text(path: Path) -> str:
 def read_bytes(path: Path, size: int) -> bytes:
     """Return a file of at most ``size`` bytes, or raise LimitReached: a device has no end."""
     with path.open('rb') as file:
-        data = file.read(int(size * factor()) + 1)
+        data = file.read(int(size * limit_factor()) + 1)
     check(len(data), size, f'{path}: the text')
     return data

@@ -20,7 +20,7 @@ from typing import Any
 from odocal_ros.errors import BadConfig
 from odocal_ros.safe_io.limits import check
 
-# never raw in a line: control characters, half surrogate pairs, changes of the writing direction
+# escaped in every line: control characters, half surrogate pairs, changes of writing direction
 UNSEEN = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\u2060-\u206f'
                     '\ufeff\ufff9-\ufffb\ud800-\udfff]')
 # our own colours on a terminal: of these words only, not of input text
@@ -142,8 +142,8 @@ def safe_loader(aliases: bool = False) -> Any:
     """Return a safe loader that refuses deep nesting, and ``*links`` unless ``aliases``."""
     import yaml
 
-    class Plain(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here
-        """Composes nodes within limits."""
+    class LimitedLoader(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here
+        """Limits nesting and number of the nodes."""
 
         depth = nodes = 0
 
@@ -170,7 +170,7 @@ def safe_loader(aliases: bool = False) -> Any:
 
         def flatten_mapping(self, node: Any) -> None:
             """Ignore merges (<<): a few nested ones make millions of keys."""
-    return Plain
+    return LimitedLoader
 
 
 def compose_yaml(text: str, where: str) -> Any:

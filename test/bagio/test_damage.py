@@ -112,7 +112,7 @@ def test_files_that_metadata_list_are_shorter_missing_or_ruined(tmp_path, plain)
         read(path)[1])
     (path / 'b_1.mcap').write_bytes(b'')
     found, notes = read(path)
-    assert 'b_1.mcap: is an empty file' in truncated(notes)
+    assert 'b_1.mcap: an empty file' in truncated(notes)
     assert len(found['imu', 'stamp_ns']) == 400
 
 

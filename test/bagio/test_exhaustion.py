@@ -19,7 +19,7 @@ from odocal_ros.bagio import rosbags_readers
 from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
-from odocal_ros.safe_io.limits import RAISE, zstd_module
+from odocal_ros.safe_io.limits import FACTOR_VARIABLE, zstd_module
 
 MEMORY_LIMIT = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
 
@@ -98,7 +98,7 @@ def test_a_stream_that_unpacks_to_2_gib(tmp_path, bomb, kind):
     peak, error_text = peak_memory_and_error(path)
     assert peak < MEMORY_LIMIT
     assert 'unpacked, it exceeds the limit of' in error_text
-    assert f'set {RAISE}=10' in error_text
+    assert f'set {FACTOR_VARIABLE}=10' in error_text
 
 
 def test_the_limit_can_be_raised(tmp_path, monkeypatch):
@@ -106,7 +106,7 @@ def test_the_limit_can_be_raised(tmp_path, monkeypatch):
     packed = zeros(100)
     mcap(path, packed, 100 * 2**20)
     assert peak_memory_and_error(path)[1]
-    monkeypatch.setenv(RAISE, '10')
+    monkeypatch.setenv(FACTOR_VARIABLE, '10')
     assert 'exceeds the limit of' not in peak_memory_and_error(path)[1]
 
 
@@ -166,7 +166,7 @@ DEFINITIONS = {
 
 @pytest.mark.parametrize('kind', DEFINITIONS)
 def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr('odocal_ros.bagio.rosbags_readers.SECONDS', 3)
+    monkeypatch.setattr('odocal_ros.safe_io.limits.PARSE_SECONDS', 3)
     peak, error_text = peak_memory_and_error(database(
         tmp_path, ("UPDATE topics SET type = 'a/msg/B'",),
         ("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
