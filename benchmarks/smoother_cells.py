@@ -96,8 +96,8 @@ def true_levels(problem, drive):
     values = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2, 'fix': 1.0,
               'fix_up': 1.0, 'gyro_walk': grade.gyro_bias_walk**2,
               'accel_walk': grade.accel_bias_walk**2}
-    least = {name: max(value, problem.least[name]) for name, value in road.items()}
-    return problem.first_levels.replaced(correlation_time=0.0, **values, **least)
+    least = {name: max(value, problem.min_levels[name]) for name, value in road.items()}
+    return problem.initial_levels.replaced(correlation_time=0.0, **values, **least)
 
 
 def bounds(drive, config, leg, result):

@@ -107,7 +107,7 @@ def _starts(simulated, seed, grade, noise, worst):
     problem = make_problem(moving, config)
     noise_found = dict(late.details['noise'])
     tau = noise_found.pop('correlation_time')
-    levels = problem.first_levels.replaced(correlation_time=tau,
+    levels = problem.initial_levels.replaced(correlation_time=tau,
                                            **{k: v**2 for k, v in noise_found.items()})
     best = fit(problem, state, levels)
     change = [(math.log(late.estimates[NAMES[0]].value) - best.state.constants[0]),

@@ -62,8 +62,8 @@ class Slips(NamedTuple):
 def count_size(travel: Travel) -> float:
     """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
     coarse = travel.coarse
-    # coarse.most is the largest error of speeds at the ends of a window and within it
-    return travel.quantum if coarse is None else coarse.most * SPIN_WINDOW / PIN_COUNTS
+    # coarse.max_error is the largest error of speeds at the ends of a window and within it
+    return travel.quantum if coarse is None else coarse.max_error * SPIN_WINDOW / PIN_COUNTS
 
 
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Least squares on a chain with a border, and its Schur complement: docs/method.md (S22) to (S24).
+Solver of the normal equations of a fit: docs/method.md (S22) to (S24).
 
-The normal matrix is block tridiagonal with a border of constants (an arrowhead). Blocks are
-eliminated in order by Cholesky; back substitution gives the step and the joint covariance of each
-pair of adjacent blocks and the border. Unknowns are scaled to a unit diagonal first: their sizes
-differ by 1e20.
+The unknowns are a chain of N blocks (keyframes) of n, and m constants that all blocks share. The
+normal matrix is block tridiagonal, bordered by the constants (an arrowhead). ``solve`` eliminates
+the blocks in order by Cholesky. Back substitution gives the step, and the joint covariance of
+each pair of adjacent blocks with the constants. Unknowns are scaled to a unit diagonal first:
+their sizes differ by 1e20.
 
 An hour has thousands of blocks. The equations, their elimination and the covariances use the same
 memory in turn, which is in mapped files for long legs.
@@ -23,7 +24,7 @@ from odocal_ros.errors import OdocalError
 
 
 class NotPositive(OdocalError):
-    """The normal matrix is not positive definite; block : its first such block, -1: border."""
+    """The normal matrix is not positive definite; block : first such block, -1: constants."""
 
     def __init__(self, text: str, block: int = -1) -> None:
         super().__init__(text)
@@ -32,112 +33,115 @@ class NotPositive(OdocalError):
 
 class Normal:
     """
-    Normal equations H x = g of N blocks of n unknowns and a border of m, initially zero.
+    Normal equations H x = g of N blocks of n unknowns and of m constants, initially zero.
 
-    diagonal : (N, n, n).   beside : (N - 1, n, n), row k, column k + 1.   border : (N, n, m).
-    corner : (m, m).   g, g_border : (N, n), (m,).   absent : prior weights of constants that no
-    row depends on; they appear only in the results.
+    diagonal : (N, n, n) H_k.   upper : (N - 1, n, n) H_k,k+1.   coupling : (N, n, m) of blocks and
+    constants.   corner : (m, m) of the constants.   g, g_constants : (N, n), (m,).   absent :
+    prior weights of further constants, on which no row depends; they appear only in the results.
     """
 
     def __init__(self, N: int, n: int, m: int) -> None:
         self.diagonal = work_array(N, n, n)
-        self.wide = work_array(N, n, n + m + 1)           # right-hand sides of the elimination
-        self.beside = self.wide[:-1, :, :n]
-        self.border = self.wide[:, :, n:n + m]
-        self.g = self.wide[:, :, n + m]
-        self.corner, self.g_border = np.zeros((m, m)), np.zeros(m)
+        # what the elimination multiplies by H_k^-1, side by side
+        self.right_sides = work_array(N, n, n + m + 1)
+        self.upper = self.right_sides[:-1, :, :n]
+        self.coupling = self.right_sides[:, :, n:n + m]
+        self.g = self.right_sides[:, :, n + m]
+        self.corner, self.g_constants = np.zeros((m, m)), np.zeros(m)
         self.absent = np.zeros(0)
 
 
 @dataclass(eq=False)
 class Solved:
-    """The step, and the factorisation from which the covariances are computed."""
+    """The solution, and the elimination from which the covariances are computed."""
 
-    step: Floats              # (N, n)
-    step_border: Floats       # (m,), here and below with the absent constants
-    covariance: Floats        # (m, m) of the border
+    step: Floats              # (N, n) of the blocks
+    step_constants: Floats    # (m,), here and in the next four with the absent constants
+    covariance: Floats        # (m, m) of the constants
     log_determinant: float    # of H
-    reduced: Floats           # (m, m) Schur complement of the border
-    g_reduced: Floats         # (m,)
-    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n); None after marginals
+    reduced: Floats           # (m, m) Schur complement of the constants, (S24)
+    g_reduced: Floats         # (m,) its right-hand side
+    # (N, n, n + m + 1) H_k^-1 times the right sides, (N, n, n) H_k^-1 of the eliminated chain;
+    # None after ``marginals``, which reuses their memory
+    _elimination: tuple[Floats, Floats] | None
     _scale: Floats            # (N, n)
-    _scale_border: Floats     # (m,) of those that are not absent
-    taken: float = 1.0        # share of the full step
+    _scale_constants: Floats  # (m,) of those that are not absent
+    step_fraction: float = 1.0    # of the full Gauss-Newton step that ``step`` is
 
     def marginals(self) -> 'JointMarginals':
         """Return the joint marginals of adjacent blocks; callable once: it reuses the memory."""
-        assert self._chain is not None, 'marginals() was already called'
-        (wide, own), self._chain = self._chain, None
+        assert self._elimination is not None, 'marginals() was already called'
+        (gains, diagonal), self._elimination = self._elimination, None
         N, n = self.step.shape
-        m = len(self._scale_border)
-        z = np.empty((n + m, n + m))          # of block k + 1 and the border, scaled
-        corner = self.covariance[:m, :m] / np.multiply.outer(self._scale_border,
-                                                             self._scale_border)
-        H = wide[N - 1][:, n:n + m]
-        z[n:, n:] = corner
-        z[:n, n:] = -H @ corner
-        z[n:, :n] = z[:n, n:].T
-        z[:n, :n] = own[N - 1] - z[:n, n:] @ H.T
-        own[N - 1], wide[N - 1, :, n:n + m] = z[:n, :n], z[:n, n:]
+        m = len(self._scale_constants)
+        after = np.empty((n + m, n + m))      # covariance of block k + 1 and the constants, scaled
+        corner = self.covariance[:m, :m] / np.multiply.outer(self._scale_constants,
+                                                             self._scale_constants)
+        G = gains[N - 1][:, n:n + m]
+        after[n:, n:] = corner
+        after[:n, n:] = -G @ corner
+        after[n:, :n] = after[:n, n:].T
+        after[:n, :n] = diagonal[N - 1] - after[:n, n:] @ G.T
+        diagonal[N - 1], gains[N - 1, :, n:n + m] = after[:n, :n], after[:n, n:]
         for k in iterate_releasing(range(N - 2, -1, -1)):
-            G = wide[k][:, :n + m]
-            across = -G @ z
-            own[k] -= across @ G.T
-            G[:] = across
-            z[:n, :n] = own[k]
-            z[:n, n:] = across[:, n:]
-            z[n:, :n] = across[:, n:].T
-        return self._unscaled(own, wide[:, :, :n + m])
+            G = gains[k][:, :n + m]
+            cross = -G @ after
+            diagonal[k] -= cross @ G.T
+            G[:] = cross
+            after[:n, :n] = diagonal[k]
+            after[:n, n:] = cross[:, n:]
+            after[n:, :n] = cross[:, n:].T
+        return self._unscaled(diagonal, gains[:, :, :n + m])
 
-    def _unscaled(self, own: Floats, across: Floats) -> 'JointMarginals':
-        """Return covariances in the units of the unknowns, computed in place."""
-        n, s, s_c = own.shape[1], self._scale, self._scale_border
-        for rows in blocks(len(own)):
-            own[rows] *= s[rows, :, None] * s[rows, None, :]
-            across[rows] *= s[rows, :, None]
-            across[rows, :, n:] *= s_c
-        for rows in blocks(len(own) - 1):
-            across[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
-        return JointMarginals(own, across, self.covariance[:len(s_c), :len(s_c)])
+    def _unscaled(self, diagonal: Floats, cross: Floats) -> 'JointMarginals':
+        """Return the joint marginals in the units of the unknowns, computed in place."""
+        n, s, s_c = diagonal.shape[1], self._scale, self._scale_constants
+        for rows in blocks(len(diagonal)):
+            diagonal[rows] *= s[rows, :, None] * s[rows, None, :]
+            cross[rows] *= s[rows, :, None]
+            cross[rows, :, n:] *= s_c
+        for rows in blocks(len(diagonal) - 1):
+            cross[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
+        return JointMarginals(diagonal, cross, self.covariance[:len(s_c), :len(s_c)])
 
-    def products(self, chain: Floats, border: Floats) -> tuple[Floats, Floats]:
+    def products(self, g: Floats, g_constants: Floats) -> tuple[Floats, Floats]:
         """
-        Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
+        Return G' H^-1 G of r right-hand sides G, (r, r), and of H^-1 G the constants, (m, r).
 
-        chain : (N, n, r), border : (m, r).   Call it before ``marginals``.
+        g : (N, n, r) of the blocks.   g_constants : (m, r).   Call it before ``marginals``.
         """
-        assert self._chain is not None, 'call products() before marginals()'
-        wide, own = self._chain
+        assert self._elimination is not None, 'call products() before marginals()'
+        gains, inverse = self._elimination
         N, n = self.step.shape
-        m = len(self._scale_border)
-        square = np.zeros((chain.shape[2],) * 2)
-        rest = border * self._scale_border[:, None]
-        y = np.zeros((n, chain.shape[2]))
+        m = len(self._scale_constants)
+        square = np.zeros((g.shape[2],) * 2)
+        rest = g_constants * self._scale_constants[:, None]
+        y = np.zeros((n, g.shape[2]))
         for k in iterate_releasing(range(N)):
-            y = chain[k] * self._scale[k][:, None] - y
-            square += y.T @ own[k] @ y
-            eliminated = wide[k][:, :n + m].T @ y
+            y = g[k] * self._scale[k][:, None] - y
+            square += y.T @ inverse[k] @ y
+            eliminated = gains[k][:, :n + m].T @ y
             rest -= eliminated[n:]
             y = eliminated[:n]
-        rest /= self._scale_border[:, None]
-        moved = self.covariance[:, :m] @ rest
-        return square + rest.T @ moved[:m], moved
+        rest /= self._scale_constants[:, None]
+        solution = self.covariance[:, :m] @ rest
+        return square + rest.T @ solution[:m], solution
 
 
 @dataclass(frozen=True, eq=False)
 class JointMarginals:
     """
-    Joint marginals: the covariance of block k, block k + 1 and the border, for N - 1 intervals.
+    Joint marginals: the covariance of block k, block k + 1 and the constants, for N - 1 intervals.
 
     The full array would be (N - 1, 2n + m, 2n + m); a few intervals are computed at a time.
     """
 
-    _own: Floats              # (N, n, n) covariance of each block
-    _across: Floats           # (N, n, n + m) with the next block and the border
-    _corner: Floats           # (m, m)
+    _diagonal: Floats         # (N, n, n) of each block
+    _cross: Floats            # (N, n, n + m) of each block with the next one and the constants
+    _corner: Floats           # (m, m) of the constants
 
     def __len__(self) -> int:
-        return len(self._own) - 1
+        return len(self._diagonal) - 1
 
     def __getitem__(self, k: int) -> Floats:
         """Return the covariance of one interval: (2n + m, 2n + m)."""
@@ -145,13 +149,13 @@ class JointMarginals:
         return out
 
     def covariances(self, rows: Ints) -> Floats:
-        """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
-        n, size = self._own.shape[1], self._across.shape[2] + self._own.shape[1]
+        """Return the covariances of the intervals k of an index array: (r, 2n + m, 2n + m)."""
+        n, size = self._diagonal.shape[1], self._cross.shape[2] + self._diagonal.shape[1]
         out = np.empty((len(rows), size, size))
-        across, after = self._across[rows], self._across[rows + 1][:, :, n:]
-        out[:, :n, :n], out[:, :n, n:] = self._own[rows], across
-        out[:, n:, :n] = np.swapaxes(across, 1, 2)
-        out[:, n:2 * n, n:2 * n], out[:, n:2 * n, 2 * n:] = self._own[rows + 1], after
+        cross, after = self._cross[rows], self._cross[rows + 1][:, :, n:]
+        out[:, :n, :n], out[:, :n, n:] = self._diagonal[rows], cross
+        out[:, n:, :n] = np.swapaxes(cross, 1, 2)
+        out[:, n:2 * n, n:2 * n], out[:, n:2 * n, 2 * n:] = self._diagonal[rows + 1], after
         out[:, 2 * n:, n:2 * n] = np.swapaxes(after, 1, 2)
         out[:, 2 * n:, 2 * n:] = self._corner
         return out
@@ -159,47 +163,48 @@ class JointMarginals:
     def variances(self) -> Floats:
         """Return the variance of each unknown of each block: (N, n)."""
         # copies: views would be read again after their memory is released
-        own = [np.einsum('kii->ki', self._own[rows]).copy() for rows in blocks(len(self._own))]
-        return np.concatenate(own)
+        return np.concatenate([np.einsum('kii->ki', self._diagonal[rows]).copy()
+                               for rows in blocks(len(self._diagonal))])
 
-    def with_next(self) -> Floats:
+    def next_covariances(self) -> Floats:
         """Return the covariance of each unknown with itself in the next block: (N - 1, n)."""
-        n = self._own.shape[1]
-        return np.concatenate([np.einsum('kii->ki', self._across[rows, :, :n]).copy()
+        n = self._diagonal.shape[1]
+        return np.concatenate([np.einsum('kii->ki', self._cross[rows, :, :n]).copy()
                                for rows in blocks(len(self))])
 
-    def variances_of(self, rows: Ints, own: Floats, border: Floats, ahead: Floats | None,
-                     ahead_columns: slice) -> Floats:
+    def variances_of(self, rows: Ints, J: Floats, J_constants: Floats, J_next: Floats | None,
+                     next_columns: slice) -> Floats:
         """
-        Return the variances of sums over the unknowns of some intervals: (k, c).
+        Return the variances of linear functions of the unknowns of some intervals: (k, c).
 
-        own, border : (k, n, c), (k, m, c) factors of block and border.   ahead : (k, a, c) of the
-        unknowns ``ahead_columns`` of the next block, or None.
+        J, J_constants : (k, n, c), (k, m, c) derivatives by block and constants.   J_next :
+        (k, a, c) by the unknowns ``next_columns`` of the next block, or None.
         """
-        n, across = own.shape[1], self._across[rows]
-        by_own = self._own[rows] @ own + 2 * (across[:, :, n:] @ border)
-        by_border = self._corner @ border
-        if ahead is not None:
-            by_own += 2 * (across[:, :, :n][:, :, ahead_columns] @ ahead)
-            by_ahead = self._own[rows + 1][:, ahead_columns, ahead_columns] @ ahead
-            by_ahead += 2 * (self._across[rows + 1][:, ahead_columns, n:] @ border)
-        out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
-        return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
+        n, cross = J.shape[1], self._cross[rows]
+        by_block = self._diagonal[rows] @ J + 2 * (cross[:, :, n:] @ J_constants)
+        by_constants = self._corner @ J_constants
+        if J_next is not None:
+            by_block += 2 * (cross[:, :, :n][:, :, next_columns] @ J_next)
+            by_next = self._diagonal[rows + 1][:, next_columns, next_columns] @ J_next
+            by_next += 2 * (self._cross[rows + 1][:, next_columns, n:] @ J_constants)
+        out: Floats = (J * by_block).sum(axis=1) + (J_constants * by_constants).sum(axis=1)
+        return out if J_next is None else out + (J_next * by_next).sum(axis=1)
 
     def covariance_form(self, rows: slice, J: Floats) -> Floats:
         """
-        Return a matrix with the quadratic form of the covariance of rows: (k, r, r).
+        Return matrices A of some intervals, (k, r, r): a' A a is the variance of a' J x.
 
-        J : (k, r, 2n + m).   The matrix A is not symmetric: a' A a is the variance of a' times the
-        rows.
+        x : the unknowns of an interval.   J : (k, r, 2n + m).   A is not symmetric, which saves
+        half of the products.
         """
-        n, ends = self._own.shape[1], slice(rows.start + 1, rows.stop + 1)
-        across, after = self._across[rows], self._across[ends][:, :, n:]
-        own, end, border = J[:, :, :n], J[:, :, n:2 * n], J[:, :, 2 * n:]
-        by_own = own @ self._own[rows] + 2 * (end @ np.swapaxes(across[:, :, :n], 1, 2))
-        by_border = border @ self._corner + 2 * (own @ across[:, :, n:] + end @ after)
-        out: Floats = by_own @ np.swapaxes(own, 1, 2) + by_border @ np.swapaxes(border, 1, 2)
-        out += end @ self._own[ends] @ np.swapaxes(end, 1, 2)
+        n, ends = self._diagonal.shape[1], slice(rows.start + 1, rows.stop + 1)
+        cross, after = self._cross[rows], self._cross[ends][:, :, n:]
+        begin, end, constants = J[:, :, :n], J[:, :, n:2 * n], J[:, :, 2 * n:]
+        by_begin = begin @ self._diagonal[rows] + 2 * (end @ np.swapaxes(cross[:, :, :n], 1, 2))
+        by_constants = constants @ self._corner + 2 * (begin @ cross[:, :, n:] + end @ after)
+        out: Floats = by_begin @ np.swapaxes(begin, 1, 2)
+        out += by_constants @ np.swapaxes(constants, 1, 2)
+        out += end @ self._diagonal[ends] @ np.swapaxes(end, 1, 2)
         return out
 
     def blocks(self) -> Iterator[Floats]:
@@ -209,15 +214,15 @@ class JointMarginals:
 
 
 def solve(normal: Normal) -> Solved:
-    """Solve normal equations in place; raises NotPositive: an unknown is not constrained."""
+    """Solve normal equations in place; raises NotPositive if an unknown is not constrained."""
     from scipy.linalg.lapack import dpotrf, dpotrs
-    wide = normal.wide
+    right_sides = normal.right_sides
     N, n = normal.g.shape
-    m = len(normal.g_border)
+    m = len(normal.g_constants)
     s, s_c = _scale(normal)
     corner = np.zeros((m + 1, m + 1))
     corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
-    corner[:m, m] = corner[m, :m] = normal.g_border * s_c
+    corner[:m, m] = corner[m, :m] = normal.g_constants * s_c
     roots = _eliminate(normal, corner)
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
@@ -227,21 +232,21 @@ def solve(normal: Normal) -> Solved:
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
-    x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
+    x = np.concatenate([right_sides[rows, :, n + m] - right_sides[rows, :, n:n + m] @ c
                         for rows in blocks(N)])
     for k in iterate_releasing(range(N - 2, -1, -1)):
-        x[k] -= wide[k][:, :n] @ x[k + 1]
+        x[k] -= right_sides[k][:, :n] @ x[k + 1]
     absent = normal.absent
     return Solved(
         x * s, _with_absent(c * s_c, 0 * absent),
         _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
         _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
-        (wide, normal.diagonal), s, s_c)
+        (right_sides, normal.diagonal), s, s_c)
 
 
 def _scale(normal: Normal) -> tuple[Floats, Floats]:
     """Scale the blocks to a unit diagonal, in place; return the factors: (N, n), (m,)."""
-    diagonal, wide = normal.diagonal, normal.wide
+    diagonal, right_sides = normal.diagonal, normal.right_sides
     N, n = normal.g.shape
     s = np.ones((N + 1, n))     # of N blocks and of one after the last, which is not used
     for rows in blocks(N):
@@ -250,30 +255,30 @@ def _scale(normal: Normal) -> tuple[Floats, Floats]:
     for rows in blocks(N):
         diagonal[rows] *= s[rows, :, None]
         diagonal[rows] *= s[rows, None, :]
-        wide[rows] *= s[rows, :, None]
-        wide[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
-        normal.border[rows] *= s_c
+        right_sides[rows] *= s[rows, :, None]
+        right_sides[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
+        normal.coupling[rows] *= s_c
     return s[:N], s_c
 
 
 def _eliminate(normal: Normal, corner: Floats) -> Floats:
-    """Eliminate the blocks and reduce the corner, in place; return their roots' diagonals."""
+    """Eliminate the blocks and reduce the corner, in place; return diagonals of roots: (N, n)."""
     from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-    diagonal, wide = normal.diagonal, normal.wide
+    diagonal, right_sides = normal.diagonal, normal.right_sides
     N, n = normal.g.shape
     D, roots = diagonal[0], np.empty((N, n))
     for k in iterate_releasing(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
             raise NotPositive(f'the data do not determine block {k} of {N}', k)
-        W = wide[k]
+        W = right_sides[k]
         X, _ = dpotrs(root, W, lower=1)
         roots[k] = root.diagonal()
         corner -= W[:, n:].T @ X[:, n:]
         if k + 1 < N:
             onward = W[:, :n].T @ X
             D = diagonal[k + 1] - onward[:, :n]
-            wide[k + 1, :, n:] -= onward[:, n:]
+            right_sides[k + 1, :, n:] -= onward[:, n:]
         diagonal[k] = dpotri(root, lower=1)[0]
         W[:] = X
     below = np.tril_indices(n, -1)      # dpotri fills one triangle

@@ -201,9 +201,9 @@ def change_gyro_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats
     """Return sums for a gyro bias changed by (3,), to first order, and the attitudes C_0k."""
     by = slice(0, 3)
     S = sums.S.copy()
-    S[:, :, 0] += sums.S_by[:, :, by] @ change
-    sums = replace(sums, R=exp_so3(-sums.turned[:, :, by] @ change) @ sums.R,
-                   dv=sums.dv + sums.dv_by[:, :, by] @ change, S=S)
+    S[:, :, 0] += sums.S_by_gyro[:, :, by] @ change
+    sums = replace(sums, R=exp_so3(-sums.R_by_gyro[:, :, by] @ change) @ sums.R,
+                   dv=sums.dv + sums.dv_by_gyro[:, :, by] @ change, S=S)
     C = np.empty((len(sums.T) + 1, 3, 3))
     C[0] = np.eye(3)
     for k, R in enumerate(sums.R):
@@ -291,6 +291,6 @@ def _join_sections(leg: SmootherLeg, sections: 'Sequence[_Section]', K: float,
                    yaw: float) -> State:
     """Return the states of adjacent sections as one; each begins where the one before ends."""
     states = [_state(leg, section, K, yaw) for section in sections]
-    columns = [one.of_keyframes() for one in states]
+    columns = [one.keyframe_arrays() for one in states]
     return replace(states[0], **{name: np.concatenate([
         column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})

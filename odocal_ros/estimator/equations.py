@@ -25,17 +25,17 @@ from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import as_rolled, SpeedSteps, TravelError
 from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows
 from odocal_ros.estimator.factors.pressure import PressureRows
-from odocal_ros.estimator.factors.pseudo_observations import PriorRows, Rests, SIZES
+from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZES, StandstillRows
 from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.levels import LevelInformation, LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, LN_K, PITCH, Priors, State, WITH_SLOW, YAW
+from odocal_ros.estimator.state import LN_K, PITCH, Priors, State, WITH_SLOW, WITHOUT_SLOW, YAW
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
-                                     SpeedSteps, TravelError, SlowError, Rests, PriorRows)
+                                     SpeedSteps, TravelError, SlowError, StandstillRows, PriorRows)
 EXTERNAL_FACTORS = tuple(part for part in FACTORS if issubclass(part, ExternalRows))
 
 
@@ -65,7 +65,7 @@ class Equations:
         point = LinearisationPoint(state, *preintegrate_at(problem, state),
                                    priors or problem.priors, variance_factors, fitted)
         self.constants_in_use = point.priors.used_count
-        self.parts = {kind.name: kind(problem, point) for kind in FACTORS
+        self.factors = {kind.name: kind(problem, point) for kind in FACTORS
                       if kind.is_present(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
@@ -83,19 +83,19 @@ class Weighted:
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
-        self.n = WITH_SLOW if levels.correlation_time else BARE
+        self.n = WITH_SLOW if levels.correlation_time else WITHOUT_SLOW
         self.m = equations.constants_in_use
-        self.parts = {name: part.weighted_copy(levels, self.m) for name,
-                      part in equations.parts.items()
+        self.factors = {name: part.weighted_copy(levels, self.m) for name,
+                      part in equations.factors.items()
                       if part.is_used(levels)}
 
     def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
-        return next(part for part in self.parts.values() if isinstance(part, kind))
+        return next(part for part in self.factors.values() if isinstance(part, kind))
 
     def normal(self) -> Normal:
         """Return the normal equations of the step."""
         out = Normal(len(self.state.t), self.n, self.m)
-        for part in self.parts.values():
+        for part in self.factors.values():
             part.add(out)
         return out
 
@@ -111,9 +111,9 @@ class Weighted:
 
     def apply_step(self, solved: Solved) -> 'Weighted':
         """Apply the step to the residuals, to first order; return self."""
-        step, constants = solved.step, solved.step_border
-        reached = self.state.moved(step, constants)
-        for part in self.parts.values():
+        step, constants = solved.step, solved.step_constants
+        reached = self.state.updated(step, constants)
+        for part in self.factors.values():
             part.apply_step(step, constants, reached)
         return self
 
@@ -121,18 +121,18 @@ class Weighted:
         """Return the information on the levels, sizes last; call before ``solved.marginals``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
         sides = LevelRightHandSides(len(self.state.t), self.n, self.m, names)
-        for part in self.parts.values():
+        for part in self.factors.values():
             part.add_levels(sides)
-        taken, moves = solved.products(sides.chain, sides.border)
+        taken, moves = solved.products(sides.g, sides.g_constants)
         return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
 
     def cost(self) -> float:
         """Return the weighted sum of squares of all rows; point rows with their robust loss."""
-        return float(sum(part.cost() for part in self.parts.values()))
+        return float(sum(part.cost() for part in self.factors.values()))
 
     def log_R_total(self) -> float:
         """Return the log determinant of the covariance of all rows that the levels change."""
-        return float(sum(part.log_R for part in self.parts.values()))
+        return float(sum(part.log_R for part in self.factors.values()))
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """
@@ -142,7 +142,7 @@ class Weighted:
         covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V less that of the part the
         unknowns take up, P J' R^-1 s V R^-1 J (P the covariance of the unknowns).
         """
-        return {name: pair for part in self.parts.values()
+        return {name: pair for part in self.factors.values()
                 for name, pair in part.components(marginals).items()}
 
 
@@ -172,9 +172,9 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
     path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
     chain, border, square, score = rows.step_sides(at, STEPPING)
-    left = 1 / solved.taken - 1      # of the step, if it was shortened: to the minimum
+    left = 1 / solved.step_fraction - 1      # of the step, if it was shortened: to the minimum
     score -= left * (np.einsum('kil,ki->l', chain, solved.step)
-                     + border.T @ solved.step_border[:len(border)])
+                     + border.T @ solved.step_constants[:len(border)])
     taken, _ = solved.products(chain, border)
     of_rows, whole = np.diag(square), square - taken
     information = np.diag(whole).copy()

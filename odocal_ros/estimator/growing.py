@@ -34,7 +34,7 @@ from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, NO_ERROR, State
+from odocal_ros.estimator.state import CONSTANTS, LN_K, NO_ERROR, SCALE_BY_TIME, State
 from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
@@ -145,7 +145,7 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
     """Return the running estimate of finished windows and the one in progress."""
     # tyres warm up from the begin of a leg: each window has its own rate
     legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
-                {CONSTANTS[BY_TIME]: np.inf}))
+                {CONSTANTS[SCALE_BY_TIME]: np.inf}))
             for one in (past, now)]
     whole = combine_legs(legs, [0] * len(legs), config)
     sigmas = _parameter_sigmas(whole)
@@ -218,11 +218,11 @@ def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
         return None
     at = at[:n]
     state = replace(last.state, **{
-        name: value[at] for name, value in last.state.of_keyframes().items()})
+        name: value[at] for name, value in last.state.keyframe_arrays().items()})
     slipped = [last.variance_factors[a:b].mean(axis=0) for a,
                b in zip(at[:-1], at[1:], strict=True)]
     variance_factors = np.concatenate([slipped, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
-    levels = problem.first_levels.replaced(**last.levels.values)
+    levels = problem.initial_levels.replaced(**last.levels.values)
     return WarmStart(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
                      last.priors, problem.priors, variance_factors)
 
@@ -234,7 +234,7 @@ def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     rows = replace(imu, key=key)
     K, c = len(key) - 1, state.constants
     on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
-          for name, value in state.of_keyframes().items()}
+          for name, value in state.keyframe_arrays().items()}
     t = on['t'] = imu.t[imu.key]
     on['travel_error'][n:] = 0.0
     f = state.scale * state.forward

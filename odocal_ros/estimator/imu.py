@@ -24,7 +24,7 @@ from odocal_ros.data.arrays import (
     release_mapped_memory,
 )
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.levels import LEAST
+from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_conjugate,
@@ -113,7 +113,7 @@ class ImuSteps(Steps):
                 for f in fields(Steps)}
         return cls(**sums, t=leg.t_imu[edges], key=np.searchsorted(edges, key))
 
-    def swings(self) -> Floats:
+    def angle_covariances(self) -> Floats:
         """Return the covariances of the angles turned within the intervals: (K, 3, 3) rad^2."""
         T = np.diff(self.t)
         turned = np.cumsum(self.turn, axis=0) - self.turn / 2
@@ -172,7 +172,7 @@ def sensor_noise(grade: Grade) -> dict[str, float]:
     """Return sigmas of white noise and random walks by the grade of the IMU, SI."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
-    return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
+    return {name: max(sigma, MIN_NOISE.imu[name]) for name, sigma in stated.items()}
 
 
 def without_accelerometer(grade: Grade) -> Grade:
@@ -181,11 +181,11 @@ def without_accelerometer(grade: Grade) -> Grade:
                    accel_bias_walk=NO_ACCEL_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 
 
-def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
+def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict[str, float]:
     """Return white noise levels of gyro and accelerometer from standstills; lower limits."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t[imu.key])[:, None]
-    inside = still[:-1] & still[1:]
+    inside = at_rest[:-1] & at_rest[1:]
     rest = np.flatnonzero(inside)
     runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
     # second differences contain no bias and no drift; their variance is six times as large
@@ -196,7 +196,7 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[s
         return {}
     # people may get in and out, or load, during most of a stop: use the quarter with least motion
     found = {name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
-                       LEAST.imu[name]**2)
+                       MIN_NOISE.imu[name]**2)
              for name, x in zip(('gyro', 'accel'), both, strict=True)}
     return found if leg.has_accelerometer else {'gyro': found['gyro']}
 
@@ -226,6 +226,6 @@ def gyro_bias_at_rest(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:
     """Return the mean turn rate at standstills between the keyframes, (3,); None without any."""
     first, last = imu.key[[0, -1]]
     inside = is_standing(leg, imu.t[first:last + 1])
-    still = inside[:-1] & inside[1:]
-    length = float(np.diff(imu.t[first:last + 1])[still].sum())
-    return None if length < 1.0 else imu.turn[first:last][still].sum(axis=0) / length
+    at_rest = inside[:-1] & inside[1:]
+    length = float(np.diff(imu.t[first:last + 1])[at_rest].sum())
+    return None if length < 1.0 else imu.turn[first:last][at_rest].sum(axis=0) / length

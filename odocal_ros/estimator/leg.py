@@ -45,7 +45,7 @@ def thinned(t: Floats, most: float = EXTERNAL_RATE) -> slice:
     return slice(None, None, max(1, round(rate / most)))
 
 
-def from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
+def enu_to_n(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     """Return C_np of the places at times: east and north differ from those at the origin."""
     latitude, longitude = (np.interp(t, inputs.t_fix, inputs.geodetic[:, i]) for i in (0, 1))
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
@@ -53,7 +53,7 @@ def from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
 
 def convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     """Return the yaw in n of east at the places of the vehicle: (m,) rad."""
-    C_np = from_place(inputs, t, origin)
+    C_np = enu_to_n(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])
 
 
@@ -102,7 +102,7 @@ class SmootherLeg:
         return np.sqrt(np.maximum(variance, 0.0))
 
     @property
-    def by_steps(self) -> bool:
+    def uses_speed_steps(self) -> bool:
         """
         Return True if the transitions of a coarse speed are used, not its integral.
 

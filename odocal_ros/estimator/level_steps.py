@@ -72,14 +72,14 @@ def update_levels(weighted: Weighted, marginals: JointMarginals, levels: Levels,
         # the others have one pseudo-observation, at their current value: with more, iterations
         # would end at too large a noise
         pseudo = PSEUDO_OBSERVATIONS.get(name, 1.0)
-        pull = pseudo * (problem.first_levels[name] / level if name in PSEUDO_OBSERVATIONS
+        pull = pseudo * (problem.initial_levels[name] / level if name in PSEUDO_OBSERVATIONS
                          else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
         first = RELAXATION.first if name in SLIP_LEVELS or name in PSEUDO_OBSERVATIONS else 1.0
         move = np.clip(_relaxation_exponent(pace, name, step, first) * step, np.log(0.03),
                        np.log(30.0))
-        new[name] = max(level * float(np.exp(move)), problem.least[name])
+        new[name] = max(level * float(np.exp(move)), problem.min_levels[name])
     # the first steps are not compared: their residuals depend on the initial state
     for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
         step = float(np.log(size / levels[name]))
@@ -112,7 +112,7 @@ def long_span_factors(fixes: Fixes, levels: Levels,
     expectation of each level.
     """
     t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()
-    stated = 1 / np.diagonal(fixes.root, axis1=1, axis2=2)**2
+    stated = 1 / np.diagonal(fixes.whitening, axis1=1, axis2=2)**2
     time, out = levels.correlation_time, dict.fromkeys(SLOW_COLUMNS, 1.0)
     span = max(1.0, 2 * float(np.median(np.diff(t))))
     while t[-1] - t[0] > LEAST_SPANS * span:

@@ -22,7 +22,7 @@ CORRELATED_LEVELS = ('slow', 'slow_up')
 
 
 @dataclass(frozen=True)
-class LeastNoise:
+class MinimumNoise:
     """
     Minimum sigma of each variance component.
 
@@ -42,7 +42,7 @@ class LeastNoise:
         'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7})
 
 
-LEAST = LeastNoise()
+MIN_NOISE = MinimumNoise()
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class LevelRightHandSides:
 
     def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
         self.names = tuple(names)
-        self.chain = work_array(N, n, len(self.names))
-        self.border = np.zeros((m, len(self.names)))
+        self.g = work_array(N, n, len(self.names))
+        self.g_constants = np.zeros((m, len(self.names)))
         self.square = np.zeros((len(self.names),) * 2)
 
     def at(self, names: Iterable[str]) -> list[int]:

@@ -53,11 +53,11 @@ class Intervals:
     #                  millimetres off, which would determine a scale that is not observable
     FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
     # by the gyro bias (3) and by the constants of GYRO (g)
-    turned: Floats   # (K, 3, 3 + g) rotation of the end: -turned d
-    dv_by: Floats    # (K, 3, 3 + g) derivative of dv
-    dp_by: Floats    # (K, 3, 3 + g)
+    R_by_gyro: Floats     # (K, 3, 3 + g) an error d of them turns the end by -R_by_gyro d
+    dv_by_gyro: Floats    # (K, 3, 3 + g) derivative of dv
+    dp_by_gyro: Floats    # (K, 3, 3 + g)
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
-    S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
+    S_by_gyro: Floats     # (K, 3, 3 + g) derivative of S @ forward
     mean_rate: Floats   # (K, 3) mean measured turn rate less its bias, rad/s
     mean_force: Floats  # (K, 3) mean measured specific force less its bias, m/s^2
     longest_step: Floats   # (K,) longest gap between IMU rows, s
@@ -80,9 +80,9 @@ class Points:
     AA: Floats       # (m, 3, 3)
     F: Floats        # (m, 3, a)
     FF: Floats       # (m, 3, a)
-    turned: Floats   # (m, 3, 3 + g)
-    dv_by: Floats    # (m, 3, 3 + g)
-    dp_by: Floats    # (m, 3, 3 + g)
+    R_by_gyro: Floats     # (m, 3, 3 + g)
+    dv_by_gyro: Floats    # (m, 3, 3 + g)
+    dp_by_gyro: Floats    # (m, 3, 3 + g)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
     spin: Floats     # (m, 3) rad/s^2, its rate of change
@@ -103,7 +103,7 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     Return the sums over all intervals, and up to points within them.
 
     imu : steps.   gyro_bias, accel_bias : (K, 3) taken out, one for each interval.   travel : (m,)
-    times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by.
+    times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by_gyro.
     t_points : (m,) times of fixes, rising, within the keyframes.   constants : (M,) of which GYRO
     and ACCEL are taken out.
     """
@@ -246,7 +246,7 @@ class _Chunk:
 
     def _effects(self, begin: Ints, end: Ints, dv: Floats, dp: Floats,
                  tau: Floats) -> tuple[Floats, ...]:
-        """Return A, AA, F, FF, turned, dv_by, dp_by of errors in steps between (m,) cuts."""
+        """Return A to FF and the derivatives by the gyro, of errors in steps between (m,) cuts."""
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
         turns, once, twice, late = (x[last] - x[first] for x in self.sums)
         by_turn = self._gyro(turns[..., OF_GYRO])
@@ -263,14 +263,14 @@ class _Chunk:
         S_rest = walk[self.own] - walked - moved @ forward
         cross, ahead = skew(self.turn), skew(forward)
         own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
-        S_by = self._sum(_by(_cross(S_rest, self.mean) + self.R @ own * ds[:, :, None],
+        S_by_gyro = self._sum(_by(_cross(S_rest, self.mean) + self.R @ own * ds[:, :, None],
                              self.signals[:, OF_GYRO]))
-        A, AA, F, FF, turned, dv_by, dp_by = self._effects(
+        A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
             self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
         measured = self._sum(self.signals[:, 1:7]) / T[:, None]
-        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, turned, dv_by, dp_by,
-                         self._sum(moved), self._gyro(S_by), measured[:, :3], measured[:, 3:],
-                         np.maximum.reduceat(self.longest, self.key[:-1]))
+        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
+                         dp_by_gyro, self._sum(moved), self._gyro(S_by_gyro), measured[:, :3],
+                         measured[:, 3:], np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
         """Return the sums to times in steps j, a cut each: rate and force change evenly in it."""
@@ -283,7 +283,7 @@ class _Chunk:
         rate = self.turn[j] / dt - spin * dt / 2
         R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
         tau = t - self.t[self.key[interval]]
-        A, AA, F, FF, turned, dv_by, dp_by = self._effects(
+        A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
             self.key[interval], j, dv, dp, tau[:, None, None])
         # errors within the step itself
         share, by = (h / dt)[:, None], self.signals[j]
@@ -294,6 +294,6 @@ class _Chunk:
             (x + y for x, y in zip(before, self._accel(_by(step, by)), strict=True))
             for before, step in (((A, F), self.mean[j] * share),
                                  ((AA, FF), self.twice[j] * share**2)))
-        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, turned + own,
-                      dv_by + _cross(moved / 2, own), dp_by + _cross(moved * h / 6, own),
+        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, R_by_gyro + own,
+                      dv_by_gyro + _cross(moved / 2, own), dp_by_gyro + _cross(moved * h / 6, own),
                       force + rise * h, rate + spin * h, spin, self.signals[j, 1:7] / dt)

@@ -22,7 +22,7 @@ from odocal_ros.estimator.imu import (
     without_accelerometer,
 )
 from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, FIX_RATE, SmootherLeg, thinned
-from odocal_ros.estimator.levels import LEAST
+from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
@@ -85,10 +85,10 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
     """Return the estimation problem of a leg; ``imu``: IMU steps with keyframes, else SPACING."""
     imu = ImuSteps.from_leg(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
-    still = is_standing(leg, t)
+    at_rest = is_standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    at_rest = white_noise_at_rest(imu, leg, still)
-    config = replace(config, imu=with_grade_by_noise(config.imu, at_rest))
+    config = replace(config, imu=with_grade_by_noise(
+        config.imu, white_noise_at_rest(imu, leg, at_rest)))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
     external = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}
@@ -96,28 +96,28 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
                      if part.name in leg.external and part.name not in SHARED}
     whitening = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     problem = Problem(
-        leg, imu, grade, _priors(config, grade, leg), use, whitening, still,
+        leg, imu, grade, _priors(config, grade, leg), use, whitening, at_rest,
         {name: sent for name, sent in external.items() if len(sent.t)}, own_constants,
         total_turn(leg, imu), config.gnss.correlation_time,
-        mean_rates_at(leg.t_imu, leg.w_b, t), imu.swings(), drift_time(leg, t),
+        mean_rates_at(leg.t_imu, leg.w_b, t), imu.angle_covariances(), drift_time(leg, t),
         # poses can be from motion capture; fixes and points are less accurate
-        LEAST.fix if not leg.origin.local or config.reference.points else LEAST.pose)
+        MIN_NOISE.fix if not leg.origin.local or config.reference.points else MIN_NOISE.pose)
     for part in FACTORS:
         if part.is_present(problem):
-            first, least = part.first_levels(problem)
-            problem.first_levels = problem.first_levels.replaced(**first)
-            problem.least |= least
+            first, least = part.initial_levels(problem)
+            problem.initial_levels = problem.initial_levels.replaced(**first)
+            problem.min_levels |= least
     # initial levels include the vibration; most of it cancels within a second, so the fit then
     # decreases them
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
-    problem.vibrating = {name: max(sigma**2, problem.first_levels[name])
+    problem.vibrating_levels = {name: max(sigma**2, problem.initial_levels[name])
                          for name, sigma in sample_noise(leg, rows).items()}
     return problem
 
 
 def imperfection_sigmas(grade: Grade) -> Floats:
     """
-    Return the usual sigmas of the constants IMPERFECT, 0 for an absent error: (k,).
+    Return the usual sigmas of the constants IMPERFECTIONS, 0 for an absent error: (k,).
 
     Errors of the IMU are by its grade. Receivers that smooth do so over a second; most receivers
     have no odometer, so theirs is a small error with a wide range (SIZE_SPREADS). Clocks differ by
@@ -153,7 +153,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[layout.ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[layout.GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    sigma[layout.IMPERFECT] = np.maximum(imperfection_sigmas(grade), layout.NO_ERROR)
+    sigma[layout.IMPERFECTIONS] = np.maximum(imperfection_sigmas(grade), layout.NO_ERROR)
     # at least the biases of the grade, also for a calibrated IMU: otherwise a bias would be
     # estimated as an axis error, and change the yaw of a tilted IMU
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
@@ -168,9 +168,9 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
     # definition: the error is in stated sigmas, so 1; with constant sigmas it has no effect
-    sigma[layout.BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
+    sigma[layout.FIX_ERROR_BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
-    centre[layout.FIX_TIME], sigma[layout.FIX_TIME] = np.log(20.0), 0.7
+    centre[layout.FIX_MOTION_TIME], sigma[layout.FIX_MOTION_TIME] = np.log(20.0), 0.7
     # offset of a coarse speed: 0 (rounded) to half a step (truncated)
     half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
     centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR

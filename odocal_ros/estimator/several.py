@@ -33,7 +33,7 @@ from odocal_ros.estimator.result.wheel_result import (
     wheel_details,
     wheel_estimates,
 )
-from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
+from odocal_ros.estimator.state import CONSTANTS, IMPERFECTIONS, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, REMARK_SIGMAS
@@ -117,7 +117,7 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants, wheels: dic
 
 def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInformation]:
     """Return marginals with the same sizes of imperfections: geometric means by information."""
-    imperfect = set(CONSTANTS[IMPERFECT])
+    imperfect = set(CONSTANTS[IMPERFECTIONS])
     logs: dict[str, list[tuple[float, float]]] = {}
     for marginal in marginals:
         prior = 1 / marginal.relaxed_sigma**2

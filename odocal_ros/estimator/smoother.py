@@ -96,7 +96,8 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
     del current             # the equations of one fit at a time
     fixed_sigma = 1e-3 * coarse.step       # practically fixed
     warm_start = replace(summary, priors=_fix_offset_priors(summary.priors, usual, fixed_sigma),
-                         first=_fix_offset_priors(summary.first, usual, fixed_sigma))
+                         initial_priors=_fix_offset_priors(summary.initial_priors, usual,
+                                                           fixed_sigma))
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)
@@ -133,13 +134,14 @@ def _initial_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels; the noise of the fixes is at least their scatter about the track."""
     factor, factor_up = (max(1.0, (scatter / sigma)**2) for scatter, sigma in (
         (start.fix_scatter, problem.fix_sigma), (2 * start.fix_scatter, problem.height_sigma)))
-    correlation_time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
+    configured = problem.correlation_time
+    correlation_time = USUAL_TIME if np.isnan(configured) else configured
     leg = problem.leg
     long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
-    return problem.first_levels.replaced(
+    return problem.initial_levels.replaced(
         fix=WHITE_SHARE * factor, fix_up=4.0 * WHITE_SHARE * factor_up,
-        correlation_time=correlation_time, **sizes, **problem.vibrating)
+        correlation_time=correlation_time, **sizes, **problem.vibrating_levels)
 
 
 def missing_samples_reason(leg: SmootherLeg) -> Reason | None:

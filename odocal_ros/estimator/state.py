@@ -26,7 +26,7 @@ BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
     BLOCK.values(), accumulate(BLOCK.values()), strict=True))
 E = TRAVEL.start
-BARE, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
+WITHOUT_SLOW, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
 
 # Errors of the IMU's axes: (axis with the error, signal that it contains). Signals of the
 # gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
@@ -83,7 +83,7 @@ FIX_LAG2 = CONSTANTS.index('fix_lag_square')
 # m/s: rate of a height error that changes over more time than a leg
 HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
 # fix errors per stated sigma, east, north, up: they decrease as a receiver converges (S15a)
-BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
+FIX_ERROR_BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
 FIX_ERRORS = constants_from('fix_height_drift', 'fix_error_up')
 # relative: rate of the clock of its stamps minus that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
@@ -91,28 +91,28 @@ GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock
 ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
 # of an odometer in the receiver: its relative error, and the logarithm of the time constant, s,
 # with which satellites correct its positions
-FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
+FIX_BY_MOTION, FIX_MOTION_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
 # relative change of the scale from its mean by distance: with the square of the speed (its slope
 # at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
 # what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
-BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
+SCALE_BY_SPEED, SCALE_BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
 FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
 # of the path, per half the mean square of the body pitch in an interval: 1 if the axle keeps its
 # direction, 0 if it follows the body, negative if bumps are shorter than the wheelbase
-BY_PITCHING = CONSTANTS.index('scale_by_pitching')
+SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: the body reacts with a delay, tyres immediately
-LEAN = constants_from('squat', 'sideslip_by_jerk')
+BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
 # m, ahead of the odometer: points about which the body pitches on hills, in addition on bumps,
 # and in turns about its own left axis, on banked ground; and m/rad: the last times the roll of the
 # ground in the mean of the leg, which tilts that axis
-PITCH_CENTRE = constants_from('pitch_centre', 'lift_by_turning')
+PITCH_CENTRES = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
 # of each leg alone: its ground and its fixes
-OF_LEG = constants_from('lift_by_turning', 'fix_error_up')
+LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
 # deviations from an ideal vehicle
-IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
+IMPERFECTIONS = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
 # kinds of deviations with one common size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
@@ -120,7 +120,7 @@ KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'acceleromete
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
               'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1, 'squat_by_jerk': 1,
               'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1}
-KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
+KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')
 # of a GNSS velocity: delay of its stamps, s, square of the time constant of the receiver's filter,
@@ -165,12 +165,12 @@ class State:
         """Return the rotation from vehicle to body axes: (3, 3)."""
         return C_bv(self.forward, self.up_b)
 
-    def of_keyframes(self) -> dict[str, Floats]:
+    def keyframe_arrays(self) -> dict[str, Floats]:
         """Return the arrays with a row for each keyframe, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)
                 if f.name not in ('constants', 'up_b')}
 
-    def level(self) -> 'State':
+    def with_mean_up(self) -> 'State':
         """Return the state with the mean up axis of its attitudes: the roll of the IMU."""
         return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
 
@@ -181,9 +181,9 @@ class State:
         by_yaw, by_pitch = forward_gradient(self.constants[YAW], self.constants[PITCH])
         return _turned_axes(C, up, by_yaw), _turned_axes(C, up, by_pitch)
 
-    def moved(self, step: Floats, step_constants: Floats) -> 'State':
+    def updated(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state with an increment of every unknown: (N, n), (M,)."""
-        slow = self.slow_n + step[:, SLOW] if step.shape[1] > BARE else self.slow_n
+        slow = self.slow_n + step[:, SLOW] if step.shape[1] > WITHOUT_SLOW else self.slow_n
         return replace(
             self, p_n=self.p_n + step[:, P], v_n=self.v_n + step[:, V],
             C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],

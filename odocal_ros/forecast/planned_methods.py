@@ -148,7 +148,7 @@ def _true_state(motion: _Motion, key: Ints) -> State:
     N = len(key)
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
                  np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),
-                 np.zeros(M)).level()
+                 np.zeros(M)).with_mean_up()
 
 
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
@@ -201,10 +201,10 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
         name: 2 / max(tau, 1.0) * (1 - white) * variance
         for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
     values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
-    least = {name: problem.least.get(name, 0.0) for name in values}
+    least = {name: problem.min_levels.get(name, 0.0) for name in values}
     # the bound is for one fix, not for the fixes that it replaces
     least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
-    return problem.first_levels.replaced(
+    return problem.initial_levels.replaced(
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 

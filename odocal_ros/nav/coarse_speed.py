@@ -77,7 +77,7 @@ class CoarseSpeed:
         return np.diff(np.interp(t, self.t, total))
 
     @cached_property
-    def most(self) -> float:
+    def max_error(self) -> float:
         """Return the limit of the deviation of a speed from lines between rows, with curvature."""
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)

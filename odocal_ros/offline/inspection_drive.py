@@ -192,7 +192,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(rests, *ends)
-            for ends in survey.straight_stretches(inputs, located, config.leg.min_distance)[:5])]
+            for ends in survey.straight_sections(inputs, located, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
     if marks or config.method != 'two_point' or not all(is_closed(leg) for leg in found['legs']):
         return []

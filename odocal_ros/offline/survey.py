@@ -231,7 +231,7 @@ def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floa
             [float(speed.min()), float(speed.max())] if len(t) else [0.0, 0.0])
 
 
-def straight_stretches(inputs: Inputs, located: LocatedFixes,
+def straight_sections(inputs: Inputs, located: LocatedFixes,
                        shortest: float) -> list[tuple[float, float]]:
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
     if not located.rough or len(inputs.t_fix) < 3:

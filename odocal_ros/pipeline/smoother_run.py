@@ -63,7 +63,7 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
                            dead_reckon(t, q_nb, travel))
     # of coarse speeds the fit only uses the steps: slip is detected by this track
     odometer = slip_reasons(slip_check(prepared, track, f, (0.0, prepared.t_fit)),
-                            prepared.config.odometer.time_offset) if leg.by_steps else ()
+                            prepared.config.odometer.time_offset) if leg.uses_speed_steps else ()
     return MethodRun(method, Paths(before, _delayed_path(track, f, lever_b, delays_s['gnss'])),
                      delays=observed_delays, odometer=odometer)
 

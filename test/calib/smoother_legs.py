@@ -91,7 +91,7 @@ def truth(drive, config, leg) -> State:
         np.log(o.scale), *mounting_from_forward(C_vb[0]), o.odometer_delay, o.fix_delay)
     v_n = v_n + np.cross(turning, arm_n)
     return State(t, p_n + arm_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
-                 np.zeros((len(t), 3)), constants).level()
+                 np.zeros((len(t), 3)), constants).with_mean_up()
 
 
 def _biases(drive, since):

@@ -15,9 +15,9 @@ from smoother_legs import leg_of, made, reason_texts
 from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
+from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import _change_reasons, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
@@ -70,7 +70,7 @@ def column_of(problem, fit, constant, size):
     """Return the whitened derivatives of the motion rows by a constant, by differences: (K, r)."""
     rows = fit.weighted[MotionRows]
     above, below = (equations_at(problem, fit, fit.state.constants + by * (
-        np.arange(M) == constant)).parts['motion'].raw for by in (size, -size))
+        np.arange(M) == constant)).factors['motion'].raw for by in (size, -size))
     return np.einsum('kij,kj->ki', rows.whiten, (above - below) / (2 * size))
 
 
@@ -86,20 +86,20 @@ def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
 
     plain, n, m = weighted.normal(), weighted.n, weighted.m
     wider = Normal(len(fit.state.t), n, m + 1)
-    wider.diagonal[:], wider.beside[:] = plain.diagonal, plain.beside
-    wider.border[:, :, :m], wider.corner[:m, :m] = plain.border, plain.corner
-    wider.g[:], wider.g_border[:m] = plain.g, plain.g_border
+    wider.diagonal[:], wider.upper[:] = plain.diagonal, plain.upper
+    wider.coupling[:, :, :m], wider.corner[:m, :m] = plain.coupling, plain.corner
+    wider.g[:], wider.g_constants[:m] = plain.g, plain.g_constants
     by = np.einsum('kij,ki->kj', rows.J, column)
-    wider.border[:-1, :, m] += by[:, :n]
-    wider.border[1:, :, m] += by[:, n:2 * n]
+    wider.coupling[:-1, :, m] += by[:, :n]
+    wider.coupling[1:, :, m] += by[:, n:2 * n]
     wider.corner[:m, m] = wider.corner[m, :m] = by[:, 2 * n:].sum(axis=0)
     wider.corner[m, m] = (column**2).sum()
-    wider.g_border[m] = -(column * rows.r).sum()
+    wider.g_constants[m] = -(column * rows.r).sum()
     whole = solve(wider)
     sigma = np.sqrt(whole.covariance[m, m])
     assert step.sigma == pytest.approx(sigma, rel=2e-3)
     # the other unknowns are at their minimum to the limit of convergence
-    assert step.size == pytest.approx(whole.step_border[m], abs=CONVERGENCE.max_step * sigma)
+    assert step.size == pytest.approx(whole.step_constants[m], abs=CONVERGENCE.max_step * sigma)
 
 
 def test_a_shortened_last_step_does_not_change_the_steps(fitted):
@@ -111,20 +111,20 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
     for taken in (1.0, 0.4):
         weighted = equations.at(fit.levels)
         full = solve(weighted.normal())
-        solved = replace(full, step=taken * full.step, step_border=taken * full.step_border,
+        solved = replace(full, step=taken * full.step, step_constants=taken * full.step_constants,
                          taken=taken)
         found.append([step.size
                       for step in find_constant_steps(weighted.apply_step(solved), solved)])
-    sigma = [step.sigma for step in fit.steps]
+    sigma = [step.sigma for step in fit.constant_steps]
     # fixes beyond their tails lose weight with the full step
     np.testing.assert_allclose(*found, atol=0.1 * max(sigma))
 
 
 def test_nothing_is_said_of_a_drive_without_a_change(fitted):
     _, fit = fitted
-    assert {s.constant for s in fit.steps} == {LN_K, YAW, PITCH}
+    assert {s.constant for s in fit.constant_steps} == {LN_K, YAW, PITCH}
     # the largest of 15 places that overlap: beyond 4 sigma once in 1,000 drives
-    assert all(abs(s.size) < 4 * s.sigma for s in fit.steps)
+    assert all(abs(s.size) < 4 * s.sigma for s in fit.constant_steps)
     assert Code.CHANGE_IN_LEG not in changed()[2]
 
 

@@ -82,8 +82,8 @@ def walked(slope, passes):
     off, taken = np.array([1.0, -0.5]), np.zeros(2)
     for _ in range(passes):
         found = damp_step(step_of(-slope * off, np.diag([4.0, 1.0])), taken)
-        assert_allclose(found.step[0], found.step_border)
-        taken = found.step_border
+        assert_allclose(found.step[0], found.step_constants)
+        taken = found.step_constants
         off = off + taken
     return float(np.abs(off).max())
 
@@ -94,8 +94,8 @@ def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
     assert walked(2.0, 2) < 1e-12
     assert walked(0.4, 3) == pytest.approx(0.6**3)
     back = np.array([-2.0, 1.0])
-    assert damp_step(step_of(back, np.eye(2)), -back).taken == pytest.approx(0.5)
-    assert np.array_equal(damp_step(step_of(back, np.eye(2)), np.zeros(2)).step_border, back)
+    assert damp_step(step_of(back, np.eye(2)), -back).step_fraction == pytest.approx(0.5)
+    assert np.array_equal(damp_step(step_of(back, np.eye(2)), np.zeros(2)).step_constants, back)
 
 
 def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():

@@ -95,14 +95,14 @@ def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
     bent = (np.linalg.norm(BIAS) * STEP)**2 * np.linalg.norm(FORCE_BIAS)
     for found in (sums, points):
         np.testing.assert_allclose(found.R - np.eye(3), 0.0, atol=1e-12)
-        for zero in (found.F, found.turned[:, :, 3:][:, :, by_rate]):
+        for zero in (found.F, found.R_by_gyro[:, :, 3:][:, :, by_rate]):
             np.testing.assert_allclose(zero, 0.0, atol=1e-12)
         for zero in (found.dv, found.dp):
             np.testing.assert_allclose(zero, 0.0, atol=bent)
     # an error of the bias is one of the signal, too
     by_bias = np.eye(3, 6)
     by_bias[GYRO_AXIS, GYRO_SIGNAL] -= 0.2 * by_rate
-    np.testing.assert_allclose(sums.turned[0, :, :3], by_bias[:, :3], atol=1e-9)
+    np.testing.assert_allclose(sums.R_by_gyro[0, :, :3], by_bias[:, :3], atol=1e-9)
 
 
 # rad: of second order in the turn by the bias in each of ten steps, 0.0027 rad, beside 0.062 rad
@@ -116,7 +116,7 @@ def test_the_angles_of_a_constant_turn_scatter_by_their_closed_form():
     turn = RATE + BIAS
     # of an angle that grows evenly over 1 s, of means of steps: 1 / 12 less STEP^2 / 12
     want = np.outer(turn, turn) * (1 - STEP**2) / 12
-    np.testing.assert_allclose(imu.swings(), np.tile(want, (5, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(imu.angle_covariances(), np.tile(want, (5, 1, 1)), atol=1e-12)
 
 
 def test_coning_at_the_sample_rate_is_in_the_steps():

@@ -45,14 +45,14 @@ def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
     _, _, leg, problem, fit = fitted()
     found = stored_residuals(leg, problem, fit)
     again = Equations(problem, fit.state, fit.priors, fit.variance_factors, True)
-    motion = again.parts[MotionRows.name].motion
+    motion = again.factors[MotionRows.name].motion
     begin, end = (np.swapaxes(C, 1, 2) for C in (motion.C, motion.C_end))
     middle = np.swapaxes((motion.C + motion.C_end) @ fit.state.C_bv, 1, 2) / 2
     for name, expected in (
             ('gyro', np.einsum('kij,kj->ki', end, motion.residual[:, PHI]) / motion.T),
             ('accelerometer', np.einsum('kij,kj->ki', begin, motion.residual[:, V]) / motion.T),
             ('odometer', np.einsum('kij,kj->ki', middle, motion.residual[:, D])),
-            ('fix', -again.parts[Fixes.name].raw)):
+            ('fix', -again.factors[Fixes.name].raw)):
         value, sigma = in_halves(found[f'left_{name}'])
         if name == 'odometer':      # its rows end before the last second does
             value, sigma, expected = value[:-1], sigma[:-1], expected[:-1]
@@ -77,10 +77,10 @@ def test_sigmas_are_those_of_white_noise_over_an_interval():
     _, sigma = in_halves(found['left_accelerometer'])
     # the gyro's noise turns gravity: most of what is level
     assert np.all(sigma > 0.999 * np.sqrt(fit.levels['accel'] / T)[:, None])
-    np.testing.assert_allclose(sigma[problem.still[1:], 2], np.sqrt(
-        fit.levels['accel'] / T)[problem.still[1:]], rtol=0.02)
+    np.testing.assert_allclose(sigma[problem.at_rest[1:], 2], np.sqrt(
+        fit.levels['accel'] / T)[problem.at_rest[1:]], rtol=0.02)
     _, sigma = in_halves(found['left_fix'])
-    stated = np.sqrt(np.einsum('mii->mi', leg.covariance_n[problem.use]))
+    stated = np.sqrt(np.einsum('mii->mi', leg.covariance_n[problem.used_fixes]))
     factor = np.sqrt([fit.levels['fix'], fit.levels['fix'], fit.levels['fix_up']])
     np.testing.assert_allclose(sigma, stated * factor, rtol=1e-3)
 

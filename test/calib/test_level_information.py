@@ -50,8 +50,8 @@ def test_moves_are_the_differences_of_solutions(weighted_equations):
     information = both.information(solved)
     sigma = np.sqrt(np.diag(solved.covariance))
     for name in (*NAMES, 'correlation_time'):
-        up, down = (at(**{name: x})[1].step_border for x in (STEP, -STEP))
-        moves = information.moves[:, information.names.index(name)]
+        up, down = (at(**{name: x})[1].step_constants for x in (STEP, -STEP))
+        moves = information.constants_by_level[:, information.names.index(name)]
         np.testing.assert_allclose(moves / sigma, (up - down) / (2 * STEP) / sigma,
                                    rtol=ROUGH, atol=ROUGH * np.abs(moves / sigma).max() + 1e-9)
 
@@ -90,7 +90,8 @@ def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_equ
     sure = information.effects(dict.fromkeys(own, 1e12))
     assert (np.sqrt((sure**2).sum(axis=1)) < 1e-5 * np.sqrt(np.diag(solved.covariance))).all()
     effects = information.effects(own)
-    most = sum(information.moves[:, i]**2 / own[n] for i, n in enumerate(information.names))
+    most = sum(information.constants_by_level[:, i]**2 / own[n]
+               for i, n in enumerate(information.names))
     # errors of levels in common may double what each does alone, not more than their number
     assert ((effects**2).sum(axis=1) <= most * len(own) + 1e-30).all()
 

@@ -155,7 +155,7 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
     sigmas = replace(town_sigmas, config=config, fix=0.02)
     one = ideal_samples(drive, sigmas, 1.0)
     problem = make_problem(one.leg, config, one.imu)
-    parts = Equations(problem, one.state).parts
+    parts = Equations(problem, one.state).factors
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
     # most, beside what a planned drive's own steps of 0.1 s leave
     assert np.abs(parts['fixes'].raw).max() < 0.03

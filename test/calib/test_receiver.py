@@ -15,7 +15,7 @@ from smoother_legs import leg_of, made, reason_texts
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.level_steps import long_span_factors
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.state import BY_SIGMA, CONSTANTS, HEIGHT_DRIFT
+from odocal_ros.estimator.state import CONSTANTS, FIX_ERROR_BY_SIGMA, HEIGHT_DRIFT
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.options import SimOptions
@@ -169,5 +169,5 @@ def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
     assert off(result, drive) < 3
     sigma = result.estimates['scale_factor'].sigma / drive.truth.scale
     assert sigma < START / drive.truth.distance / 2     # it would show there
-    for name, true in zip(CONSTANTS[BY_SIGMA], IN_SIGMAS, strict=True):
+    for name, true in zip(CONSTANTS[FIX_ERROR_BY_SIGMA], IN_SIGMAS, strict=True):
         assert abs(result.details[name]['value'] - true) < 3 * result.details[name]['sigma']

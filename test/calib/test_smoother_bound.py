@@ -25,7 +25,7 @@ from odocal_ros.estimator.factors.pseudo_observations import (
     STILL_TURN,
 )
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
+from odocal_ros.estimator.state import E, IMPERFECTIONS, M, SLOW, WITH_SLOW, WITHOUT_SLOW
 
 pytestmark = pytest.mark.core
 N, STATES, BORDER = 6, 4, 3
@@ -37,11 +37,11 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     drive, config, leg = made(duration=140.0, fix_rate=1.0)
     leg = replace(leg, t_stop=50.0)
     problem = make_problem(leg, config)
-    levels = problem.first_levels.replaced(correlation_time=correlation_time, fix=0.5)
+    levels = problem.initial_levels.replaced(correlation_time=correlation_time, fix=0.5)
     state = truth(drive, config, leg)
-    parts = Equations(problem, state, fitted=True).parts
+    parts = Equations(problem, state, fitted=True).factors
     motion, fixes = parts['motion'], parts['fixes']
-    n, N = (WITH_SLOW if correlation_time else BARE), len(state.t)
+    n, N = (WITH_SLOW if correlation_time else WITHOUT_SLOW), len(state.t)
     size = N * n + M
     rows = []
 
@@ -65,8 +65,8 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         root = np.linalg.inv(np.linalg.cholesky(Q[k] * np.outer(s, s))) * s
         add(np.concatenate([a[k], b[k], c[k]], axis=1), (block(k), block(k + 1), border), root)
     J, Jc = fixes.jacobians(n)
-    covariance = leg.covariance_n[problem.use]
-    white = np.hypot(*np.einsum('kij,kj->ki', problem.root, fixes.raw)[:, :2].T)
+    covariance = leg.covariance_n[problem.used_fixes]
+    white = np.hypot(*np.einsum('kij,kj->ki', problem.fix_whitening, fixes.raw)[:, :2].T)
     factor = np.array([np.sqrt(0.5), np.sqrt(0.5), 1.0])
     for i, k in enumerate(fixes.k):
         C = covariance[i] * np.outer(factor, factor)
@@ -82,12 +82,12 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     single = np.eye(n)
     for k in range(N):
         add(single[[E]], (block(k),),
-            np.eye(1) * np.sqrt(parts['travel'].weight[k] / problem.least['travel']))
-        if problem.still[k]:
+            np.eye(1) * np.sqrt(parts['travel'].weight[k] / problem.min_levels['travel']))
+        if problem.at_rest[k]:
             add(single[3:6], (block(k),), np.eye(3) / STILL_SPEED)
     for k in range(N - 1):
         T = state.t[k + 1] - state.t[k]
-        if problem.still[k] and problem.still[k + 1]:
+        if problem.at_rest[k] and problem.at_rest[k + 1]:
             add(np.concatenate([-single[6:9], single[6:9]], axis=1), (block(k), block(k + 1)),
                 np.diag(1 / (STILL_TURN * np.sqrt(T))))
         if n == WITH_SLOW:
@@ -101,7 +101,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     if n == WITH_SLOW:
         add(single[SLOW], (block(0),), np.diag(1 / np.sqrt(power)))
     prior = problem.priors.constants.copy()
-    prior[IMPERFECT] *= np.sqrt(SIZE)         # the first sizes
+    prior[IMPERFECTIONS] *= np.sqrt(SIZE)         # the first sizes
     add(np.eye(M), (border,), np.diag(1 / prior))
     A = np.concatenate(rows)
     # by QR of the rows, which does not square their condition: scaled columns
@@ -134,10 +134,10 @@ def _as_chain(H, g):
     c = slice(N * STATES, TOTAL)
     out = Normal(N, STATES, BORDER)
     out.diagonal[:] = [H[s, s] for s in b]
-    out.beside[:] = [H[b[k], b[k + 1]] for k in range(N - 1)]
-    out.border[:] = [H[s, c] for s in b]
+    out.upper[:] = [H[b[k], b[k + 1]] for k in range(N - 1)]
+    out.coupling[:] = [H[s, c] for s in b]
     out.g[:] = g[:N * STATES].reshape(N, STATES)
-    out.corner[:], out.g_border[:] = H[c, c], g[c]
+    out.corner[:], out.g_constants[:] = H[c, c], g[c]
     return out
 
 
@@ -148,7 +148,7 @@ def test_step_and_covariances_are_those_of_a_dense_solve():
     s = 1 / np.sqrt(np.diag(H))
     P = np.linalg.inv(H * np.outer(s, s)) * np.outer(s, s)
     x = P @ g
-    np.testing.assert_allclose(np.append(solved.step.ravel(), solved.step_border), x, rtol=1e-9)
+    np.testing.assert_allclose(np.append(solved.step.ravel(), solved.step_constants), x, rtol=1e-9)
     c = np.arange(N * STATES, TOTAL)
     np.testing.assert_allclose(solved.covariance, P[np.ix_(c, c)], rtol=1e-9)
     assert solved.log_determinant == pytest.approx(np.linalg.slogdet(H)[1], abs=1e-9)
@@ -166,13 +166,13 @@ def test_absent_constants_have_their_priors_as_if_they_were_in_the_border():
     normal.absent = weights
     some = solve(normal)
     whole, part = Normal(N, STATES, BORDER + 2), _as_chain(H, g)
-    for to, of in zip((whole.diagonal, whole.beside, whole.g),
-                      (part.diagonal, part.beside, part.g), strict=True):
+    for to, of in zip((whole.diagonal, whole.upper, whole.g),
+                      (part.diagonal, part.upper, part.g), strict=True):
         to[:] = of
-    whole.border[:, :, :BORDER], whole.corner[:BORDER, :BORDER] = part.border, part.corner
-    whole.corner[[-2, -1], [-2, -1]], whole.g_border[:BORDER] = weights, part.g_border
+    whole.coupling[:, :, :BORDER], whole.corner[:BORDER, :BORDER] = part.coupling, part.corner
+    whole.corner[[-2, -1], [-2, -1]], whole.g_constants[:BORDER] = weights, part.g_constants
     all_of = solve(whole)
-    for name in ('step', 'step_border', 'covariance', 'reduced', 'g_reduced'):
+    for name in ('step', 'step_constants', 'covariance', 'reduced', 'g_reduced'):
         np.testing.assert_allclose(getattr(some, name), getattr(all_of, name), rtol=1e-9,
                                    atol=1e-12, err_msg=name)
     assert some.log_determinant == pytest.approx(all_of.log_determinant, abs=1e-9)
@@ -201,7 +201,7 @@ def peak_of_a_pass(duration):
     _, config, leg = made(scenario='town', duration=duration, imu_rate=25.0, fix_rate=1.0)
     problem = make_problem(leg, config)
     state = cold_start(leg, problem.imu, problem.priors).state
-    levels = problem.first_levels.replaced(correlation_time=60.0)
+    levels = problem.initial_levels.replaced(correlation_time=60.0)
     tracemalloc.start()
     weighted = Equations(problem, state).at(levels)
     solved = solve(weighted.normal())

@@ -48,7 +48,7 @@ def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
     _, state = perfect
     step = np.zeros(layout.M)
     step[layout.PITCH] = turned
-    moved = state.moved(np.zeros((len(state.t), layout.BARE)), step)
+    moved = state.updated(np.zeros((len(state.t), layout.WITHOUT_SLOW)), step)
     assert abs(moved.constants[layout.PITCH]) <= np.pi / 2
     np.testing.assert_allclose(moved.forward, forward_b(
         state.constants[layout.YAW], state.constants[layout.PITCH] + turned), atol=1e-12)
@@ -57,7 +57,7 @@ def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
 
 def test_the_truth_fulfils_the_equations(perfect):
     problem, state = perfect
-    parts = Equations(problem, state).parts
+    parts = Equations(problem, state).factors
     r = np.abs(parts['motion'].raw)
     # trapezoid rule at 50 Hz: kinks of the profile within a step leave a few dt^2 / 12 of a jerk
     # of 3 m/s^3, 1e-4 m/s over an interval
@@ -91,7 +91,7 @@ def test_a_turn_is_no_braking():
     c = state.constants.copy()
     c[layout.TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
-    along = Equations(problem, state).parts['motion'].raw[:, 15]
+    along = Equations(problem, state).factors['motion'].raw[:, 15]
     speed = np.linalg.norm(state.v_n, axis=1)
     even = (np.abs(np.diff(speed)) < 1e-3) & (speed[1:] > 5.0)
     turned = np.abs(problem.imu.over_intervals(problem.imu.turn)[:, 2])
@@ -123,9 +123,10 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
     roll = 0.09
     drive, problem, state = at_truth(roll=roll)
-    motion = Equations(problem, state).parts['motion'].motion
+    motion = Equations(problem, state).factors['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
-    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN]
+    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(
+        layout.WITHOUT_SLOW)[2][:, 15:18, layout.BODY_LEAN]
     sizes = np.linalg.norm(by, axis=1).max(axis=0)
     assert (sizes > 0.1).all()
     # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
@@ -135,17 +136,17 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
 
 def along_axis(problem, state, axis, constants):
     """Return the odometer's residuals along an axis of the vehicle and how constants move them."""
-    part = Equations(problem, state).parts['motion']
+    part = Equations(problem, state).factors['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     return ((C_vn @ part.raw[:, 15:18, None])[:, axis, 0],
-            (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, constants])[:, axis])
+            (C_vn @ part.jacobians(layout.WITHOUT_SLOW)[2][:, 15:18, constants])[:, axis])
 
 
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
 def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
-    off, by = along_axis(problem, state, axis, layout.LEAN)
+    off, by = along_axis(problem, state, axis, layout.BODY_LEAN)
 
     def left(columns):
         c = np.linalg.lstsq(by[:, columns], off, rcond=None)[0]
@@ -159,7 +160,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
     _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
                                  real=Real(wheelbase=3.0))
-    off, by = along_axis(problem, state, 2, layout.PITCH_CENTRE)
+    off, by = along_axis(problem, state, 2, layout.PITCH_CENTRES)
     by = by[:, 0]
     centre = -(by @ off) / (by @ by)
     assert np.abs(off).max() > 1e-3       # m in a second
@@ -167,9 +168,10 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
     # no count lifts the odometer: what does is no part of what the scale multiplies
     c = state.constants.copy()
-    c[layout.PITCH_CENTRE.start] = centre
-    there, here = (Equations(problem, one).parts['motion'].jacobians(layout.BARE)[2] for one in (
-        replace(state, constants=c), state))
+    c[layout.PITCH_CENTRES.start] = centre
+    there, here = (
+        Equations(problem, one).factors['motion'].jacobians(layout.WITHOUT_SLOW)[2]
+        for one in (replace(state, constants=c), state))
     np.testing.assert_allclose(there[:, D, layout.LN_K], here[:, D, layout.LN_K], atol=1e-9)
 
 
@@ -177,7 +179,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
 def test_on_banked_ground_a_turn_pitches_the_vehicle_about_its_own_left_axis(banking):
     """The road takes all of the lateral force: it leans by its angle to gravity, inwards."""
     _, problem, state = at_truth(real=Real(banking=banking))
-    motion = Equations(problem, state).parts['motion'].motion
+    motion = Equations(problem, state).factors['motion'].motion
     rate, speed = motion.rate_n[:, 2], np.linalg.norm(state.v_n, axis=1)[:-1]
     want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
     steady = np.abs(np.gradient(rate)) < 0.01        # the lean is that at the begin
@@ -187,7 +189,7 @@ def test_on_banked_ground_a_turn_pitches_the_vehicle_about_its_own_left_axis(ban
 
 def test_bumps_may_have_another_centre_than_hills():
     _, problem, state = at_truth(slope=0.05)
-    motion = Equations(problem, state).parts['motion'].motion
+    motion = Equations(problem, state).factors['motion'].motion
     hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
     around = slice(HILL_INTERVALS, -HILL_INTERVALS)
     # the mean of five over a period of 2.5 is 0; over one of 40 it is a sinc: 0.974
@@ -200,7 +202,7 @@ def test_bumps_may_have_another_centre_than_hills():
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
     drive, problem, state = at_truth(slope=0.1)
-    motion = Equations(problem, state).parts['motion'].motion
+    motion = Equations(problem, state).factors['motion'].motion
     since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
     fast = there.speed > 2.0
@@ -220,9 +222,9 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     # on a level road the force along z is gravity, but for the tilt: the error a bias
     bias = state.accel_bias + [0.0, 0.0, error * 9.80154]
     state = replace(state, constants=c, accel_bias=bias)
-    r = Equations(problem, state).parts['motion'].raw
+    r = Equations(problem, state).factors['motion'].raw
     without, straight = perfect
-    kinks = Equations(without, straight).parts['motion'].raw
+    kinks = Equations(without, straight).factors['motion'].raw
     # no more than what the trapezoid rule leaves without a scale error; the error times the mean
     # force of each second would be off by 1 % of up to 0.2 m
     assert np.abs(r[:, :2] - kinks[:, :2]).max() < 2e-5
@@ -233,9 +235,10 @@ def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
     _, problem, state = at_truth(scenario='town')
     c = np.zeros(layout.M)
-    c[layout.LEAN.start] = 0.1
-    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), layout.BARE)), step))
-                      .parts['motion'].motion for step in (np.zeros(layout.M), c))
+    c[layout.BODY_LEAN.start] = 0.1
+    unmoved = np.zeros((len(state.t), layout.WITHOUT_SLOW))
+    level, leaning = (Equations(problem, state.updated(unmoved, step)).factors['motion'].motion
+                      for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
     # slower than a walk the direction of travel is not known
     walks = np.linalg.norm(level.displacement_by_state, axis=1) > WALK_SPEED * level.T[:, 0]
@@ -271,10 +274,10 @@ def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
 def test_a_turn_at_rest_has_the_variance_that_makes_it_an_outlier_of_three_sigmas():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    k = int(np.flatnonzero(problem.still[:-1] & problem.still[1:])[3])
+    k = int(np.flatnonzero(problem.at_rest[:-1] & problem.at_rest[1:])[3])
     step, tilt = np.zeros((len(state.t), WITH_SLOW)), 0.01
     step[k + 1:, PHI.start] = tilt
-    part = Equations(problem, state.moved(step, np.zeros(M))).parts['rests']
+    part = Equations(problem, state.updated(step, np.zeros(M))).factors['standstills']
     T = float(np.diff(state.t)[k])
     z2 = (tilt / STILL_TURN[0])**2 / T / 3
     variance = part.turn_variance[k]

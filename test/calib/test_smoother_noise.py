@@ -15,7 +15,7 @@ from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors import signals
 from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.odometer import once_a_rest
+from odocal_ros.estimator.factors.odometer import standstill_weights
 from odocal_ros.estimator.imu import white_noise_at_rest
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
@@ -78,8 +78,8 @@ def test_a_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most
 
 def test_rounding_that_stands_counts_once():
     still = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1], bool)
-    assert once_a_rest(still) == pytest.approx([1/2, 1/2, 1, 1, 1, 1, 1/3, 1/3, 1/3])
-    assert once_a_rest(np.zeros(3, bool)) == pytest.approx(1.0)
+    assert standstill_weights(still) == pytest.approx([1/2, 1/2, 1, 1, 1, 1, 1/3, 1/3, 1/3])
+    assert standstill_weights(np.zeros(3, bool)) == pytest.approx(1.0)
 
 
 def test_a_counter_that_stands_is_no_slip_of_the_wheel():
@@ -99,7 +99,7 @@ def scores(fitted):
     """Return the scores of the IMU's errors at the truth by noise alone, in their sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    weighted = Equations(problem, state, fitted=fitted).at(problem.first_levels)
+    weighted = Equations(problem, state, fitted=fitted).at(problem.initial_levels)
     rows = weighted[MotionRows]
     J = rows.J[:, :, -rows.m:]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))
@@ -155,7 +155,7 @@ def test_without_noise_the_whole_signal_counts(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
-        Equations(problem, state, fitted=x).at(problem.first_levels)[MotionRows]
+        Equations(problem, state, fitted=x).at(problem.initial_levels)[MotionRows]
         for x in (False, True)))
     for i, name in enumerate(CONSTANTS[:raw.shape[2]]):
         if name in GYRO_ERRORS or name in ACCEL_ERRORS and road is BANKED:

@@ -53,7 +53,7 @@ def test_rows_are_true_at_the_truth():
                             heading_sigma=0.0, **ARMS)
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    parts = Equations(problem, state).parts
+    parts = Equations(problem, state).factors
     # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
     assert np.abs(parts['velocity'].raw).max() < 5e-3
     # within a step of 20 ms the turn is taken to first order: (0.02 s 0.5 rad/s)^2 / 2
@@ -209,7 +209,7 @@ def test_rows_vanish_at_the_truth_but_for_the_constants():
                             **HILLS | {'pressure_sigma': 0.0})
     leg = replace(leg_of(drive.leg(), config), t_stop=60.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    part = Equations(problem, state).parts['pressure']
+    part = Equations(problem, state).factors['pressure']
     _, by_constants = part.jacobians(16)
     by = by_constants[:, 0, PRESSURE]
     left = part.raw[:, 0] - by @ np.linalg.lstsq(by, part.raw[:, 0], rcond=None)[0]

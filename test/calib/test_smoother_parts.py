@@ -59,15 +59,15 @@ def moved():
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, layout.PHI.start:layout.BG.stop] *= 0.1
     c = 1e-3 * np.insert(rng.standard_normal(layout.M - 4), [
-        layout.FIX_TIME, *3 * [layout.BY_SIGMA.start - 1]], 1.0)
+        layout.FIX_MOTION_TIME, *3 * [layout.FIX_ERROR_BY_SIGMA.start - 1]], 1.0)
     # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
     # of the size that there is: derivatives leave out how these change what the others do
-    c[layout.SPEED_OFFSET], c[layout.FIX_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
-    c[layout.IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
-                            0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3]
+    c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
+    c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
+                                0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3]
     c[layout.FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     c[layout.VELOCITY_LAG2] = 2.1e-4
-    return problem, state.moved(step, c)
+    return problem, state.updated(step, c)
 
 
 @pytest.fixture(scope='module')
@@ -81,7 +81,7 @@ def stepping(moved):
     path = Travel(t, np.cumsum(coarse.value) * 0.1, 0.0, coarse)
     c = np.zeros(layout.M)
     c[layout.LN_K], c[layout.SPEED_OFFSET] = -np.log(leg.rough_scale), 0.1
-    state = state.moved(np.zeros((len(state.t), N)), c)
+    state = state.updated(np.zeros((len(state.t), N)), c)
     return replace(problem, leg=replace(leg, travel=path, rough_scale=1.0)), state
 
 
@@ -95,7 +95,7 @@ def without_steps(problem, state):
 
 
 def part_at(problem, state, name):
-    return Equations(problem, state).parts[name]
+    return Equations(problem, state).factors[name]
 
 
 # in a local frame the bias of the accelerometer turns with a robot
@@ -135,7 +135,7 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name, loca
                 step[even, i] = size
             else:
                 c[i - N] = size
-            return part_at(point, state.moved(step, c), name).raw
+            return part_at(point, state.updated(step, c), name).raw
 
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
@@ -163,12 +163,12 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
     problem, state = stepping
     # steps so fine that the way is heard, of the same way
     problem = replace(problem, leg=replace(problem.leg, rough_scale=0.1))
-    assert not problem.leg.by_steps
+    assert not problem.leg.uses_speed_steps
 
     def raw(size):
         c = np.zeros(layout.M)
         c[layout.SPEED_OFFSET] = size
-        return part_at(problem, state.moved(np.zeros((len(state.t), N)), c), 'motion').raw
+        return part_at(problem, state.updated(np.zeros((len(state.t), N)), c), 'motion').raw
 
     by_offset = part_at(problem, state, 'motion').jacobians(N)[2][:, :, layout.SPEED_OFFSET]
     np.testing.assert_allclose((raw(0.01) - raw(-0.01)) / 0.02, by_offset, atol=1e-9)
@@ -181,7 +181,7 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     problem, state = stepping if name == 'steps' else moved
     # so wide that nothing lies far out: squares only
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
-    levels = problem.first_levels.replaced(correlation_time=40.0, **wide)
+    levels = problem.initial_levels.replaced(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighted_copy(levels, layout.M)
     normal = Normal(len(state.t), N, layout.M)
     part.add(normal)
@@ -190,22 +190,23 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     # the start is held, that the chain can be solved: no prior
     x[0, layout.P.start:layout.PHI.stop] = 0.0
     # H x by blocks of the chain
-    Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.border @ c
-    Hx[:-1] += np.einsum('kij,kj->ki', normal.beside, x[1:])
-    Hx[1:] += np.einsum('kji,kj->ki', normal.beside, x[:-1])
-    Hc = normal.corner @ c + np.einsum('kij,ki->j', normal.border, x)
-    change = (x * Hx).sum() + c @ Hc - 2 * ((normal.g * x).sum() + normal.g_border @ c)
+    Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.coupling @ c
+    Hx[:-1] += np.einsum('kij,kj->ki', normal.upper, x[1:])
+    Hx[1:] += np.einsum('kji,kj->ki', normal.upper, x[:-1])
+    Hc = normal.corner @ c + np.einsum('kij,ki->j', normal.coupling, x)
+    change = (x * Hx).sum() + c @ Hc - 2 * ((normal.g * x).sum() + normal.g_constants @ c)
     before = part.cost()
-    part.apply_step(x, c, state.moved(x, c))
+    part.apply_step(x, c, state.updated(x, c))
     # standstills take their turns anew: of second order in 1e-3 rad
-    assert part.cost() - before == pytest.approx(change, rel=1e-2 if name == 'rests' else 1e-6)
+    rel = 1e-2 if name == 'standstills' else 1e-6
+    assert part.cost() - before == pytest.approx(change, rel=rel)
     assert change != 0.0
 
 
 @pytest.mark.parametrize('name', ['slow', 'slow_up', 'correlation_time'])
 def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
     problem, state = moved
-    levels = problem.first_levels.replaced(correlation_time=20.0, slow=0.01, slow_up=0.02,
+    levels = problem.initial_levels.replaced(correlation_time=20.0, slow=0.01, slow_up=0.02,
                                            fix=1e4, fix_up=1e4, velocity=1.0)
 
     weighted, solved, at = least(problem, state, levels)
@@ -232,7 +233,7 @@ def least(problem, state, levels):
 
     for _ in range(3):
         _, solved, _ = at(levels)
-        state = state.moved(solved.step, solved.step_border)
+        state = state.updated(solved.step, solved.step_constants)
     return *at(levels)[:2], at
 
 
@@ -257,7 +258,7 @@ def sized(problem, where, sigma, centre):
 def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, name, where, prior):
     problem, state = moved
     problem = sized(problem, where, prior, 1.5 * prior)
-    levels = problem.first_levels
+    levels = problem.initial_levels
     weighted, solved, at = least(problem, state, levels)
     found = weighted[PriorRows].sizes(solved.marginals())[name]
     # 1.5 of the prior for each, against the log-normal prior of the size
@@ -274,7 +275,7 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(moved):
     where = layout.CONSTANTS.index('squat_by_jerk')
     # known to 1e-3 by the drive, to 7e-6 by the prior; a misfit pulls by 100 sigmas of the drive
     problem = sized(problem, where, 1e-5, 0.1)
-    levels = problem.first_levels
+    levels = problem.initial_levels
     weighted, solved, at = least(problem, state, levels)
     name = 'size_squat_by_jerk'
     assert slope(at, levels, name) > 0.1         # the likelihood would have it grow

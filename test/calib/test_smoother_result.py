@@ -22,7 +22,7 @@ from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.estimates import estimate_constants, FittedConstants
 from odocal_ros.estimator.result.outcome import make_result
-from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
+from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECTIONS, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
 
@@ -98,9 +98,9 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     _, method = result()
     details = method.details
     usual = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
-                      for name in CONSTANTS[IMPERFECT]])
+                      for name in CONSTANTS[IMPERFECTIONS]])
     problem = make_problem(leg, config)
-    problem.priors.constants[IMPERFECT] = usual
+    problem.priors.constants[IMPERFECTIONS] = usual
     covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
         Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
@@ -178,7 +178,7 @@ def test_what_still_moves_far_widens_by_as_much():
     problem = make_problem(leg, config)
     start = cold_start(leg, problem.imu, problem.priors).state
     start.constants[YAW] += 0.1         # far off, and but one pass
-    method = make_result(leg, problem, fit(problem, start, problem.first_levels, 1), config)
+    method = make_result(leg, problem, fit(problem, start, problem.initial_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',
                            reason_texts(method)[Code.MODEL_MISMATCH])[1])
     assert move > 10.0

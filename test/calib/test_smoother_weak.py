@@ -130,14 +130,14 @@ def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
     turn = interval_noise.total_turn(leg, problem.imu)
     assert turn == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
     biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
-    assert make_problem(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
+    assert make_problem(biased, config).total_turn == pytest.approx(problem.total_turn, rel=0.02)
     _, config, leg = straight()
-    assert make_problem(leg, config).turned == 0.0
+    assert make_problem(leg, config).total_turn == 0.0
 
 
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
     angles = np.deg2rad(np.arange(0.0, 270.0))
-    least = np.array([interval_noise.least_sideslip(a) for a in angles])
+    least = np.array([interval_noise.min_sideslip(a) for a in angles])
     assert least[:90] == pytest.approx(interval_noise.ORDINARY_ROAD)
     assert least[181:] == pytest.approx(interval_noise.TURN_SLIDE)
     # a factor of 80 over 90 deg: 5 % a degree

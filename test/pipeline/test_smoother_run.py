@@ -14,7 +14,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.drive import motion_reasons
 from odocal_ros.calib.gyro_axes import turn_ratio
 from odocal_ros.data.leg import part_of
-from odocal_ros.estimator.fit import CONVERGENCE
+from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.leg import drift_time, SmootherLeg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, rough_scale
 from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north

@@ -64,7 +64,7 @@ class Axle:
 
     def accelerations(self) -> Floats:
         """
-        Return accelerations and jerks of each interval in the order of LEAN: (K, 4).
+        Return accelerations and jerks of each interval in the order of BODY_LEAN: (K, 4).
 
         Acceleration forward (including the component of gravity on a slope) and left, m/s^2, and
         their rates of change, m/s^3.

@@ -23,7 +23,7 @@ from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
+from odocal_ros.estimator.state import Priors, State, WITH_SLOW, WITHOUT_SLOW
 
 # levels of the IMU: white noises, and random walks of its biases
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
@@ -77,7 +77,7 @@ class Factor:
         return True
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         """Return the initial and the minimum variances, by the names of its levels."""
         return {}, {}
 
@@ -89,7 +89,7 @@ class Factor:
         """Return a copy with weighted rows and the first m constants."""
         new = copy(self)
         new.levels, new.m = levels, m
-        new.n = WITH_SLOW if levels.correlation_time else BARE
+        new.n = WITH_SLOW if levels.correlation_time else WITHOUT_SLOW
         new.weigh(levels)
         return new
 
@@ -118,14 +118,15 @@ class Factor:
         """Yield the names of error sources and the effects of their unit errors: (..., 3, k)."""
         return ()
 
-    def with_parameters(self, block: Floats) -> Floats:
+    def parameter_covariances(self, block: Floats) -> Floats:
         """Return the cross-covariance of scale, yaw, pitch and the unknowns: (k, 3, 2n + M)."""
         return block[:, 2 * self.n:2 * self.n + PARAMETER_COUNT, :]
 
-    def all_with_parameters(self, marginals: JointMarginals) -> Floats:
+    def all_parameter_covariances(self, marginals: JointMarginals) -> Floats:
         """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would keep the whole block in memory
-        return np.concatenate([self.with_parameters(block).copy() for block in marginals.blocks()])
+        return np.concatenate([self.parameter_covariances(block).copy()
+                               for block in marginals.blocks()])
 
 
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
@@ -145,15 +146,15 @@ def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floa
                 residual: Floats) -> None:
     """Add a first-order process over all intervals, (K, c): x at the end less decay times x."""
     i = np.arange(out.g.shape[1])[columns]
-    all_of = np.broadcast_shapes(np.shape(residual), (len(out.beside), len(i)))
+    all_of = np.broadcast_shapes(np.shape(residual), (len(out.upper), len(i)))
     terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,
              weight * residual)
     own, end, across, pull, pull_end = (np.broadcast_to(x, all_of) for x in terms)
-    for rows in blocks(len(out.beside)):
+    for rows in blocks(len(out.upper)):
         out.diagonal[rows, i, i] += own[rows]
-        out.beside[rows, i, i] -= across[rows]
+        out.upper[rows, i, i] -= across[rows]
         out.g[rows, i] += pull[rows]
-    for rows in blocks(len(out.beside)):
+    for rows in blocks(len(out.upper)):
         ends = slice(rows.start + 1, rows.stop + 1)
         out.diagonal[ends, i, i] += end[rows]
         out.g[ends, i] -= pull_end[rows]

@@ -17,8 +17,8 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows, Rows
-from odocal_ros.estimator.leg import ExternalSamples, from_place, thinned
-from odocal_ros.estimator.levels import LEAST
+from odocal_ros.estimator.leg import enu_to_n, ExternalSamples, thinned
+from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.receiver_filter import own_odometer_error, smoothing_error
@@ -43,10 +43,10 @@ class Fixes(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points['fixes']
-        self.state, self.points, self.root = state, points, problem.root
+        self.state, self.points, self.whitening = state, points, problem.fix_whitening
         super().__init__(problem, points)
         k, tau = self.k, points.tau[:, None]
-        self.t_fix = leg.t_fix[problem.use]
+        self.t_fix = leg.t_fix[problem.used_fixes]
         self.C = state.C_nb[k]
         dp = rotate(self.C, points.dp)
         v = state.v_n[k]
@@ -64,7 +64,7 @@ class Fixes(PointRows):
         self.v_n = v + rotate(self.C, points.dv) + g * tau + rotate(
             self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
-        raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
+        raw = leg.fixes_n[problem.used_fixes] - place - self.arm_n - slow
         # noise in these derivatives would determine accelerometer errors: decision 9
         fitted = rotate(transpose(self.C), np.diff(state.v_n, axis=0)[k] / T[:, None] - g)
         measured = point.intervals.dv[k] / T[:, None]
@@ -74,12 +74,12 @@ class Fixes(PointRows):
                  state.t[k] + points.tau)
         smoothed, self.by_lag = smoothing_error(*track, state.constants[layout.FIX_LAG2])
         added, self.by_motion, self.by_time = own_odometer_error(
-            *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_TIME])
-        stated = leg.stated_sigma[problem.use]
+            *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_MOTION_TIME])
+        stated = leg.stated_sigma[problem.used_fixes]
         # a constant error does not affect the results
         self.by_sigma = stated - np.median(stated, axis=0)
         raw[:, 2] -= state.constants[layout.HEIGHT_DRIFT] * self.t_fix
-        raw -= state.constants[layout.BY_SIGMA] * self.by_sigma
+        raw -= state.constants[layout.FIX_ERROR_BY_SIGMA] * self.by_sigma
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
@@ -96,9 +96,10 @@ class Fixes(PointRows):
         J[:, :, layout.P], J[:, :, layout.V] = -one, -one * tau
         J[:, :, layout.PHI] = skew(self.dp + self.arm_n)
         J[:, :, layout.BA] = self.C @ self.points.AA
-        by_gyro = -self.C @ self.points.dp_by - skew(self.arm_n) @ self.C @ self.points.turned
+        by_gyro = -self.C @ self.points.dp_by_gyro - skew(
+            self.arm_n) @ self.C @ self.points.R_by_gyro
         J[:, :, layout.BG], c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
-        if n > layout.BARE:
+        if n > layout.WITHOUT_SLOW:
             J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
         c[:, :, layout.YAW], c[:, :, layout.PITCH] = (
@@ -108,31 +109,32 @@ class Fixes(PointRows):
         c[:, :, layout.GNSS_DELAY] = self.v_n
         c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
         c[:, 2, layout.HEIGHT_DRIFT] = -self.t_fix
-        c[:, :, layout.BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
+        c[:, :, layout.FIX_ERROR_BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
         c[:, :, layout.FIX_LAG2] = -self.by_lag
-        c[:, :, layout.FIX_BY_MOTION], c[:, :, layout.FIX_TIME] = -self.by_motion, -self.by_time
+        c[:, :, layout.FIX_BY_MOTION] = -self.by_motion
+        c[:, :, layout.FIX_MOTION_TIME] = -self.by_time
         c[:, :, layout.ACCEL] = self.C @ (self.points.FF + self.signal_noise * tau**2 / 2)
         return J, c
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        least = (problem.fix_least / problem.fix_sigma)**2
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        least = (problem.min_fix_sigma / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        t = problem.leg.t_fix[problem.use]
+        t = problem.leg.t_fix[problem.used_fixes]
         # the delay is that at the start mark
         out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        return self.root[some] @ rows
+        return self.whitening[some] @ rows
 
     def existing_components(self) -> Bools:
         """Return a mask of the components that exist, (m, 3); fixes without height have two."""
         known = np.ones((len(self.k), 3), bool)
-        known[:, 2] = self.root[:, 2, 2] > 1e-5
+        known[:, 2] = self.whitening[:, 2, 2] > 1e-5
         return known
 
 
@@ -183,7 +185,7 @@ class VelocityRows(ExternalRows):
         t, variance = t[some], sent.variance_n[some, :2]
         known = np.isfinite(variance) & (variance > 0)
         sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
-        v_n = (from_place(inputs, t, origin) @ sent.velocity_n[some, :, None])[:, :2, 0]
+        v_n = (enu_to_n(inputs, t, origin) @ sent.velocity_n[some, :, None])[:, :2, 0]
         return Velocity(t, v_n, sigma)
 
     @staticmethod
@@ -213,11 +215,12 @@ class VelocityRows(ExternalRows):
         times = 1 + state.constants[layout.VELOCITY_SCALE]
         m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
         measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
-        J, c = np.zeros((m, 3, layout.BARE)), np.zeros((m, 3, layout.M))
+        J, c = np.zeros((m, 3, layout.WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
         J[:, :, layout.V] = -np.eye(3)
         J[:, :, layout.PHI] = skew(dv + swing)
         J[:, :, layout.BA] = C @ points.A
-        by_gyro, by_rate = -C @ points.dv_by - skew(swing) @ C @ points.turned, -C_t @ skew(arm_b)
+        by_gyro = -C @ points.dv_by_gyro - skew(swing) @ C @ points.R_by_gyro
+        by_rate = -C_t @ skew(arm_b)
         J[:, :, layout.BG] = by_gyro[:, :, :3] + by_rate
         c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
             by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
@@ -237,9 +240,9 @@ class VelocityRows(ExternalRows):
         return out
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         # before the delay is known, residuals are larger
-        first, least = super().first_levels(problem)
+        first, least = super().initial_levels(problem)
         sent = problem.external[cls.name]
         assert isinstance(sent, Velocity)
         sigma = float(np.median(sent.sigma))
@@ -247,4 +250,4 @@ class VelocityRows(ExternalRows):
 
     @staticmethod
     def least(sent: Velocity) -> dict[str, float]:
-        return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
+        return {'velocity': (MIN_NOISE.velocity / float(np.median(sent.sigma)))**2}

@@ -2,13 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Variance components of an interval, and the effect of a unit of each on its rows, (S13).
+Noise of the motion in an interval between keyframes: docs/method.md (S13).
+
+The covariance of the 18 rows of an interval (motion.py) is a sum over independent noises: of the
+IMU, of the road under the wheels, and known ones such as gaps. ``IntervalNoise`` has the effect of
+each noise, at unit variance, on the rows. Those of IMU and road are multiplied by the roots of
+their levels, which the fit estimates.
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
 time is a two-point Gauss rule. With constant force and speed the integrand is a polynomial in
 time. The rule is exact up to the third order, and 3 % off for the small terms of fourth order
-(position by gyro noise). Each column is the effect of one independent noise of unit variance: the
-root of its level is a factor on it (docs/method.md).
+(position by gyro noise).
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
@@ -35,7 +39,7 @@ from odocal_ros.nav.time_series import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import SWAY
 
-# m/sqrt(s), lower limit of sideslip if turns determine it. Tuned: the yaw sigma of simulated
+# m/sqrt(s), lower limit of sideslip noise if turns determine it. Tuned: the yaw sigma of simulated
 # vehicles, which do not slide, then matches their errors (docs/decisions/0005)
 TURN_SLIDE = 2e-4
 # m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
@@ -48,10 +52,13 @@ PITCHING, PITCHING_LEAST = 0.03, 1e-4
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn angle: one corner does not determine sideslip, two do. Judgement
 CORNER_ANGLE = np.pi / 2
+# levels whose lower limit is that of sideslip
 SIDEWAYS = ('side', 'side_turn', 'up')
-# levels of the road, variance per second as those of IMU, and the axis of the vehicle
+# levels of the motion that the odometer does not measure, m^2/s, and the index of their axis:
+# forward, left, up. _hard: while accelerating or braking; _turn: in turns; pitching: m^2/rad^2, by
+# the pitch of the body within the interval
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
-INTERVAL = (*IMU, *ROAD)
+INTERVAL = (*IMU, *ROAD)    # all levels of an interval
 # definition: Gauss and Legendre's nodes and weights on 0 to 1
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(2)[1] / 2
@@ -73,25 +80,27 @@ def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
     up = imu.signals[:, 3:].sum(axis=0)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
     path = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
-    return float(angle[(angle > TURNING_RATE * T) & (path > 0.2 * T)].sum())    # m/s: moving
+    moving = path > 0.2 * T     # m/s
+    return float(angle[moving & (angle > TURNING_RATE * T)].sum())
 
 
-def least_sideslip(angle: float) -> float:
-    """Return the minimum sideways and vertical noise, m/sqrt(s), by the total turn angle, rad."""
+def min_sideslip(angle: float) -> float:
+    """Return the lower limit of sideslip noise, m/sqrt(s); angle : rad, of all turns of a leg."""
     corners = np.clip((angle - CORNER_ANGLE) / CORNER_ANGLE, 0.0, 1.0)
     return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**corners)
 
 
 def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     """Return the reason that reports an assumed road noise, if it affects the result."""
-    least = problem.least['side']
+    least = problem.min_levels['side']
     if least < 2e-3**2 or all(      # m^2/s, smallest that is reported
             levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
     return [Reason(
         Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
-        f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to {np.rad2deg(problem.turned):.0f} deg, '
-        f'less than the limit of {np.rad2deg(2 * CORNER_ANGLE):.0f} deg. '
+        f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to '
+        f'{np.rad2deg(problem.total_turn):.0f} deg, less than the limit of '
+        f'{np.rad2deg(2 * CORNER_ANGLE):.0f} deg. '
         f'{1e3 * np.sqrt(least):.0f} mm/√s of sideslip are assumed; the uncertainties of the '
         'mounting angles depend on this value', 'Drive with left and right turns.')]
 
@@ -99,30 +108,31 @@ def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
 @dataclass(eq=False)
 class IntervalNoise:
     """
-    The noises of K intervals; the effect of a unit of each on the rows, (K, 18, c), in chunks.
+    The independent noises of K intervals.
 
-    component : (c,) index in INTERVAL of each column.
+    Estimated are c unit noises: those of IMU at the Gauss points, three axes each, then those of
+    ROAD. Their effects, (K, 18, c), are computed for some intervals at a time.
     """
 
     motion: Motion
-    axes: Floats                       # (K, 3, 3) rows: forward, left, up
-    imu: Floats                        # (K, 4) factors on the unit noises of IMU
-    road: Floats                       # (K, 6) effects of the unit noises of ROAD along their axes
-    extra: Floats                      # (K, 18) variances that are given, not estimated
-    given: Floats                      # (K, 18, g) columns of unit noises that are given, too
-    component: ClassVar[Ints] = np.array(
+    axes: Floats                # (K, 3, 3) axes of the vehicle in n; rows: forward, left, up
+    imu: Floats                 # (K, 4) roots of the variance factors of IMU
+    road: Floats                # (K, 6) displacement by unit noises of ROAD along their axes
+    known_variances: Floats     # (K, 18) of the rows, not estimated
+    known_columns: Floats       # (K, 18, g) effects of unit noises that are not estimated either
+    component: ClassVar[Ints] = np.array(       # (c,) index in INTERVAL of each unit noise
         len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
         + [INTERVAL.index(name) for name in ROAD])
 
     def columns(self, rows: slice) -> Floats:
-        """Return the effects of unit noises in the intervals of a slice: (k, 18, c)."""
+        """Return the effects of unit noises on the rows of a slice of intervals: (k, 18, c)."""
         motion = self.motion.take(rows)
         T, C = motion.T[:, 0], motion.C
         force, displacement = skew(motion.dv / motion.T), skew(motion.displacement / motion.T)
         one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
         out = np.zeros((len(T), ROWS, len(self.component)))
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
-            u = ((1 - x) * T)[:, None, None]
+            u = ((1 - x) * T)[:, None, None]        # s, from the noise to the end
             gyro, accel, gyro_walk, accel_walk = (
                 out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
             gyro[:, PHI], gyro[:, V] = -one, force * u
@@ -140,21 +150,21 @@ class IntervalNoise:
             out[:, D, column] = self.axes[rows, axis] * root[:, None]
         return out
 
-    def grown(self, by: dict[str, float]) -> Floats:
-        """Return factors on the variances along, side, up and of IMU by new levels: (K, 7)."""
+    def variance_ratios(self, level_ratios: dict[str, float]) -> Floats:
+        """Return ratios of the variances of VARIANCE_FACTORS before JUMP, new to old: (K, 7)."""
         out = np.ones((len(self.road), JUMP))
-        out[:, IMU_NOISE] = [by[name] for name in IMU]
+        out[:, IMU_NOISE] = [level_ratios[name] for name in IMU]
         for column, (name, axis) in enumerate(ROAD.items()):
-            out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
+            out[:, axis] = np.where(self.road[:, column] > 0, level_ratios[name], out[:, axis])
         return out
 
     def covariance(self, units: Floats, rows: slice) -> Floats:
-        """Return the covariance of the rows of some intervals with these unit noises."""
+        """Return the covariances of some intervals, (k, 18, 18); units : effects in sigmas."""
         Q = units @ np.swapaxes(units, 1, 2)
-        given = self.given[rows]
-        if given.shape[2]:
-            Q += given @ np.swapaxes(given, 1, 2)
-        Q[:, range(ROWS), range(ROWS)] += self.extra[rows]
+        known = self.known_columns[rows]
+        if known.shape[2]:
+            Q += known @ np.swapaxes(known, 1, 2)
+        Q[:, range(ROWS), range(ROWS)] += self.known_variances[rows]
         return Q
 
 
@@ -163,7 +173,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     """
     Return the noises of a motion.
 
-    rest : (K,) bool, intervals at standstill: their odometer noise is given, since it does not
+    rest : (K,) bool, intervals at standstill: their odometer noise is known, since it does not
         depend on the noise in motion.
     variance_factors : (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals.
     """
@@ -173,25 +183,25 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.displacement, axis=1) / T
     root_path = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
-    hard, turning = hard_and_turning(motion)
+    hard, turning = accelerating_and_turning(motion)
     variance_factors = np.ones(
         (K, VARIANCE_FACTOR_COUNT)) if variance_factors is None else variance_factors
     magnitudes = (root_path * ~hard, root_path * hard, root_path * ~turning, root_path * turning,
                   root_path, np.sqrt(2 * motion.half_pitch_variance))
     road = np.stack([magnitude * ~rest * np.sqrt(variance_factors[:, axis])
                      for axis, magnitude in zip(ROAD.values(), magnitudes, strict=True)], -1)
-    extra = _given_variances(motion, leg)
-    still_variance = rest_noise(speed, rest)
-    extra[rest, D] += still_variance
+    known_variances = _known_variances(motion, leg)
+    rest_variance = rest_noise(speed, rest)
+    known_variances[rest, D] += rest_variance
     slow = ~rest & (speed < 1.0)
-    extra[slow, D] += still_variance * (1 - speed[slow, None])
-    return IntervalNoise(motion, axes, np.sqrt(variance_factors[:, IMU_NOISE]), road, extra,
-                         _given_noises(motion, leg, axes, rest))
+    known_variances[slow, D] += rest_variance * (1 - speed[slow, None])
+    return IntervalNoise(motion, axes, np.sqrt(variance_factors[:, IMU_NOISE]), road,
+                         known_variances, _known_columns(motion, leg, axes, rest))
 
 
-def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
+def _known_columns(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
     """
-    Return noises of travel from quantised speeds: (K, 18, g).
+    Return the effects of unit errors of a quantised speed on the rows: (K, 18, g).
 
     Fine steps are rounding noise. Coarse steps are not used along the path; ``SpeedSteps`` uses
     their transitions. In a turn, a quantisation error that changes within the interval displaces
@@ -200,29 +210,29 @@ def _given_noises(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -
     coarse = leg.travel.coarse
     if coarse is None:
         return np.zeros((len(rest), ROWS, 0))
-    if not leg.by_steps:
+    if not leg.uses_speed_steps:
         sigma = motion.state.scale * np.sqrt(coarse.travel_variance(motion.state.t))
-        given = np.zeros((len(rest), ROWS, 1))
-        given[:, D, 0] = axes[:, 0] * sigma[:, None]
-        return given * ~rest[:, None, None]
+        columns = np.zeros((len(rest), ROWS, 1))
+        columns[:, D, 0] = axes[:, 0] * sigma[:, None]
+        return columns * ~rest[:, None, None]
     # first column: unknown path length along the rolling direction, without pitching of the body
     size = np.linalg.norm(motion.wheel_displacement, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.wheel_displacement / np.maximum(size, 1e-3), axes[:, 0])
     turn_angle = motion.turning * motion.T[:, 0]
-    path_error = motion.state.scale * coarse.most * motion.T[:, 0]
-    given = np.zeros((len(rest), ROWS, 2))
-    given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
-    given[:, D, 1] = axes[:, 1] * (path_error * turn_angle / 8)[:, None]
-    return given * ~rest[:, None, None]
+    path_error = motion.state.scale * coarse.max_error * motion.T[:, 0]
+    columns = np.zeros((len(rest), ROWS, 2))
+    columns[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
+    columns[:, D, 1] = axes[:, 1] * (path_error * turn_angle / 8)[:, None]
+    return columns * ~rest[:, None, None]
 
 
 def rest_noise(speed: Floats, rest: Bools) -> float:
-    """Return the variance of the travel of an interval at rest, m^2."""
+    """Return the variance of the travel of an interval at rest, m^2; speed : (K,) m/s."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s: judgement
     return max(measured, REST_NOISE**2)
 
 
-def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
+def accelerating_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     """Return masks of the intervals with acceleration or braking, and with turns: (K,) each."""
     # above 0.5 m/s^2 a wheel may slip, above TURNING_RATE it may slide
     T = motion.T[:, 0]
@@ -233,28 +243,27 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     return hard, motion.turning > TURNING_RATE
 
 
-def _given_variances(motion: Motion, leg: SmootherLeg) -> Floats:
+def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     """Return variances of the motion within gaps and outside the odometer samples: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
-    extra = np.zeros((len(T), ROWS))
+    variances = np.zeros((len(T), ROWS))
     # s: motion within a longer step between IMU samples is unknown
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    rate, force = HIDDEN_RATE, HIDDEN_FORCE
-    extra[:, PHI] = (rate * gap[:, None])**2
-    extra[:, V] = (force * gap[:, None])**2
-    extra[:, P] = (force * gap * T)[:, None]**2
+    variances[:, PHI] = (HIDDEN_RATE * gap[:, None])**2
+    variances[:, V] = (HIDDEN_FORCE * gap[:, None])**2
+    variances[:, P] = (HIDDEN_FORCE * gap * T)[:, None]**2
     t, travel = motion.state.t, leg.travel
     stamp = stamp_of(t, motion.state.constants)
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
-    extra[outside, D] = ABSENT_VARIANCE
-    extra[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
+    variances[outside, D] = ABSENT_VARIANCE
+    variances[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
     for at, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
             near = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
-            extra[near, D] += (motion.state.scale * sigma)**2
-    return extra
+            variances[near, D] += (motion.state.scale * sigma)**2
+    return variances
 
 
 def _gap_variances(stamp: Floats, travel: Travel, scale: float) -> Floats:

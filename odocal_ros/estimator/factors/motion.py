@@ -23,10 +23,9 @@ from odocal_ros.estimator.state import (
     ACCEL,
     BA,
     BG,
-    BY_PITCHING,
+    BODY_LEAN,
     E,
     GYRO,
-    LEAN,
     LN_K,
     M,
     ODO_ARM,
@@ -36,7 +35,8 @@ from odocal_ros.estimator.state import (
     P,
     PHI,
     PITCH,
-    PITCH_CENTRE,
+    PITCH_CENTRES,
+    SCALE_BY_PITCHING,
     SPEED_OFFSET,
     State,
     TYRES,
@@ -84,7 +84,8 @@ class Motion:
                  fitted: bool = False) -> None:
         leg, self.axle = problem.leg, Axle(problem, state)
         self.state, self.sums, self.fitted = state, intervals, fitted
-        self.by_steps, self.swings = leg.by_steps, problem.swings
+        self.uses_speed_steps = leg.uses_speed_steps
+        self.angle_covariances = problem.angle_covariances
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
@@ -161,7 +162,7 @@ class Motion:
     @property
     def vertical_shift(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
-        return self.by_pitch_centre @ self.state.constants[PITCH_CENTRE]
+        return self.by_pitch_centre @ self.state.constants[PITCH_CENTRES]
 
     def _vary_axis(self) -> Floats:
         """Return the change of the scaled forward axis, (K, 3), (S11), (S12); set its signals."""
@@ -172,10 +173,11 @@ class Motion:
         self.tyre_signals = tyre_signals_at(
             speed, self.t_middle - state.t[0],
             self.axle.acceleration()) - self.axle.means_by_path(self.sums)
-        self.half_pitch_variance = np.maximum(self.left @ self.swings @ self.left, 0.0) / 2
+        self.half_pitch_variance = np.maximum(
+            self.left @ self.angle_covariances @ self.left, 0.0) / 2
         self.scale_ratio = 1 + self.tyre_signals @ c[TYRES, None] + self.half_pitch_variance[
-            :, None] * c[BY_PITCHING]
-        pitch, yaw = (self.lean_accelerations * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
+            :, None] * c[SCALE_BY_PITCHING]
+        pitch, yaw = (self.lean_accelerations * c[BODY_LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up; not by turns of a body that rolls
         self.rate_n = rotate(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
@@ -229,13 +231,13 @@ class Motion:
         a, b = np.zeros((K, ROWS, n)), np.zeros((K, ROWS, n))
         arm_b = state.C_bv @ self.arm_v
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
-        gyro = np.zeros((K, ROWS, s.turned.shape[2]))       # by the gyro's bias and constants
-        gyro[:, PHI], gyro[:, V], gyro[:, P] = C @ s.turned, -C @ s.dv_by, -C @ s.dp_by
-        gyro[:, D] = -C @ s.S_by
+        gyro = np.zeros((K, ROWS, s.R_by_gyro.shape[2]))       # by the gyro's bias and constants
+        gyro[:, PHI], gyro[:, V] = C @ s.R_by_gyro, -C @ s.dv_by_gyro
+        gyro[:, P], gyro[:, D] = -C @ s.dp_by_gyro, -C @ s.S_by_gyro
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: they do not affect the faster part
         lift = T * (C @ self.up)[:, :, None]
-        hills, _, turns, tilted = state.constants[PITCH_CENTRE]
+        hills, _, turns, tilted = state.constants[PITCH_CENTRES]
         a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
                                + turns * self.left + tilted * self.up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
@@ -271,7 +273,7 @@ class Motion:
         c[:, D, LN_K] = self.vertical_shift - displacement
         by_scale = c[:, D, LN_K] / self.scale_ratio
         c[:, D, TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
-        c[:, D, BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
+        c[:, D, SCALE_BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
         for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
             tilt = np.einsum('ki,ki->k', self.displacement_by_state,
                              (C + self.C_end) @ gradient[:, 2] / 2)
@@ -280,9 +282,9 @@ class Motion:
                     tilt * self.slope_gradient)[:, None]
         for i, axis in enumerate((self.up, -self.left)):
             turned = C @ s.S @ (state.scale * axis)
-            c[:, D, LEAN.start
-              + i:LEAN.stop:2] = -turned[:, :, None] * self.lean_accelerations[:, None, i::2]
-        c[:, D, PITCH_CENTRE] = -self.by_pitch_centre
+            c[:, D, BODY_LEAN.start
+              + i:BODY_LEAN.stop:2] = -turned[:, :, None] * self.lean_accelerations[:, None, i::2]
+        c[:, D, PITCH_CENTRES] = -self.by_pitch_centre
         c[:, D, ODO_ARM] = swing @ state.C_bv
         if self.by_speed_offset is not None:
             c[:, D, SPEED_OFFSET] = -self.by_speed_offset
@@ -290,8 +292,8 @@ class Motion:
         ahead = (self.f_n + self.f_n_end) / 2
         c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.by_delay[:, None]
         c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.wheel_displacement
-        if self.by_steps:       # only the direction of the path is used, independent of these
-            c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, BY_PITCHING, SPEED_OFFSET]] = 0.0
+        if self.uses_speed_steps:   # only the direction of the path is used: independent of these
+            c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, SCALE_BY_PITCHING, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF

@@ -15,7 +15,7 @@ from odocal_ros.estimator.factors.interval_noise import (
     HEAVE,
     INTERVAL,
     interval_noise,
-    least_sideslip,
+    min_sideslip,
     PITCHING,
     PITCHING_LEAST,
     SIDEWAYS,
@@ -24,7 +24,7 @@ from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
-from odocal_ros.estimator.levels import LEAST, LevelRightHandSides, Levels
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
 
@@ -53,17 +53,17 @@ class MotionRows(Factor):
         self.motion = Motion(problem, point.state, point.intervals, point.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion)
-        self.noise = interval_noise(self.motion, problem.leg,
-                                    problem.still[:-1] & problem.still[1:], point.variance_factors)
+        rest = problem.at_rest[:-1] & problem.at_rest[1:]
+        self.noise = interval_noise(self.motion, problem.leg, rest, point.variance_factors)
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
-        imu |= white_noise_at_rest(problem.imu, problem.leg, problem.still)
-        slide, road = least_sideslip(problem.turned)**2, 0.01**2      # m^2/s, initial
+        imu |= white_noise_at_rest(problem.imu, problem.leg, problem.at_rest)
+        slide, road = min_sideslip(problem.total_turn)**2, 0.01**2      # m^2/s, initial
         return (imu | dict.fromkeys(ALONG, road)
                 | dict.fromkeys(SIDEWAYS, max(road, slide)) | {'pitching': PITCHING**2},
-                imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
+                imu | dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, slide)
                 | {'up': max(slide, HEAVE**2), 'pitching': PITCHING_LEAST**2})
 
     def weigh(self, levels: Levels) -> None:
@@ -112,13 +112,13 @@ class MotionRows(Factor):
             g = -np.einsum('kij,ki->kj', J, self.r[rows])
             out.diagonal[rows] += own[:, :, :n]
             out.diagonal[ends] += end[:, :, :n]
-            out.beside[rows] += own[:, :, n:2 * n]
-            out.border[rows] += own[:, :, 2 * n:]
-            out.border[ends] += end[:, :, n:]
+            out.upper[rows] += own[:, :, n:2 * n]
+            out.coupling[rows] += own[:, :, 2 * n:]
+            out.coupling[ends] += end[:, :, n:]
             out.corner += border.T @ border
             out.g[rows] += g[:, :n]
             out.g[ends] += g[:, n:2 * n]
-            out.g_border += g[:, 2 * n:].sum(axis=0)
+            out.g_constants += g[:, 2 * n:].sum(axis=0)
 
     def cost(self) -> float:
         out: float = (self.r**2).sum()
@@ -151,9 +151,9 @@ class MotionRows(Factor):
             A = self.units(rows)
             q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ level_selector
             g = np.swapaxes(self.J[rows], 1, 2) @ q
-            out.chain[rows, :, columns] += g[:, :n]
-            out.chain[ends, :, columns] += g[:, n:2 * n]
-            out.border[:, columns] += g[:, 2 * n:].sum(axis=0)
+            out.g[rows, :, columns] += g[:, :n]
+            out.g[ends, :, columns] += g[:, n:2 * n]
+            out.g_constants[:, columns] += g[:, 2 * n:].sum(axis=0)
             out.square[np.ix_(columns, columns)] += (np.swapaxes(q, 1, 2) @ q).sum(axis=0)
 
     def step_sides(self, at: Ints, constants: Sequence[int]) -> tuple[Floats, Floats, Floats,
@@ -196,14 +196,14 @@ class MotionRows(Factor):
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         units, given = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
-            cross = self.with_parameters(block)
+            cross = self.parameter_covariances(block)
             by_rows = cross @ np.swapaxes(self.J[rows], 1, 2)
             units.append(by_rows @ self.units(rows))
-            given.append(by_rows @ (self.whiten[rows] @ self.noise.given[rows]))
+            given.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.noise_mask(name)]
-        if self.noise.given.shape[2]:
+        if self.noise.known_columns.shape[2]:
             yield SpeedSteps.source, np.concatenate(given)
 
     def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.levels import LEAST, LevelRightHandSides, Levels
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     E,
@@ -86,14 +86,14 @@ class TravelError(Factor):
     name = 'travel'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
-        self.state, self.still = point.state, problem.still
-        self.least = problem.least['travel']
-        self.weight = once_a_rest(problem.still)
+        self.state, self.at_rest = point.state, problem.at_rest
+        self.least = problem.min_levels['travel']
+        self.weight = standstill_weights(problem.at_rest)
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         leg = problem.leg
-        least = LEAST.travel / leg.rough_scale
+        least = MIN_NOISE.travel / leg.rough_scale
         level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
         return level, level
 
@@ -111,7 +111,7 @@ class TravelError(Factor):
         return out
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        e, moving = self.variance, ~self.still
+        e, moving = self.variance, ~self.at_rest
         spread = marginals.variances()[:, E]
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
@@ -119,21 +119,21 @@ class TravelError(Factor):
     def add_levels(self, out: LevelRightHandSides) -> None:
         i, = out.at((self.name,))
         g = self.weight * self.state.travel_error / self.variance
-        out.chain[:, E, i] += g
+        out.g[:, E, i] += g
         out.square[i, i] += g @ self.state.travel_error
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        cross = self.all_with_parameters(marginals)
+        cross = self.all_parameter_covariances(marginals)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
         yield 'quantisation', travel[:, :, None]
 
 
-def once_a_rest(still: Bools) -> Floats:
+def standstill_weights(at_rest: Bools) -> Floats:
     """Return the weights of rounding errors, (N,): 1 for all keyframes of a standstill."""
-    starts = np.flatnonzero(np.diff(still, prepend=False) & still)
-    stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
-    weight = np.ones(len(still))
+    starts = np.flatnonzero(np.diff(at_rest, prepend=False) & at_rest)
+    stops = np.flatnonzero(np.diff(at_rest, append=False) & at_rest) + 1
+    weight = np.ones(len(at_rest))
     for first, last in zip(starts, stops, strict=True):
         weight[first:last] = 1 / (last - first)
     return weight
@@ -184,7 +184,7 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def is_present(cls, problem: Problem) -> bool:
-        return problem.leg.by_steps and len(_within(problem).t) > 0
+        return problem.leg.uses_speed_steps and len(_within(problem).t) > 0
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -196,7 +196,7 @@ class SpeedSteps(PointRows):
             at - before[:, None], keyframes[0], keyframes[-1]).ravel()])
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         # factors on the variances by the grid: real transitions are no more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
@@ -210,8 +210,8 @@ class SpeedSteps(PointRows):
         J[:, layout.BA] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.A)
         arm = state.C_bv @ self.arm_v
         by_rate = np.cross(arm, state.forward)
-        by_gyro = np.einsum('ki,kij->kj', np.cross(ahead, v), self.C @ self.points.turned) \
-            - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by)
+        by_gyro = np.einsum('ki,kij->kj', np.cross(ahead, v), self.C @ self.points.R_by_gyro) \
+            - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by_gyro)
         J[:, layout.BG] = by_gyro[:, :3] + by_rate
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
@@ -233,7 +233,7 @@ class SpeedSteps(PointRows):
 def _within(problem: Problem) -> SpeedInstants:
     """Return the steps of the speed within the keyframes."""
     t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
-    assert coarse is not None, 'by_steps'
+    assert coarse is not None, 'uses_speed_steps'
     return coarse.instants.between(t[0], t[-1])
 
 

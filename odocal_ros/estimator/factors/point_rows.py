@@ -25,7 +25,7 @@ from odocal_ros.estimator.leg import ExternalSamples
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, CONSTANTS, SLOW, State, WITH_SLOW
+from odocal_ros.estimator.state import CONSTANTS, SLOW, State, WITH_SLOW, WITHOUT_SLOW
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.screening.inputs import Inputs
@@ -139,16 +139,16 @@ class PointRows(Factor):
             own, g = by[:, :n] @ J, -(by @ r)[:, :, 0]
             border = np.ascontiguousarray(J[:, :, n:]).reshape(-1, self.m)
             out.diagonal[present] += own[:, :, :n]
-            out.border[present] += own[:, :, n:]
+            out.coupling[present] += own[:, :, n:]
             out.corner += border.T @ border
             out.g[present] += g[:, :n]
-            out.g_border += g[:, n:].sum(axis=0)
+            out.g_constants += g[:, n:].sum(axis=0)
             if self.J_end is None:
                 continue
             B = gather(self.J_end)
             X = by @ B
-            out.beside[present, :, SLOW] += X[:, :n]
-            out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
+            out.upper[present, :, SLOW] += X[:, :n]
+            out.coupling[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
             out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
             out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
 
@@ -190,11 +190,11 @@ class PointRows(Factor):
         for present, gather in self._intervals():
             some = gather(q)
             g = np.swapaxes(gather(self.J), 1, 2) @ some
-            out.chain[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
-            out.border[:, columns] += g[:, self.n:].sum(axis=0)
+            out.g[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
+            out.g_constants[:, columns] += g[:, self.n:].sum(axis=0)
             if self.J_end is not None:
                 end = np.swapaxes(gather(self.J_end), 1, 2) @ some
-                out.chain[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
+                out.g[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
         out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
     def _taken(self, marginals: JointMarginals, present: Ints, gather: Gather) -> Floats:
@@ -208,7 +208,8 @@ class PointRows(Factor):
         n, parts = self.n, []       # columns of J and of J_end in the joint marginals
         own, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
-            cross = np.ascontiguousarray(self.with_parameters(marginals.covariances(present)))
+            cross = np.ascontiguousarray(
+                self.parameter_covariances(marginals.covariances(present)))
             X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
@@ -234,7 +235,7 @@ def count_rows_per_independent(rows: PointRows) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of one kind at one state: (m, d), (m, d, BARE), (m, d, M), (m, d) 1 / sigma."""
+    """Rows of one kind at one state: (m, d), (m, d, WITHOUT_SLOW), (m, d, M), (m, d) 1 / sigma."""
 
     raw: np.ndarray
     J: np.ndarray
@@ -281,7 +282,7 @@ class ExternalRows(PointRows):
         return problem.external[cls.name].t
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         return dict.fromkeys(cls.levels_of, 1.0), cls.least(problem.external[cls.name])
 
     @staticmethod
@@ -291,7 +292,7 @@ class ExternalRows(PointRows):
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         J = self._rows.J
-        return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
+        return np.pad(J, ((0, 0), (0, 0), (0, n - WITHOUT_SLOW))), self._rows.c
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         out: Floats = rows * self._rows.root[some, :, None]

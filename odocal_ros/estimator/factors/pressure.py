@@ -16,9 +16,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
 from odocal_ros.estimator.leg import ExternalSamples
-from odocal_ros.estimator.levels import LEAST
+from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BA, BARE, BG, GYRO, M, P, PHI, PRESSURE, V
+from odocal_ros.estimator.state import BA, BG, GYRO, M, P, PHI, PRESSURE, V, WITHOUT_SLOW
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.rotations import rotate, skew
 from odocal_ros.screening.inputs import Inputs
@@ -70,7 +70,7 @@ class PressureRows(ExternalRows):
 
     @staticmethod
     def least(sent: Pressure) -> dict[str, float]:
-        return {'pressure': (LEAST.height / float(np.median(sent.sigma)))**2}
+        return {'pressure': (MIN_NOISE.height / float(np.median(sent.sigma)))**2}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         leg, state, points = problem.leg, point.state, point.points['pressure']
@@ -86,13 +86,13 @@ class PressureRows(ExternalRows):
         p_n = state.p_n[k] + state.v_n[k] * tau[:, None] + dp + g * (tau**2 / 2)[:, None]
         height = p_n[:, 2] + (p_n[:, :2]**2).sum(axis=1) / (2 * EARTH_RADIUS)
         raw = sent.height - height - by_constants @ state.constants[PRESSURE]
-        J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
+        J, c = np.zeros((len(k), 1, WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         up = np.concatenate([p_n[:, :2] / EARTH_RADIUS, np.ones((len(k), 1))], axis=1)[:, None]
         t = tau[:, None, None]
         J[:, :, P], J[:, :, V] = -up, -up * t - by_velocity
         J[:, :, PHI] = up @ skew(dp) + by_velocity @ skew(dv)
         J[:, :, BA] = up @ C @ points.AA + by_velocity @ C @ points.A
-        by_gyro = -up @ C @ points.dp_by - by_velocity @ C @ points.dv_by
+        by_gyro = -up @ C @ points.dp_by_gyro - by_velocity @ C @ points.dv_by_gyro
         J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         c[:, 0, PRESSURE] = -by_constants
         return Rows(raw[:, None], J, c, 1 / sent.sigma[:, None])

@@ -56,7 +56,8 @@ SHARED: dict[str, slice | Ints] = {
     'gyro_by_force': layout.constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
     'accelerometer_scale': layout.constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
     'accelerometer_axes': layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
-    'receiver_smoothing': np.array([layout.FIX_LAG2, layout.FIX_BY_MOTION, layout.FIX_TIME]),
+    'receiver_smoothing': np.array([layout.FIX_LAG2, layout.FIX_BY_MOTION,
+                                    layout.FIX_MOTION_TIME]),
     'tyre_changes': layout.TYRES,
     'body_lean': layout.constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
     'speed_truncation': layout.constants_from('speed_offset'),
@@ -74,21 +75,21 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.own = problem.own | {'slow_fix_errors': layout.FIX_ERRORS,
+        self.own = problem.unshared_constants | {'slow_fix_errors': layout.FIX_ERRORS,
                                   'vertical_motion': layout.LIFT}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > layout.NO_ERROR).any()}
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
 
     def weigh(self, levels: Levels) -> None:
         """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
         size = np.array([levels[name] for name in SIZES])[layout.KIND_OF]
         constants = self.base.constants.copy()
-        constants[layout.IMPERFECT] *= np.sqrt(size)
+        constants[layout.IMPERFECTIONS] *= np.sqrt(size)
         self.priors = replace(self.base, constants=constants)
         self.log_R = float(np.log(size).sum())
 
@@ -100,13 +101,13 @@ class PriorRows(Factor):
         errors would change the size of one that is hardly observable. For the wide prior of a rare
         effect it is the most likely size: the mean is that of the few vehicles with the effect.
         """
-        at = 2 * self.n + np.arange(layout.IMPERFECT.start, layout.IMPERFECT.stop)
-        usual = self.base.constants[layout.IMPERFECT]**2
-        weight = 1 / self.priors.constants[layout.IMPERFECT]**2
+        at = 2 * self.n + np.arange(layout.IMPERFECTIONS.start, layout.IMPERFECTIONS.stop)
+        usual = self.base.constants[layout.IMPERFECTIONS]**2
+        weight = 1 / self.priors.constants[layout.IMPERFECTIONS]**2
         total = 1 / marginals[0][at, at]
         data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
         known = data / (data + 1 / (SIZE * usual))
-        found = (self._constants_off()[layout.IMPERFECT] * total / data)**2
+        found = (self._constants_off()[layout.IMPERFECTIONS] * total / data)**2
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
         off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[layout.KIND_OF]
         spread = np.array([SIZE_SPREADS[name] for name in SIZES])
@@ -118,10 +119,10 @@ class PriorRows(Factor):
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         columns = out.at(SIZES)
-        off = self._constants_off()[layout.IMPERFECT]
-        sigma = self.priors.constants[layout.IMPERFECT]
+        off = self._constants_off()[layout.IMPERFECTIONS]
+        sigma = self.priors.constants[layout.IMPERFECTIONS]
         of = np.eye(len(SIZES))[layout.KIND_OF]
-        out.border[layout.IMPERFECT, columns] += of * (off / sigma**2)[:, None]
+        out.g_constants[layout.IMPERFECTIONS, columns] += of * (off / sigma**2)[:, None]
         out.square[columns, columns] += of.T @ (off / sigma)**2
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
@@ -143,7 +144,7 @@ class PriorRows(Factor):
             add_prior(out, 0, columns, sigma**2, value)
         w, m = 1 / self.priors.constants**2, self.m
         out.corner[range(m), range(m)] += w[:m]
-        out.g_border -= (w * self._constants_off())[:m]
+        out.g_constants -= (w * self._constants_off())[:m]
         out.absent = w[m:]
 
     def cost(self) -> float:
@@ -152,7 +153,7 @@ class PriorRows(Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        first = self.with_parameters(marginals[0][None])[0]
+        first = self.parameter_covariances(marginals[0][None])[0]
         yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias
         for name, where in self.own.items():
@@ -165,14 +166,14 @@ class PriorRows(Factor):
             yield name, covariance[:PARAMETER_COUNT, where] / self.priors.constants[where]
 
 
-class Rests(Factor):
+class StandstillRows(Factor):
     """Rows of the velocity of keyframes at rest, of the turn of intervals at rest."""
 
-    name = 'rests'
+    name = 'standstills'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
-        self.state, self.still = point.state, problem.still
-        self.pair = self.still[:-1] & self.still[1:]
+        self.state, self.at_rest = point.state, problem.at_rest
+        self.pair = self.at_rest[:-1] & self.at_rest[1:]
         variance = STILL_TURN**2 * point.intervals.T[:, None]
         z2 = (self.turned()**2 / variance).mean(axis=1, keepdims=True)
         self.turn_variance = variance * np.maximum(z2 / TAIL_SIGMAS**2, 1.0)
@@ -183,11 +184,11 @@ class Rests(Factor):
         return rotvec(C[1:] @ transpose(C[:-1]))
 
     def add(self, out: Normal) -> None:
-        weight = self.still[:, None] / STILL_SPEED**2
+        weight = self.at_rest[:, None] / STILL_SPEED**2
         add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
         add_process(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
 
     def cost(self) -> float:
-        total = (self.state.v_n[self.still]**2).sum() / STILL_SPEED**2
+        total = (self.state.v_n[self.at_rest]**2).sum() / STILL_SPEED**2
         out: float = total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()
         return out

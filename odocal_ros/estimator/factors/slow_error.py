@@ -36,16 +36,16 @@ class SlowError(factor.Factor):
         self.state, self.T = point.state, problem.drift_time
         self.jump = 1.0 if point.variance_factors is None else point.variance_factors[:,
                                                                                       factor.JUMP:]
-        self.time_given = not np.isnan(problem.fix_time)
+        self.time_given = not np.isnan(problem.correlation_time)
         # start of runs of intervals without fixes: a fix ends a run
         ends = np.bincount(point.points['fixes'].interval, minlength=len(self.T)) > 0
         self.runs = np.flatnonzero(np.append(True, ends[:-1] | ends[1:]))
 
     @classmethod
-    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
-            **dict.fromkeys(('slow', 'slow_up'), 2 * problem.fix_least**2 / USUAL_TIME),
+            **dict.fromkeys(('slow', 'slow_up'), 2 * problem.min_fix_sigma**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: shorter times are not separable from white noise
 
     def is_used(self, levels: Levels) -> bool:
@@ -94,8 +94,9 @@ class SlowError(factor.Factor):
 
     def _variances(self, marginals: JointMarginals) -> tuple[Floats, Floats, Floats]:
         """Return covariances: of the value before, with that after, of driving noise: (K, 3)."""
-        own, both, a = marginals.variances()[:, SLOW], marginals.with_next()[:, SLOW], self.decay
-        before, after = own[:-1], own[1:]
+        variances, a = marginals.variances()[:, SLOW], self.decay
+        before, after = variances[:-1], variances[1:]
+        both = marginals.next_covariances()[:, SLOW]
         return before, both, after + a**2 * before - 2 * a * both
 
     def jumps(self, marginals: JointMarginals) -> Floats:
@@ -137,7 +138,7 @@ class SlowError(factor.Factor):
             names.append('correlation_time')
         columns = out.at(names)
         for i, own in zip(columns, g, strict=True):
-            out.chain[:, SLOW, i] += own
+            out.g[:, SLOW, i] += own
         out.square[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
 
     def _precision(self) -> Floats:
@@ -171,7 +172,7 @@ class SlowError(factor.Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        cross, n = self.all_with_parameters(marginals), self.n
+        cross, n = self.all_parameter_covariances(marginals), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]

@@ -126,17 +126,18 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
     # each leg has its own ground and errors of the fixes, with their own priors
-    own = np.linalg.solve(reduced[layout.OF_LEG, layout.OF_LEG], reduced[layout.OF_LEG]).T
-    g_reduced = g_reduced - own @ g_reduced[layout.OF_LEG]
-    reduced = reduced - own @ reduced[layout.OF_LEG]
+    leg_rows = reduced[layout.LEG_CONSTANTS]
+    gain = np.linalg.solve(leg_rows[:, layout.LEG_CONSTANTS], leg_rows).T
+    g_reduced = g_reduced - gain @ g_reduced[layout.LEG_CONSTANTS]
+    reduced = reduced - gain @ leg_rows
     weight = 1 / priors.constants**2
     free = priors.constants > layout.NO_ERROR
-    free[layout.OF_LEG] = False
+    free[layout.LEG_CONSTANTS] = False
     return MarginalInformation(
         layout.CONSTANTS, at + setting_values,
         (reduced - np.diag(weight)) * np.outer(free, free),
         (g_reduced + weight * (at - priors.centre)) * free, priors.centre + setting_values,
-        fit.first.constants, priors.constants).with_errors(
+        fit.initial_priors.constants, priors.constants).with_errors(
             fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
 
 

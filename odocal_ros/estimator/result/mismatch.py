@@ -12,10 +12,11 @@ from collections.abc import Collection
 import numpy as np
 
 from odocal_ros.data.arrays import Array, by_row, Floats, thinned
+from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.heading import Heading
-from odocal_ros.estimator.fit import CONVERGENCE, Fit
+from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import sample_noise, sensor_noise
 from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.problem import Problem
@@ -174,7 +175,7 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
 
 def last_step(fit: Fit) -> float:
     """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
-    step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
+    step = fit.solved.step_constants / np.sqrt(np.diag(fit.solved.covariance))
     return float(np.abs(step[:PARAMETER_COUNT]).max())
 
 
@@ -242,13 +243,13 @@ def _cause_of(names: Collection[str], worse: Collection[str]) -> str:
 def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Return the white noise of single samples in motion and at rest; {}: too few samples."""
     leg, keys = problem.leg, problem.imu.t[problem.imu.key]
-    still = problem.still[:-1] & problem.still[1:]
+    at_rest = problem.at_rest[:-1] & problem.at_rest[1:]
 
     def part(t: Floats) -> Array:
         """Return 0 in motion, 1 at rest, 2 outside the keyframes."""
         at = np.searchsorted(keys, t, side='right') - 1
         inside = (t >= keys[0]) & (t < keys[-1])
-        return np.where(inside, still[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
+        return np.where(inside, at_rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
     parts = by_row(part, leg.t_imu)
     in_motion, at_rest = (sample_noise(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (

@@ -18,7 +18,7 @@ from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, LegResult, M
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
-from odocal_ros.estimator.factors.interval_noise import hard_and_turning, TURNING_RATE
+from odocal_ros.estimator.factors.interval_noise import accelerating_and_turning, TURNING_RATE
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
@@ -42,23 +42,24 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMa
     """
     motion = fit.weighted[MotionRows].motion
     path = np.linalg.norm(motion.displacement, axis=1)
-    moving = ~problem.still[:-1] & ~problem.still[1:]
+    moving = ~problem.at_rest[:-1] & ~problem.at_rest[1:]
     moving = moving if moving.any() else ~moving
     speed = (path / motion.T[:, 0])[moving]
     rate = motion.turning[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)
-    least = 0.0 if leg.travel.quantum else problem.least['travel']      # no reading error
+    least = 0.0 if leg.travel.quantum else problem.min_levels['travel']      # no reading error
     odometer = {
         'reading': float(np.sqrt(max(fit.levels['travel'] - least, 0.0))),
         'period': float(np.median(np.diff(t[within]))),
         'speed_step': coarse.step if coarse else 0.0,
-        'hard': float(hard_and_turning(motion)[0][moving].mean()),
+        'hard': float(accelerating_and_turning(motion)[0][moving].mean()),
         'speed': float(np.sqrt(np.mean(speed**2))), 'fastest': float(speed.max()),
         'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
         'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
     sigma = np.sqrt(np.diagonal(near[0])[BA]) * widen
-    biases = zip('xyz', fit.state.accel_bias[0], sigma, sigma / fit.first.accel_bias, strict=True)
+    biases = zip('xyz', fit.state.accel_bias[0], sigma, sigma / fit.initial_priors.accel_bias,
+                 strict=True)
     return {'odometer': odometer} | ({'accelerometer_bias': {
         axis: {'value': float(value), 'sigma': float(s), 'ratio': float(ratio)}
         for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
@@ -74,7 +75,7 @@ def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Est
     leg, state : SmootherLeg, State.   covariance : (M, M) of the constants.
     """
     coarse = leg.travel.coarse
-    if coarse is None or not leg.by_steps:
+    if coarse is None or not leg.uses_speed_steps:
         return {}
     middle = (coarse.t[1:] + coarse.t[:-1]) / 2
     within = (middle >= leg.t_begin) & (middle <= leg.t_stop)
@@ -104,10 +105,10 @@ def combine_as_sent(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, 
 def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
     """Return additional figures for calibration.json; grade : None without an accelerometer."""
     sigma = np.sqrt(np.diag(covariance))
-    # scale_by_speed: the slope at FAST
-    out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
-                           for name, i, unit in (('scale_by_speed', layout.BY_SPEED, '1/(m/s)'),
-                                                 ('scale_by_time', layout.BY_TIME, '1/s'))}
+    # scale_by_speed: the slope at FAST_SPEED
+    out: dict[str, Any] = {
+        layout.CONSTANTS[i]: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
+        for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'))}
     if grade is not None:
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
             out[f'{name}_mounting_angle_housing_sigma'] = _entry(

@@ -60,7 +60,8 @@ from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE
 
-SCALES = range(layout.FIX_TIME, layout.VELOCITY.start)    # errors of IMU, receiver, tyres, body
+# errors of IMU, receiver, tyres, body
+SCALES = range(layout.FIX_MOTION_TIME, layout.VELOCITY.start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +150,7 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
     """Return the estimates of the first gyro bias, and ratios of sigma to prior, by name."""
     sigma = np.sqrt(np.diagonal(marginals[0])[layout.BG]) * factor
     names = [f'gyro_bias_{axis}' for axis in 'xyz']
-    ratio = dict(zip(names, (sigma / fit.first.gyro_bias).tolist(), strict=True))
+    ratio = dict(zip(names, (sigma / fit.initial_priors.gyro_bias).tolist(), strict=True))
     values = dict(zip(names, zip(fit.state.gyro_bias[0].tolist(), sigma.tolist(), strict=True),
                       strict=True))
     return {name: Estimate(*values[name], 'rad/s') for name in names
@@ -187,7 +188,7 @@ def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
                 sigma: Floats) -> tuple[tuple[Slip, ...], list[Reason]]:
     """Return the slips, and the reasons that report them and a filter of the odometer."""
     filtered = remarks.filter_reasons(fit.state.constants[layout.ODO_LAG2], sigma[layout.ODO_LAG2])
-    if leg.by_steps:    # only the steps of a coarse speed are used, which do not show slip
+    if leg.uses_speed_steps:    # only the steps of a coarse speed are used, which do not show slip
         return (), list(filtered)
     count_m = leg.travel.quantum * fit.state.scale
     slip_path = odometer_minus_ground_path(fit, marginals)
@@ -217,7 +218,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     K = state.scale
     arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // KEPT_ROWS)
-    t_fix = leg.t_fix[problem.use]
+    t_fix = leg.t_fix[problem.used_fixes]
     speed = np.linalg.norm(motion.displacement, axis=1) / motion.T[:, 0]
     return {
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
@@ -238,8 +239,8 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float((motion.turning * motion.T[:, 0]).sum()),
-                       'in_turns': problem.turned,
-                       'standing': float(problem.still.sum())},
+                       'in_turns': problem.total_turn,
+                       'standing': float(problem.at_rest.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
         'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
         'key_biases': np.stack([state.gyro_bias, state.accel_bias]),
@@ -261,7 +262,7 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     A unit error in a row moves the estimate by the covariance of the estimate and the unknowns of
     that row, times the row's whitened derivative. The remainder belongs to the standstills.
     """
-    parts, solved = fit.weighted.parts, fit.solved.covariance
+    parts, solved = fit.weighted.factors, fit.solved.covariance
     covariance: dict[str, np.ndarray] = {}
     for part in parts.values():
         for name, effects in part.effects(marginals):

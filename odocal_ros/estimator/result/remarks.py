@@ -68,7 +68,7 @@ def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     if not problem.leg.origin.local or not contains_odometer(c[layout.FIX_BY_MOTION],
                                                              sigma[layout.FIX_BY_MOTION]):
         return 0.0
-    return map_drift_sigma(c[layout.FIX_BY_MOTION], c[layout.FIX_TIME],
+    return map_drift_sigma(c[layout.FIX_BY_MOTION], c[layout.FIX_MOTION_TIME],
                            problem.leg.t_stop - problem.leg.t_begin)
 
 
@@ -88,7 +88,8 @@ def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[Er
         else HEIGHT_UNKNOWN / A
     # which of the two values a later drive has is unknown
     of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
-                 for step in fit.steps if step.constant != layout.LN_K and step.is_certain]
+                 for step in fit.constant_steps
+                 if step.constant != layout.LN_K and step.is_certain]
     of_scale = [ErrorBeyondFit(layout.LN_K, name, own) for name, own in (
         ('wheels_in_positions', by_map), ('height', by_height)) if own]
     return of_scale + of_angles
@@ -101,14 +102,15 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(problem, fit),
                *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
                *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
-                                 c[layout.FIX_TIME], sigma_by_wheels_in_map(problem, c, sigma)),
+                                 c[layout.FIX_MOTION_TIME],
+                                 sigma_by_wheels_in_map(problem, c, sigma)),
                *(reason for name, i in CLOCKS.items()
                for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
                *_scale_variation_reasons(fit, sigma), *_change_reasons(fit),
                *_bias_step_reasons(fit)]
     usual = imperfection_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
-    off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
+    off[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
     skew = float(np.linalg.norm(off[AXES]))
     if skew > IMU_ERROR_LIMIT:
@@ -158,9 +160,9 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     texts = []
-    for i, span, what in ((layout.BY_SPEED, motion.tyre_signals[:, 0], 'from low to high speed'),
-                          (layout.BY_TIME, motion.tyre_signals[:, 1], 'from start to end')):
-        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(span)
+    for i, signal, what in ((layout.SCALE_BY_SPEED, 0, 'from low to high speed'),
+                            (layout.SCALE_BY_TIME, 1, 'from start to end')):
+        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(motion.tyre_signals[:, signal])
         if abs(change) > max(REMARK_SIGMAS * change_sigma, LEAST_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {what}')
     if not texts:
@@ -189,7 +191,7 @@ def _bias_step_reasons(fit: Fit) -> list[Reason]:
 def _change_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a scale or mounting that changes in the leg."""
     texts = []
-    for step in fit.steps:
+    for step in fit.constant_steps:
         if step.is_certain and abs(step.size) > LEAST_CHANGE:
             what = layout.CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \

@@ -55,7 +55,7 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
     """
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
     return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
-            for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
+            for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.used_fixes]}
 
 
 def correlation(t: Floats, residual: Floats) -> float:
@@ -108,7 +108,7 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
 def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     """Return residuals and sigmas of the fixes: (m, 3) each."""
     fixes = fit.weighted[Fixes]
-    covariance_root = np.linalg.inv(fixes.root)
+    covariance_root = np.linalg.inv(fixes.whitening)
     factor = np.ones(3)
     for level, columns in fixes.levels_of.items():
         factor[columns] = np.sqrt(fixes.levels[level])

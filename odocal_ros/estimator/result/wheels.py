@@ -28,7 +28,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from odocal_ros.data.arrays import by_row, Floats, Ints, running_sum
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.factors.interval_noise import hard_and_turning
+from odocal_ros.estimator.factors.interval_noise import accelerating_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import as_rolled, stamp_of
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
@@ -153,7 +153,7 @@ class _Common:
         rate = (problem.rate_b - state.gyro_bias) @ up
         speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
         self.faster, self.turning = np.diff(speed[at]), np.diff(rate[at])
-        hard, turns = hard_and_turning(motion)
+        hard, turns = accelerating_and_turning(motion)
         kind = np.where(turns, 2, np.where(hard, 1, 0))
         self.kind = kind[np.clip(at[1:] - 1, 0, len(kind) - 1)]
         self.T, self.t = np.diff(state.t[at]), state.t[at]
