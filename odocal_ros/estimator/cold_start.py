@@ -175,7 +175,7 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
     """Return a section; before : (3,) gyro bias of the section before it."""
     rest = gyro_bias_at_rest(leg, imu)
     bias = before if rest is None else rest
-    sigma = np.maximum(priors.gyro_bias, 1e-3) if rest is None else np.full(3, 2e-4)
+    sigma = np.maximum(priors.gyro_bias_sigma, 1e-3) if rest is None else np.full(3, 2e-4)
     K, change = len(imu.key) - 1, np.zeros(3)
     found, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                             np.array([1.0, 0.0, 0.0]), np.empty(0))

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The least-squares problem of a leg at one state: factors, normal equations, cost, components.
+The least-squares problem of a leg, linearised at one state.
 
-An additional sensor or prior is one more class in ``FACTORS`` (``factor.Factor``).
+``Equations`` has all factors (sensors and priors) at the state, ``Weighted`` the same at given
+noise levels: normal equations, cost, and variance components. An additional sensor or prior is one
+more class in ``FACTORS``, derived from ``factor.Factor``.
 
-Constants that change within a leg are found by a score test of the converged fit: docs/method.md
+``find_constant_steps`` tests whether scale, yaw or pitch change within the leg: docs/method.md
 (S27c). A step of a constant at a time is one more column of the equations: that of the constant,
-from this time on. Its estimate with all other unknowns free needs no second fit.
+in all rows after this time. Its estimate with all other unknowns free needs no second fit.
 """
 
 from dataclasses import dataclass
@@ -36,27 +38,34 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
                                      SpeedSteps, TravelError, SlowError, StandstillRows, PriorRows)
-EXTERNAL_FACTORS = tuple(part for part in FACTORS if issubclass(part, ExternalRows))
+# sensors besides IMU, odometer and fixes
+EXTERNAL_FACTORS = tuple(kind for kind in FACTORS if issubclass(kind, ExternalRows))
 
 
 def preintegrate_at(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:
-    """Return the sums over all intervals, and to the times of rows by their part."""
+    """Return the sums over all intervals, and up to the times of the rows of each factor."""
     leg, c = problem.leg, state.constants
-    times = {part.name: part.times(problem, c) for part in FACTORS
-             if issubclass(part, PointRows) and part.is_present(problem)}
+    times = {kind.name: kind.times(problem, c) for kind in FACTORS
+             if issubclass(kind, PointRows) and kind.is_present(problem)}
     all_t = np.concatenate(list(times.values()))
     order = np.argsort(all_t, kind='stable')
     intervals, points = preintegrate(
         problem.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
         as_rolled(leg.travel, c), state.scale * state.forward, all_t[order], c)
-    place = np.split(np.argsort(order, kind='stable'),
-                     np.cumsum([len(t) for t in times.values()])[:-1])
-    return intervals, {name: points.take(own) for name, own in zip(
-        times, place, strict=True)}
+    indices = np.split(np.argsort(order, kind='stable'),
+                       np.cumsum([len(t) for t in times.values()])[:-1])
+    return intervals, {name: points.take(index)
+                       for name, index in zip(times, indices, strict=True)}
 
 
 class Equations:
-    """The factors at one linearisation point, without weights."""
+    """
+    The factors at one linearisation point, without weights.
+
+    priors : by default those of the problem.   variance_factors : (K, VARIANCE_FACTOR_COUNT), of
+    outlier intervals, by default 1.   fitted : residuals are noise; derivatives by IMU errors then
+    use the fitted signals (signals.py).
+    """
 
     def __init__(self, problem: Problem, state: State,
                  priors: Priors | None = None, variance_factors: Floats | None = None,
@@ -85,22 +94,22 @@ class Weighted:
         self.state, self.levels = equations.state, levels
         self.n = WITH_SLOW if levels.correlation_time else WITHOUT_SLOW
         self.m = equations.constants_in_use
-        self.factors = {name: part.weighted_copy(levels, self.m) for name,
-                      part in equations.factors.items()
-                      if part.is_used(levels)}
+        self.factors = {name: factor.weighted_copy(levels, self.m)
+                        for name, factor in equations.factors.items() if factor.is_used(levels)}
 
     def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
-        return next(part for part in self.factors.values() if isinstance(part, kind))
+        """Return the factor of a class."""
+        return next(factor for factor in self.factors.values() if isinstance(factor, kind))
 
     def normal(self) -> Normal:
         """Return the normal equations of the step."""
         out = Normal(len(self.state.t), self.n, self.m)
-        for part in self.factors.values():
-            part.add(out)
+        for factor in self.factors.values():
+            factor.add(out)
         return out
 
     def solved(self) -> Solved:
-        """Return the step; raises NotPositive: the data do not determine the unknowns."""
+        """Return the solution; raises NotPositive if the data do not determine the unknowns."""
         try:
             return solve(self.normal())
         except NotPositive as error:
@@ -112,52 +121,52 @@ class Weighted:
     def apply_step(self, solved: Solved) -> 'Weighted':
         """Apply the step to the residuals, to first order; return self."""
         step, constants = solved.step, solved.step_constants
-        reached = self.state.updated(step, constants)
-        for part in self.factors.values():
-            part.apply_step(step, constants, reached)
+        new_state = self.state.updated(step, constants)
+        for factor in self.factors.values():
+            factor.apply_step(step, constants, new_state)
         return self
 
     def information(self, solved: Solved) -> LevelInformation:
         """Return the information on the levels, sizes last; call before ``solved.marginals``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
         sides = LevelRightHandSides(len(self.state.t), self.n, self.m, names)
-        for part in self.factors.values():
-            part.add_levels(sides)
-        taken, moves = solved.products(sides.g, sides.g_constants)
-        return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
+        for factor in self.factors.values():
+            factor.add_levels(sides)
+        fitted, derivatives = solved.products(sides.g, sides.g_constants)
+        return LevelInformation(sides.names, (sides.square - fitted) / 2, derivatives)
 
     def cost(self) -> float:
         """Return the weighted sum of squares of all rows; point rows with their robust loss."""
-        return float(sum(part.cost() for part in self.factors.values()))
+        return float(sum(factor.cost() for factor in self.factors.values()))
 
     def log_R_total(self) -> float:
         """Return the log determinant of the covariance of all rows that the levels change."""
-        return float(sum(part.log_R for part in self.factors.values()))
+        return float(sum(factor.log_R for factor in self.factors.values()))
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """
         Return the quadratic sum and its expectation for each variance component: (S26).
 
         The restricted likelihood has its maximum where, for every component of level s with
-        covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V less that of the part the
-        unknowns take up, P J' R^-1 s V R^-1 J (P the covariance of the unknowns).
+        covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V minus that of the part that
+        the unknowns fit, P J' R^-1 s V R^-1 J (P the covariance of the unknowns).
         """
-        return {name: pair for part in self.factors.values()
-                for name, pair in part.components(marginals).items()}
+        return {name: pair for factor in self.factors.values()
+                for name, pair in factor.components(marginals).items()}
 
 
-STEP_PLACES = 15       # judgement: times of a step, at equal distances along the path
+STEP_PLACES = 15        # judgement: places where steps are tested, at equal distances on the path
 STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested, the scale first
 GRADUAL = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
 
 
 @dataclass(frozen=True)
 class ConstantStep:
-    """A change of a constant from a time, s, on: its size and sigma, relative or rad."""
+    """A step of a constant within a leg."""
 
-    constant: int
-    t: float
-    size: float
+    constant: int   # index in CONSTANTS
+    t: float        # s since the start mark
+    size: float     # relative or rad, value after t minus value before
     sigma: float
 
     @property
@@ -167,36 +176,36 @@ class ConstantStep:
 
 
 def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantStep, ...]:
-    """Return the most significant step of each constant that has any; before ``marginals``."""
+    """Return the most significant step of each constant; call before ``solved.marginals``."""
     rows = weighted[MotionRows]
     path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
-    chain, border, square, score = rows.step_sides(at, STEPPING)
-    left = 1 / solved.step_fraction - 1      # of the step, if it was shortened: to the minimum
-    score -= left * (np.einsum('kil,ki->l', chain, solved.step)
-                     + border.T @ solved.step_constants[:len(border)])
-    taken, _ = solved.products(chain, border)
-    of_rows, whole = np.diag(square), square - taken
-    information = np.diag(whole).copy()
+    g, g_constants, square, score = rows.step_sides(at, STEPPING)
+    remaining = 1 / solved.step_fraction - 1     # step to the minimum, if it was shortened
+    score -= remaining * (np.einsum('kil,ki->l', g, solved.step)
+                          + g_constants.T @ solved.step_constants[:len(g_constants)])
+    information = square - solved.products(g, g_constants)[0]
+    diagonal = np.diag(information).copy()
     scale = slice(STEP_PLACES)
-    score[scale], information[scale] = _beside_gradual(score[scale], whole[scale, scale])
-    information = information.reshape(len(STEPPING), STEP_PLACES)
-    # standing before or after a place, or a constant that no row depends on
-    known = information > 1e-9 * of_rows.reshape(information.shape)
-    sigma = 1 / np.sqrt(np.where(known, information, np.inf))
-    score, t = score.reshape(sigma.shape), weighted.state.t[at]
-    most = np.argmax(np.abs(score) * sigma, axis=1)
+    score[scale], diagonal[scale] = _with_gradual_change(score[scale], information[scale, scale])
+    shape = len(STEPPING), STEP_PLACES
+    # no information: at rest before or after the place, or a constant that no row depends on
+    known = diagonal > 1e-9 * np.diag(square)
+    sigma = (1 / np.sqrt(np.where(known, diagonal, np.inf))).reshape(shape)
+    score, t = score.reshape(shape), weighted.state.t[at]
+    largest = np.argmax(np.abs(score) * sigma, axis=1)
     return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
                               float(sigma[i, k]))
-                 for i, (constant, k) in enumerate(zip(STEPPING, most, strict=True))
+                 for i, (constant, k) in enumerate(zip(STEPPING, largest, strict=True))
                  if sigma[i].any())
 
 
-def _beside_gradual(score: Floats, information: Floats) -> tuple[Floats, Floats]:
-    """Return score and information of each step of the scale, beside a gradual change of it."""
-    # quadratic in the path, as a sum of steps at all places, with a prior
+def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """Return score and information of each step of the scale if it also changes gradually."""
+    # a change that is quadratic in the path is a sum of steps at all places; it has a prior
     shares = GRADUAL / STEP_PLACES * np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
-    across = information @ shares
-    by = np.linalg.solve(np.eye(2) + shares.T @ across,
-                         np.column_stack([across.T, shares.T @ score]))
-    return score - across @ by[:, -1], np.diag(information) - (across * by[:, :-1].T).sum(axis=1)
+    cross = information @ shares
+    solution = np.linalg.solve(np.eye(2) + shares.T @ cross,
+                               np.column_stack([cross.T, shares.T @ score]))
+    return (score - cross @ solution[:, -1],
+            np.diag(information) - (cross * solution[:, :-1].T).sum(axis=1))

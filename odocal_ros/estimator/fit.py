@@ -207,18 +207,18 @@ def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,
                  marginals: JointMarginals) -> Priors:
     """Return priors with larger sigmas where the data contradict them, docs/method.md (S30)."""
     variance = np.diagonal(marginals[0])    # of the first keyframe
-    constants = _widen(initial.constants, current.constants, state.constants - initial.centre,
-                       np.diag(solved.covariance))
+    sigma = _widen(initial.sigma, current.sigma, state.constants - initial.mean,
+                   np.diag(solved.covariance))
     # not relaxed: sizes of imperfections, which are levels, an offset that is within half a step,
     # and a time constant whose prior contains all receivers
     for kept in (layout.IMPERFECTIONS, layout.SPEED_OFFSET, layout.FIX_MOTION_TIME):
-        constants[kept] = current.constants[kept]
+        sigma[kept] = current.sigma[kept]
     return replace(
-        current, constants=constants,
-        gyro_bias=_widen(initial.gyro_bias, current.gyro_bias, state.gyro_bias[0],
-                         variance[layout.BG]),
-        accel_bias=_widen(initial.accel_bias, current.accel_bias, state.accel_bias[0],
-                          variance[layout.BA]))
+        current, sigma=sigma,
+        gyro_bias_sigma=_widen(initial.gyro_bias_sigma, current.gyro_bias_sigma,
+                               state.gyro_bias[0], variance[layout.BG]),
+        accel_bias_sigma=_widen(initial.accel_bias_sigma, current.accel_bias_sigma,
+                                state.accel_bias[0], variance[layout.BA]))
 
 
 def _widen(initial: Floats, current: Floats, deviation: Floats, variance: Floats) -> Floats:

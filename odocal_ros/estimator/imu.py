@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-IMU samples of a leg: sums over steps of a tenth of a second, and the noise of the samples.
+IMU samples of a leg: their sums over steps of a tenth of a second, and their noise.
 
-A step holds the rotation vector and the single and double integral of the specific force in the
-axes at its begin, coning and sculling at the sample rate included (two-speed strapdown, Savage
-1998). The iterations of the fit integrate steps: the errors they estimate are constant within a
-step. White noise and random walks are those of the grade, of the standstills and of the samples.
+A step has the rotation vector, and the single and double integral of the specific force in the
+axes at its start, with coning and sculling at the sample rate (two-speed strapdown, Savage 1998).
+The passes of a fit integrate steps instead of samples: errors of the IMU are constant within a
+step. The noise functions return sigmas by the grade of the IMU, and by standstills or samples.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -39,17 +39,17 @@ from odocal_ros.settings.nominal import G, Grade
 # s. Tuned: with 0.02 s the results of six drives differ by 0.04 sigma rms, at most 0.19, and a fit
 # takes 1.6 times the time (docs/decisions/0020)
 STEP = 0.1
-# judgement: samples whose arrays stay in the cache; keyframes, which limits the memory
+# judgement: samples, so that their arrays stay in the cache; keyframes, which limits the memory
 SAMPLES_IN_CACHE, KEYFRAMES_IN_CACHE = 8192, 64
-# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
-# seconds, and slopes of a few per cent over a minute. Judgement
+# judgement, without an accelerometer: white noise, m/s^2/sqrt(Hz), by vehicle accelerations of
+# 1.5 m/s^2 for some seconds; random walk, m/s^2/sqrt(s), by slopes of a few per cent over a minute
 NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
 CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
 CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
 
 def imu_rows(leg: SmootherLeg) -> tuple[int, Floats]:
-    """Return the first sample of a leg and the times from it to the last, s."""
+    """Return the index of the first used IMU sample, and the times of all used ones, s."""
     first = int(np.searchsorted(leg.t_imu, leg.t_begin))
     return first, leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
 
@@ -62,7 +62,7 @@ def nearest_samples(t: Floats, times: Floats) -> Ints:
 
 
 def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
-    """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
+    """Return the indices of samples about ``spacing``, s, apart: (K + 1,), increasing."""
     first, t = imu_rows(leg)
     grid = np.linspace(t[0], t[-1], max(1, round((t[-1] - t[0]) / spacing)) + 1)
     return first + np.unique(nearest_samples(t, grid))
@@ -71,34 +71,34 @@ def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
 @dataclass(frozen=True, eq=False)
 class Steps:
     """
-    Sums over m steps from t[k] to t[k + 1], in the axes of b at the begin of each.
+    Sums over m steps from t[k] to t[k + 1], in the axes of b at the start of each.
 
-    Biases and all other errors of the IMU are in them.
+    They contain the biases and all other errors of the IMU.
     """
 
-    turn: Floats        # (m, 3) rotation vector at the end, rad
-    turn_mean: Floats   # (m, 3) its mean over the step: half of it where the rate is constant
+    turn: Floats        # (m, 3) rad, rotation vector from start to end
+    turn_mean: Floats   # (m, 3) rad, its mean over the step: half of it if the rate is constant
     dv: Floats          # (m, 3) integral of the specific force, m/s
     dp: Floats          # (m, 3) its integral, m
     signals: Floats     # (m, 6) integrals of turn rate, rad, and specific force, m/s, as measured
-    longest: Floats     # (m,) longest time between two samples, s
+    longest: Floats     # (m,) s, longest time between two samples
 
 
 @dataclass(frozen=True, eq=False)
 class ImuSteps(Steps):
-    """The steps of a leg, with keyframes at some of their ends."""
+    """The steps of a leg, and the keyframes at some of their ends."""
 
-    t: Floats           # (m + 1,)
-    key: Ints   # (K + 1,) step that begins at each keyframe
+    t: Floats           # (m + 1,) s, ends of the steps
+    key: Ints           # (K + 1,) indices of the keyframes in t
 
     @classmethod
     def from_leg(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
-        """Return the steps of a leg, from begin to stop, with keyframes ``spacing`` s apart."""
+        """Return the steps of a leg with keyframes about ``spacing``, s, apart."""
         return cls.between(leg, keyframes(leg, spacing))
 
     @classmethod
     def between(cls, leg: SmootherLeg, key: Ints) -> 'ImuSteps':
-        """Return the steps of a leg from its first to its last keyframe: (K + 1,) samples."""
+        """Return the steps of a leg; key : (K + 1,) indices of the samples at the keyframes."""
         edges = np.append(np.concatenate([
             _edges(leg.t_imu, key[k:k + KEYFRAMES_IN_CACHE + 1])[:-1]
             for k in range(0, len(key) - 1, KEYFRAMES_IN_CACHE)]), key[-1])
@@ -114,12 +114,12 @@ class ImuSteps(Steps):
         return cls(**sums, t=leg.t_imu[edges], key=np.searchsorted(edges, key))
 
     def angle_covariances(self) -> Floats:
-        """Return the covariances of the angles turned within the intervals: (K, 3, 3) rad^2."""
+        """Return the scatter of the attitude in each interval: covariances (K, 3, 3) rad^2."""
         T = np.diff(self.t)
-        turned = np.cumsum(self.turn, axis=0) - self.turn / 2
+        angle = np.cumsum(self.turn, axis=0) - self.turn / 2
         share = (T / np.repeat(self.over_intervals(T), np.diff(self.key)))[:, None]
-        mean = self.over_intervals(turned * share)
-        square = self.over_intervals(turned[:, :, None] * (turned * share)[:, None])
+        mean = self.over_intervals(angle * share)
+        square = self.over_intervals(angle[:, :, None] * (angle * share)[:, None])
         return square - mean[:, :, None] * mean[:, None]
 
     def over_intervals(self, x: Floats) -> Floats:
@@ -128,69 +128,72 @@ class ImuSteps(Steps):
 
 
 def _edges(t: Floats, key: Ints) -> Ints:
-    """Return the samples at which steps begin or end, all keyframes with them: rising."""
+    """Return the indices of the samples at the ends of steps, all keyframes included: sorted."""
     begin, T = t[key[:-1]], np.diff(t[key])
     count = np.maximum(1, np.round(T / STEP))
-    own = np.repeat(np.arange(len(T)), np.diff(key))
+    interval = np.repeat(np.arange(len(T)), np.diff(key))
     rounding = 1e-6     # of a step: a sample at the end of a step is not moved into it by rounding
-    cell = np.floor((t[key[0]:key[-1]] - begin[own]) / T[own] * count[own] + rounding)
-    new = np.r_[True, (np.diff(own) > 0) | (np.diff(cell) > 0)]
+    step = np.floor((t[key[0]:key[-1]] - begin[interval]) / T[interval] * count[interval]
+                    + rounding)
+    new = np.r_[True, (np.diff(interval) > 0) | (np.diff(step) > 0)]
     out: Ints = np.append(np.flatnonzero(new), key[-1] - key[0]) + key[0]
     return out
 
 
 def _summed(leg: SmootherLeg, edges: Ints) -> Steps:
-    """Return the sums of steps between samples: edges (m + 1,)."""
+    """Return the sums of m steps; edges : (m + 1,) indices of the samples at their ends."""
     rows = slice(edges[0], edges[-1] + 1)
     t, f = leg.t_imu[rows], leg.f_b[rows]
     first = edges[:-1] - edges[0]
-    own = np.repeat(np.arange(len(first)), np.diff(edges))
+    step = np.repeat(np.arange(len(first)), np.diff(edges))     # of each sample
     dt = np.diff(t)[:, None]
     turn = rotation_increments(leg.t_imu, leg.w_b, edges[0], edges[-1]).T
     q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], quat_from_rotvec(turn)]))
-    back = quat_conjugate(q[first])[own]
-    at_end = quat_multiply(back, q[1:])
-    a_s = np.einsum('nij,nj->ni', matrix_from_quat(quat_multiply(back, q[:-1])), f[:-1])
-    a_e = np.einsum('nij,nj->ni', matrix_from_quat(at_end), f[1:])
+    to_start = quat_conjugate(q[first])[step]
+    at_end = quat_multiply(to_start, q[1:])
+    # specific force at both ends of a sample interval, in the axes at the start of its step
+    f_start = np.einsum('nij,nj->ni', matrix_from_quat(quat_multiply(to_start, q[:-1])), f[:-1])
+    f_end = np.einsum('nij,nj->ni', matrix_from_quat(at_end), f[1:])
     last = np.append(first[1:], len(dt)) - 1
 
     def running(x: Floats) -> tuple[Floats, Floats]:
+        """Return the sum within the step before each sample, and the sum of each step."""
         total = np.cumsum(x, axis=0)
         before = total - x
-        return before - before[first][own], total[last] - before[first]
+        return before - before[first][step], total[last] - before[first]
 
-    v, dv = running((a_s + a_e) * dt / 2)
-    _, dp = running(v * dt + (2 * a_s + a_e) * (dt**2 / 6))
+    v, dv = running((f_start + f_end) * dt / 2)
+    _, dp = running(v * dt + (2 * f_start + f_end) * (dt**2 / 6))
     signals = np.concatenate([turn, (f[:-1] + f[1:]) / 2 * dt], axis=1)
-    turned, _ = running(turn)
-    mean = np.add.reduceat((turned + turn / 2) * dt, first) / np.add.reduceat(dt, first)
+    angle, _ = running(turn)
+    mean = np.add.reduceat((angle + turn / 2) * dt, first) / np.add.reduceat(dt, first)
     return Steps(rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
                  np.maximum.reduceat(dt[:, 0], first))
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
-    """Return sigmas of white noise and random walks by the grade of the IMU, SI."""
+    """Return the sigmas of white noise and random walks of an IMU of this grade, SI, by level."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
     return {name: max(sigma, MIN_NOISE.imu[name]) for name, sigma in stated.items()}
 
 
 def without_accelerometer(grade: Grade) -> Grade:
-    """Return the grade of an IMU without an accelerometer: its specific force is gravity."""
+    """Return a grade for an IMU without an accelerometer, whose specific force is gravity."""
     return replace(grade, accel_noise=NO_ACCEL_NOISE, accel_bias=TILT_SIGMA * G,
                    accel_bias_walk=NO_ACCEL_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 
 
 def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict[str, float]:
-    """Return white noise levels of gyro and accelerometer from standstills; lower limits."""
+    """Return the white noise variances at standstills, by sensor: 'gyro', 'accel'; {}: too few."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t[imu.key])[:, None]
     inside = at_rest[:-1] & at_rest[1:]
     rest = np.flatnonzero(inside)
-    runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    stops = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
     # second differences contain no bias and no drift; their variance is six times as large
-    squares = [[(np.diff((x / T)[run], n=2, axis=0)**2).sum(axis=1) * T[run][1:-1, 0] / 6
-                for x in (turn, force)] for run in runs if len(run) > 2]
+    squares = [[(np.diff((x / T)[stop], n=2, axis=0)**2).sum(axis=1) * T[stop][1:-1, 0] / 6
+                for x in (turn, force)] for stop in stops if len(stop) > 2]
     both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
     if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
         return {}
@@ -202,18 +205,19 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict
 
 
 def sample_noise(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
-    """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
-    def jumps(x: Floats) -> Floats:
+    """Return the white noise by differences of adjacent samples, SI per sqrt(Hz), by sensor."""
+    def squared_differences(x: Floats) -> Floats:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out
 
-    usual = median(by_step(np.diff, leg.t_imu[rows]))
-    return {name: float(np.sqrt(median(by_step(jumps, x[rows])) / CHI2_3_MEDIAN / 2 * usual))
+    T = median(by_step(np.diff, leg.t_imu[rows]))
+    return {name: float(np.sqrt(median(by_step(squared_differences, x[rows]))
+                                / CHI2_3_MEDIAN / 2 * T))
             for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}
 
 
 def is_standing(leg: SmootherLeg, t: Floats) -> Bools:
-    """Return a mask of times in a standstill, half a second from its ends: (N,) bool."""
+    """Return a mask of the times in a standstill and not within 0.5 s of its ends: (N,) bool."""
     def within(t: Floats) -> Bools:
         inside = np.zeros(len(t), bool)
         for begin, end in leg.standstills:
@@ -223,7 +227,7 @@ def is_standing(leg: SmootherLeg, t: Floats) -> Bools:
 
 
 def gyro_bias_at_rest(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:
-    """Return the mean turn rate at standstills between the keyframes, (3,); None without any."""
+    """Return the mean turn rate at standstills, (3,) rad/s; None if they are shorter than 1 s."""
     first, last = imu.key[[0, -1]]
     inside = is_standing(leg, imu.t[first:last + 1])
     at_rest = inside[:-1] & inside[1:]

@@ -1,11 +1,16 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The input of the estimator: one leg as screened arrays, with observations besides fixes."""
+"""
+The input of the estimator: one leg as arrays of screened samples.
+
+``prepare.make_smoother_leg`` makes a ``SmootherLeg``. Other sensors than IMU, odometer and fixes
+are ``ExternalSamples``.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -16,83 +21,81 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import arctan2, transpose
 from odocal_ros.screening.inputs import Inputs
 
-# s: a standstill that ended longer before the start mark is another drive. Judgement
+# s, judgement: a standstill that ended earlier than this before the start mark is not used
 BEFORE_MARK = 30.0
-# Hz: physical, errors of velocity and heading last longer than a fifth of a second
+# Hz, limit for velocity and heading. Physical: their errors last longer than a fifth of a second
 EXTERNAL_RATE = 5.0
-# Hz: judgement, measured in decision 21. The noise of the IMU between a fix and its keyframe is
-# not in the rows of fixes; denser ones, finer than this noise, make the fit oscillate
+# Hz, limit for fixes. Judgement, measured in decision 21: the rows of fixes do not contain the
+# noise of the IMU between a fix and its keyframe; denser and more accurate fixes make the fit
+# oscillate
 FIX_RATE = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class ExternalSamples:
-    """Rows of a sensor in frame n: arrays of one length, times first."""
+    """Samples of a sensor: arrays of one length. A subclass adds their values."""
 
-    t: Floats       # (m,) s
+    t: Floats       # (m,) s since the start mark
 
     def between(self, first: float, last: float) -> Self:
-        """Return the rows between two times."""
+        """Return the samples between two times."""
         pick = (self.t >= first) & (self.t <= last)
         columns = {one.name: getattr(self, one.name) for one in fields(self)}
         return replace(self, **{name: column[pick] for name, column in columns.items()
                                 if isinstance(column, np.ndarray)})
 
 
-def thinned(t: Floats, most: float = EXTERNAL_RATE) -> slice:
-    """Return an index that thins sorted times, s, to a rate of about ``most``, Hz."""
+def thinned(t: Floats, max_rate: float = EXTERNAL_RATE) -> slice:
+    """Return a slice that thins sorted times, s, to a rate of about ``max_rate``, Hz."""
     rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9) if len(t) else 0.0
-    return slice(None, None, max(1, round(rate / most)))
+    return slice(None, None, max(1, round(rate / max_rate)))
 
 
 def enu_to_n(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
-    """Return C_np of the places at times: east and north differ from those at the origin."""
+    """Return the rotations from east, north, up at the vehicle to n, at times t: (m, 3, 3)."""
     latitude, longitude = (np.interp(t, inputs.t_fix, inputs.geodetic[:, i]) for i in (0, 1))
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
 def convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
-    """Return the yaw in n of east at the places of the vehicle: (m,) rad."""
+    """Return the meridian convergence, the yaw in n of east at the vehicle: (m,) rad."""
     C_np = enu_to_n(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])
-
-
-def _none(*shape: int) -> Any:
-    return field(default_factory=lambda: np.empty((0, *shape)))
 
 
 @dataclass(frozen=True, eq=False)
 class SmootherLeg:
     """
-    One leg, screened: times in s since the start mark, SI, body frame b, n fixed at ``origin``.
+    One leg: times in s since the start mark; b the axes of the IMU, n fixed at ``origin``.
 
     Lever arms are positions in base_link axes, m. Fixes without a height have NaN up.
     """
 
     origin: Origin
-    t_begin: float              # s, first moment used: the standstill before the mark, or the mark
-    t_stop: float               # s
-    t_imu: Floats               # (n,)
+    t_begin: float              # s, start of the used data: the mark or a standstill before it
+    t_stop: float               # s, end of the used data
+    t_imu: Floats               # (n,) s
     w_b: Floats                 # (n, 3) rad/s
     f_b: Floats                 # (n, 3) m/s^2
     travel: Travel
     t_fix: Floats               # (k,)
     fixes_n: Floats             # (k, 3) m
     covariance_n: Floats        # (k, 3, 3) m^2, with rounding
-    standstills: Floats         # (s, 2) s
-    rough_scale: float          # metres per unit of travel, good to 30 %
+    standstills: Floats         # (s, 2) s, start and end
+    rough_scale: float          # metres per unit of travel, with an error of up to 30 %
     nominal_scale: float = 0.0  # K0, 0 unknown
     scale_unit: str = 'm/pulse'
     imu_arm: Floats = field(default_factory=lambda: np.zeros(3))
     odometer_arm: Floats = field(default_factory=lambda: np.zeros(3))
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
-    uncertain_t: Floats = _none()
-    uncertain_sigma: Floats = _none()        # scale units
-    # by the name of the factor
+    # times, s, and sigmas, scale units, of steps of the travel that are uncertain: slips, gaps
+    uncertain_t: Floats = field(default_factory=lambda: np.empty(0))
+    uncertain_sigma: Floats = field(default_factory=lambda: np.empty(0))
+    # other sensors, by the name of their factor
     external: Mapping[str, ExternalSamples] = field(default_factory=dict)
-    wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
+    wheels: tuple[Travel, ...] = ()     # single wheels, in the order of odometer.wheels
     has_accelerometer: bool = True      # False: f_b is constant gravity
-    # (k, 3) or (1, 3) m^2, part of the variances of the fixes by rounding
+    # (k, 3) or (1, 3) m^2, part of ``covariance_n`` by rounding of the positions
     rounding_n: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
     @property
@@ -115,10 +118,11 @@ class SmootherLeg:
 
 def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     """
-    Return the time in which the correlated error of fixes changes between keyframes: (N - 1,) s.
+    Return the time in which the correlated error of fixes changes in each interval: (N - 1,) s.
 
-    That of GNSS changes with time. That of positions in a local frame (drift of SLAM, cells and
-    particles of AMCL) changes with the path of the wheels: time is shared out by path.
+    The error of GNSS changes with time: the length of the interval. That of positions in a local
+    frame (drift of SLAM, cells and particles of AMCL) changes with the path of the wheels: the
+    length of the leg, divided in proportion to the path.
     """
     T = np.diff(t)
     fastest = 5.0       # m/s, judgement: no robot indoors; the positions of a car are from GNSS

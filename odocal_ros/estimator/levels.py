@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Noise levels: the variance components of a fit, docs/method.md (S26), and their lower limits.
+Noise levels: the variances that a fit estimates, docs/method.md (S26), and their lower limits.
 
-Their uncertainty (S27b) is by the average information. V_i is the derivative of the covariance R
-of all rows by the logarithm of level i, u = R^-1 r the weighted residuals. With q_i = V_i u and
-g_i = J' R^-1 q_i, Gilmour, Thompson and Cullis (1995):
+Their uncertainty is by the average information (S27b) of Gilmour, Thompson and Cullis (1995). V_i
+is the derivative of the covariance R of all rows by the logarithm of level i, and R^-1 r are the
+weighted residuals. With q_i = V_i R^-1 r and g_i = J' R^-1 q_i,
 
     A_ij = (q_i' R^-1 q_j - g_i' H^-1 g_j) / 2,        dc / d(ln level_i) = (H^-1 g_i) of constants
 """
@@ -18,19 +18,20 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, work_array
 
+# of the time-correlated fix error, horizontal and vertical: spectral densities of its noise, m^2/s
 CORRELATED_LEVELS = ('slow', 'slow_up')
 
 
 @dataclass(frozen=True)
 class MinimumNoise:
     """
-    Minimum sigma of each variance component.
+    Minimum sigma of each noise.
 
     Physical: the best receivers of today; for an IMU a tenth of navigation grade, since one with a
     dead band has no noise at rest.
     """
 
-    fix: float = 0.005          # m, east or north or up, of white and of slow errors each
+    fix: float = 0.005          # m, each axis, of the white and of the correlated fix error each
     pose: float = 2e-4          # m, of positions in a local frame: motion capture
     velocity: float = 0.005     # m/s, of an external velocity
     heading: float = 5e-4       # rad, of an external heading
@@ -48,9 +49,11 @@ MIN_NOISE = MinimumNoise()
 @dataclass(frozen=True)
 class Levels:
     """
-    Variance of each component: per s of INTERVAL and slow errors, factors on the stated ones.
+    The noise levels by name.
 
-    ``correlation_time`` is one of them: of the correlated fix error, s, if it is estimated.
+    Those of an interval (interval_noise.INTERVAL) and of the correlated fix error are variances
+    per second, those of a sensor with stated sigmas factors on its variances. 'size_...' are the
+    sizes of imperfections, (S28); 'correlation_time' is that of the fix error, s.
     """
 
     values: dict[str, float]
@@ -68,7 +71,7 @@ class Levels:
         return Levels(self.values | values)
 
     def sigmas(self) -> dict[str, float]:
-        """Return standard deviations, stationary ones of correlated errors, and the time."""
+        """Return the roots of the levels, of correlated errors the stationary sigma; the time."""
         time = self.correlation_time
         return {k: float(np.sqrt(v * (time / 2 if k in CORRELATED_LEVELS else 1.0)))
                 for k, v in self.values.items()} | {'correlation_time': time}
@@ -83,10 +86,9 @@ class Levels:
 
 class LevelRightHandSides:
     """
-    The right-hand sides of L levels, at first all zero.
+    The vectors g_i of L levels, initially zero.
 
-    names : of the levels.   chain : (N, n, L) g_i by the keyframes.   border : (m, L) by the
-    constants.   square : (L, L) q_i' R^-1 q_j.
+    g : (N, n, L) of the keyframes.   g_constants : (m, L).   square : (L, L) q_i' R^-1 q_j.
     """
 
     def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
@@ -95,7 +97,7 @@ class LevelRightHandSides:
         self.g_constants = np.zeros((m, len(self.names)))
         self.square = np.zeros((len(self.names),) * 2)
 
-    def at(self, names: Iterable[str]) -> list[int]:
+    def columns(self, names: Iterable[str]) -> list[int]:
         """Return the columns of some levels."""
         return [self.names.index(name) for name in names]
 
@@ -105,8 +107,8 @@ class LevelInformation:
     """Information of the data on L levels, and the effect of the levels on the constants."""
 
     names: tuple[str, ...]
-    average: Floats  # (L, L) information on the logarithms of the levels
-    moves: Floats    # (m, L) derivatives of the constants by these logarithms
+    average: Floats     # (L, L) information on the logarithms of the levels, A of (S27b)
+    constants_by_level: Floats      # (m, L) derivatives of the constants by these logarithms, W
 
     def effects(self, precision: Mapping[str, float]) -> Floats:
         """
@@ -116,6 +118,5 @@ class LevelInformation:
 
         precision : information of the prior on each logarithm, by the name of the level.
         """
-        own = np.diag([precision[name] for name in self.names])
-        root = np.linalg.cholesky(np.linalg.inv(self.average + own))
-        return self.moves @ root
+        prior = np.diag([precision[name] for name in self.names])
+        return self.constants_by_level @ np.linalg.cholesky(np.linalg.inv(self.average + prior))

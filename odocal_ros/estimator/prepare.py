@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Preparation of a leg for the estimator: its rows, keyframes, whitening, priors, levels."""
+"""
+Preparation of the estimator: from screened samples to a leg, from a leg to its problem.
+
+``make_smoother_leg`` returns the input of a fit; ``make_problem`` the keyframes, the priors of the
+constants and the initial noise levels.
+"""
 
 from dataclasses import replace
 
@@ -48,67 +53,67 @@ HEIGHT_TIME = 900.0
 
 
 def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats,
-                      spans: Floats,
-                      rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
+                      spans: Floats, rough_scale: float,
+                      t_stop: float | None = None) -> SmootherLeg:
     """
     Return the input of the smoother from screened samples.
 
     inputs : result of ``screen``.   config : lever arms, nominal scale.   origin : of the frame n.
     fixes_n : (k, 3) fixes in n, m; NaN up where a fix has no height.   spans : (s, 2) standstills,
-    s.   rough_scale : metres per unit of travel.   t_stop : end of the used data, s (the rest is
-    held out); the stop mark by default.
+    s.   rough_scale : metres per unit of travel.   t_stop : end of the used data, s; by default
+    the stop mark.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
     if not inputs.has_accelerometer:         # level ground is assumed: heights are not used
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     earlier = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(earlier[-1][0])) if earlier else 0.0
-    some = thinned(inputs.t_fix, FIX_RATE)
+    kept = thinned(inputs.t_fix, FIX_RATE)
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
-        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[some],
-        fixes_n=fixes_n[some], covariance_n=inputs.covariance_n[some],
-        rounding_n=inputs.rounding_n[some],
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[kept],
+        fixes_n=fixes_n[kept], covariance_n=inputs.covariance_n[kept],
+        rounding_n=inputs.rounding_n[kept],
         standstills=np.asarray(spans), rough_scale=float(rough_scale),
         nominal_scale=nominal_scale(config, inputs.scale_unit),
         scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
         uncertain_t=inputs.uncertain_t, uncertain_sigma=inputs.uncertain_sigma,
-        external={part.name: sent for part in EXTERNAL_FACTORS
-                  if (sent := part.prepared(inputs, config, origin)) is not None},
+        external={kind.name: samples for kind in EXTERNAL_FACTORS
+                  if (samples := kind.prepared(inputs, config, origin)) is not None},
         has_accelerometer=inputs.has_accelerometer,
         wheels=inputs.travels)
 
 
 def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
-    """Return the estimation problem of a leg; ``imu``: IMU steps with keyframes, else SPACING."""
+    """Return the estimation problem of a leg; imu : its steps, by default with SPACING."""
     imu = ImuSteps.from_leg(leg, SPACING) if imu is None else imu
     t = imu.t[imu.key]
     at_rest = is_standing(leg, t)
-    use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+    used_fixes = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
     config = replace(config, imu=with_grade_by_noise(
         config.imu, white_noise_at_rest(imu, leg, at_rest)))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
-    external = {name: sent.between(t[0], t[-1]) for name, sent in leg.external.items()}
-    own_constants = {part.source: part.constants for part in EXTERNAL_FACTORS
-                     if part.name in leg.external and part.name not in SHARED}
-    whitening = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
+    external = {name: samples.between(t[0], t[-1]) for name, samples in leg.external.items()}
+    unshared_constants = {kind.source: kind.constants for kind in EXTERNAL_FACTORS
+                          if kind.name in leg.external and kind.name not in SHARED}
+    whitening = whitener(leg.covariance_n[used_fixes], np.isnan(leg.fixes_n[used_fixes, 2]))
     problem = Problem(
-        leg, imu, grade, _priors(config, grade, leg), use, whitening, at_rest,
-        {name: sent for name, sent in external.items() if len(sent.t)}, own_constants,
-        total_turn(leg, imu), config.gnss.correlation_time,
+        leg, imu, grade, _priors(config, grade, leg), used_fixes, whitening, at_rest,
+        {name: samples for name, samples in external.items() if len(samples.t)},
+        unshared_constants, total_turn(leg, imu), config.gnss.correlation_time,
         mean_rates_at(leg.t_imu, leg.w_b, t), imu.angle_covariances(), drift_time(leg, t),
         # poses can be from motion capture; fixes and points are less accurate
         MIN_NOISE.fix if not leg.origin.local or config.reference.points else MIN_NOISE.pose)
-    for part in FACTORS:
-        if part.is_present(problem):
-            first, least = part.initial_levels(problem)
-            problem.initial_levels = problem.initial_levels.replaced(**first)
-            problem.min_levels |= least
-    # initial levels include the vibration; most of it cancels within a second, so the fit then
-    # decreases them
+    for kind in FACTORS:
+        if kind.is_present(problem):
+            initial, minimum = kind.initial_levels(problem)
+            problem.initial_levels = problem.initial_levels.replaced(**initial)
+            problem.min_levels |= minimum
+    # samples also contain vibration, most of which cancels within a second: the fit starts with
+    # it, and decreases the levels
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     problem.vibrating_levels = {name: max(sigma**2, problem.initial_levels[name])
                          for name, sigma in sample_noise(leg, rows).items()}
@@ -117,17 +122,17 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
 
 def imperfection_sigmas(grade: Grade) -> Floats:
     """
-    Return the usual sigmas of the constants IMPERFECTIONS, 0 for an absent error: (k,).
+    Return the usual sigmas of the constants IMPERFECTIONS, 0 without this error: (k,).
 
-    Errors of the IMU are by its grade. Receivers that smooth do so over a second; most receivers
-    have no odometer, so theirs is a small error with a wide range (SIZE_SPREADS). Clocks differ by
+    Errors of the IMU are by its grade. Receivers that smooth do so over a second. Most have no
+    odometer: its usual error is small, with a wide range (SIZE_SPREADS). Clocks differ by
     20 ppm. The scale of tyres changes by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within
     about ten minutes, and by slip of 0.4 % for each m/s^2. The path of an axle differs from that
     along the pitching body by half the square of the pitch. A body pitches by 1.7 deg/g, the rear
     axle of a car slides by 0.3 deg per m/s^2, both with a delay of 0.1 s. Over a crest the body
     pitches about the middle of its wheelbase.
     """
-    axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
+    axes = np.sqrt(2) * grade.misalignment     # two angles: a third one turns the whole frame
     usual = {
         'gyro_scale': grade.gyro_scale_error, 'gyro_axis': axes,
         'gyro_by_force': grade.gyro_by_force,       # rad/s per m/s^2
@@ -139,7 +144,7 @@ def imperfection_sigmas(grade: Grade) -> Floats:
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
-        'scale_by_pitching': 1.0,                   # of half the square of the angle
+        'scale_by_pitching': 1.0,                   # per half the squared angle
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         # m: a car's 1.4, a truck's 2.5; in turns 0 of a body that rolls on level ground
@@ -148,7 +153,7 @@ def imperfection_sigmas(grade: Grade) -> Floats:
 
 
 def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
-    """Return the priors of biases and constants; sigma is infinite without a prior."""
+    """Return the priors of biases and constants."""
     sigma = np.full(layout.M, np.inf)
     sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[layout.ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
@@ -162,24 +167,24 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     # gravity times the scale error is a bias too
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)
-    centre = np.zeros(layout.M)
+    mean = np.zeros(layout.M)
     sigma[layout.LIFT] = LIFT_SIGMA
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
-    # definition: the error is in stated sigmas, so 1; with constant sigmas it has no effect
+    # definition: 1, as the error is in stated sigmas; if these are constant it has no effect
     sigma[layout.FIX_ERROR_BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
-    centre[layout.FIX_MOTION_TIME], sigma[layout.FIX_MOTION_TIME] = np.log(20.0), 0.7
+    mean[layout.FIX_MOTION_TIME], sigma[layout.FIX_MOTION_TIME] = np.log(20.0), 0.7
     # offset of a coarse speed: 0 (rounded) to half a step (truncated)
     half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
-    centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
-    for part in EXTERNAL_FACTORS:
-        sent = leg.external.get(part.name)
-        sigma[part.constants] = (
-            layout.NO_ERROR if sent is None else part.prior_sigmas(sent, config))
-    if not leg.has_accelerometer:        # mounting and attitude are not separable: configured
+    mean[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
+    for kind in EXTERNAL_FACTORS:
+        samples = leg.external.get(kind.name)
+        sigma[kind.constants] = (
+            layout.NO_ERROR if samples is None else kind.prior_sigmas(samples, config))
+    if not leg.has_accelerometer:   # mounting and attitude are not separable: configured mounting
         sigma[layout.ACCEL] = sigma[layout.PITCH] = layout.NO_ERROR
         if 'heading' not in leg.external:
-            centre[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
-    return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
+            mean[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
+    return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, mean)

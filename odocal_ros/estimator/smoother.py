@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
+"""
+The smoother: scale factor and mounting angles from all samples of a leg at once (docs/method.md).
+
+``smooth`` prepares the problem, fits it from one or two starts, and makes the result.
+"""
 
 from dataclasses import replace
 
@@ -27,28 +31,26 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw
 
-# rad, passes, judgement: if the heading from accelerations has a larger sigma, it may be wrong:
-# the fit is then also started at the configured yaw, and each start has this number of passes
+# rad, judgement: a heading from accelerations with a larger sigma may be wrong: the fit is then
+# also started at the configured yaw, and each of the two starts has this number of passes
 AMBIGUOUS_HEADING, TRIAL_PASSES = 0.1, 3
-# initial size (S28) of the scale error of an odometer inside the receiver, and s, shortest leg
-# with it: ten times the time constant with which satellites correct that odometer; shorter legs do
-# not determine its error. Tuned on six drives of 300 s in yards with an error of 5 %: from 0.5,
-# the usual size, all fits have scale and accelerometer 3 % off instead, 9 to 12 sigma; from 50,
-# one of six has (docs/decisions/0019)
-LARGE_SIZE, LARGE_SIZE_FROM = 50.0, 200.0
+# initial size (S28) of the scale error of an odometer inside the receiver, and shortest leg, s,
+# that starts with it: ten times the time constant with which satellites correct that odometer;
+# shorter legs do not determine its error. Tuned on six drives of 300 s in yards with an error of
+# 5 %: from 0.5, the usual size, all fits have scale and accelerometer 3 % off instead, 9 to 12
+# sigma; from 50, one of six has (docs/decisions/0019)
+RECEIVER_ODOMETER_SIZE, RECEIVER_ODOMETER_LEG = 50.0, 200.0
 
 
 def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
     """
     Return scale, yaw and pitch mounting of a leg from all its samples.
 
-    leg : screened samples.   config : grade, lever arms' and delays' sigmas, limits.   trace :
-    called with each pass of the iteration, for benchmarks. An undetermined value is None with its
-    reason.
+    leg : screened samples.   config : grade, sigmas of lever arms and delays, limits.   trace :
+    called after each pass, for benchmarks. An undetermined value is None, with its reason.
     """
-    few = missing_samples_reason(leg)
-    if few:
-        return refused_result([few], leg.scale_unit, leg.wheels)
+    if missing := missing_samples_reason(leg):
+        return refused_result([missing], leg.scale_unit, leg.wheels)
     problem = make_problem(leg, config)
     try:
         best = best_fit(problem, config, trace)
@@ -63,13 +65,13 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
 
 def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
     """
-    Return the fit of a leg.
+    Return the fit of a leg, from a cold start.
 
-    It has one start, or two if accelerations do not determine the heading: the one with the higher
+    There are two starts if accelerations do not determine the heading: the one with the higher
     likelihood after a few passes continues. The offset of a quantised speed is then compared with
     those of rounding and of truncation.
     """
-    # not stored in a variable: one fit in memory at a time
+    # nested, so that only one fit is in memory at a time
     return _fix_speed_offset(problem, _fit_from_starts(problem, config, trace), trace)
 
 
@@ -84,20 +86,20 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
         return current
     sigma = float(np.sqrt(current.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     estimated = float(current.state.constants[SPEED_OFFSET])
-    usual = coarse.truncation if estimated > coarse.truncation / 2 else 0.0
+    nearer = coarse.truncation if estimated > coarse.truncation / 2 else 0.0
     deviation, other_deviation = (
-        abs(estimated - x) / sigma for x in (usual, coarse.truncation - usual))
+        abs(estimated - x) / sigma for x in (nearer, coarse.truncation - nearer))
     # 3.5 sigma: exceeded by one correct drive in 2000; likelihood ratio of 1000 to 1
     if deviation > 3.5 or other_deviation**2 - deviation**2 < 2 * np.log(1e3):
         return current
     constants = current.state.constants.copy()
-    constants[SPEED_OFFSET] = usual
+    constants[SPEED_OFFSET] = nearer
     summary = current.summary()
-    del current             # the equations of one fit at a time
+    del current             # its equations: only one fit is in memory at a time
     fixed_sigma = 1e-3 * coarse.step       # practically fixed
-    warm_start = replace(summary, priors=_fix_offset_priors(summary.priors, usual, fixed_sigma),
-                         initial_priors=_fix_offset_priors(summary.initial_priors, usual,
-                                                           fixed_sigma))
+    priors, initial_priors = (_fix_offset_priors(one, nearer, fixed_sigma)
+                              for one in (summary.priors, summary.initial_priors))
+    warm_start = replace(summary, priors=priors, initial_priors=initial_priors)
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)
@@ -105,13 +107,13 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
 
 def _fix_offset_priors(priors: Priors, value: float, sigma: float) -> Priors:
     """Return priors with this mean and sigma of the speed offset."""
-    constants, centre = priors.constants.copy(), priors.centre.copy()
-    constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value
-    return replace(priors, constants=constants, centre=centre)
+    means, sigmas = priors.mean.copy(), priors.sigma.copy()
+    means[SPEED_OFFSET], sigmas[SPEED_OFFSET] = value, sigma
+    return replace(priors, mean=means, sigma=sigmas)
 
 
 def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> Fit:
-    """Return the fit from the cold start, or from a second yaw if that has a higher likelihood."""
+    """Return the fit from the cold start, or from the configured yaw if it is more likely."""
     nominal, has_accelerometer = nominal_yaw(config), problem.leg.has_accelerometer
     start = cold_start(problem.leg, problem.imu, problem.priors,
                        None if has_accelerometer else nominal)
@@ -137,8 +139,8 @@ def _initial_levels(problem: Problem, start: Start) -> Levels:
     configured = problem.correlation_time
     correlation_time = USUAL_TIME if np.isnan(configured) else configured
     leg = problem.leg
-    long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
-    sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
+    long = leg.has_accelerometer and leg.t_stop - leg.t_begin > RECEIVER_ODOMETER_LEG
+    sizes = {'size_fix_error_by_motion': RECEIVER_ODOMETER_SIZE} if long else {}
     return problem.initial_levels.replaced(
         fix=WHITE_SHARE * factor, fix_up=4.0 * WHITE_SHARE * factor_up,
         correlation_time=correlation_time, **sizes, **problem.vibrating_levels)
@@ -166,9 +168,10 @@ def too_few_samples_reason(fixes: int, seconds: float) -> Reason | None:
 
 def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels) -> Floats:
     """
-    Return the covariance of the constants at a given state: (M, M), ln K first.
+    Return the Cramer-Rao bound, the covariance of the constants at a known state: (M, M).
 
-    It is the inverse of the information of all observations, with the priors of the constants.
+    It is the inverse of the information of all observations, with the priors of the constants, in
+    the order of CONSTANTS.
     truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
     return Equations(make_problem(leg, config), truth, fitted=True).at(levels).solved().covariance

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The state vector of the smoother, docs/method.md (S1), and the leg's constants, (S2).
+The unknowns of the smoother: states at the keyframes, (S1), and constants, (S2) of docs/method.md.
 
-A block of the chain is [position, velocity, attitude error, gyro bias, accelerometer bias, travel
-error, (slow fix error)]; the attitude error phi turns the estimate: C_nb = exp(phi) C_hat. The
-travel error is that of the odometer's reading at the keyframe (quantisation: bounded), in scale
-units. The constants are the border.
+``State`` has their values. This module also defines where each unknown is in a step: P, V, ...
+are its columns in the BLOCK of a keyframe, LN_K, YAW, ... its indices in CONSTANTS, which are the
+same at all keyframes of a leg. The attitude has three columns: a rotation vector phi in n, which
+multiplies the estimate, C_nb = exp(phi) C_hat.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -20,15 +20,16 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3
 
-# unknowns of a block in order, and their sizes
+# unknowns of a keyframe in order, and their numbers. The travel error is that of the odometer
+# reading, in scale units, bounded by rounding; the slow error is the time-correlated one of a fix
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
-         'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU, where there is one': 3}
+         'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU': 3}
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
     BLOCK.values(), accumulate(BLOCK.values()), strict=True))
 E = TRAVEL.start
-WITHOUT_SLOW, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
+WITHOUT_SLOW, WITH_SLOW = SLOW.start, SLOW.stop     # sizes of a block, as the fixes are modelled
 
-# Errors of the IMU's axes: (axis with the error, signal that it contains). Signals of the
+# Errors of the IMU's axes: (axis with the error, signal that it contains), (S3). Signals of the
 # gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
 # bias of a level IMU, not of one mounted at an angle. Three of the 18 are zero by the definition
 # of the axes: z is the axis of turns on level ground, x the direction of a force that the y
@@ -46,7 +47,6 @@ ACCEL_ERRORS = {
 GYRO_AXIS, GYRO_SIGNAL = zip(*GYRO_ERRORS.values(), strict=True)
 ACCEL_AXIS, ACCEL_SIGNAL = zip(*ACCEL_ERRORS.values(), strict=True)
 
-# the border
 CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
@@ -69,51 +69,52 @@ def constants_from(first: str, last: str = '') -> slice:
 
 LN_K, YAW, PITCH = map(CONSTANTS.index, ('scale_factor', 'yaw_mounting_angle',
                                          'pitch_mounting_angle'))
-# from the IMU, base_link axes, m
+# corrections of the configured lever arms, base_link axes, m
 ODO_ARM = constants_from('odometer_lever_arm_x', 'odometer_lever_arm_z')
 GNSS_ARM = constants_from('antenna_lever_arm_x', 'antenna_lever_arm_z')
-# s; error of the external heading, constant over the leg, rad
+# delays of the stamps, s; error of an external heading, rad
 ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_delay',
                                                        'heading_offset'))
 GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
 ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
-# s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
-# of a filter of position and velocity (nav/receiver_filter.py)
+# s^2, filter of the receiver: squared time constant of a mean of the past, or, below zero, of a
+# filter of position and velocity, (S16), (S16b) (nav/receiver_filter.py)
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
-# m/s: rate of a height error that changes over more time than a leg
+# m/s: rate of a height error that changes over a longer time than a leg
 HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
 # fix errors per stated sigma, east, north, up: they decrease as a receiver converges (S15a)
 FIX_ERROR_BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
 FIX_ERRORS = constants_from('fix_height_drift', 'fix_error_up')
 # relative: rate of the clock of its stamps minus that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
-# s^2, of a low-pass filter on the odometer's speed: square of its time constant
+# s^2: squared time constant of a low-pass filter of the odometer speed
 ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
-# of an odometer in the receiver: its relative error, and the logarithm of the time constant, s,
-# with which satellites correct its positions
+# an odometer inside the receiver, (S16a): its relative scale error, and the logarithm of the time
+# constant, s, with which satellites correct its positions
 FIX_BY_MOTION, FIX_MOTION_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
-# relative change of the scale from its mean by distance: with the square of the speed (its slope
-# at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
-# what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
+# relative change of the scale from its mean over the path, (S11): with the square of the speed
+# (its slope at FAST_SPEED, s/m), with time as tyres warm (its rate at the start of the leg, 1/s),
+# and with traction and braking, 1/(m/s^2): a wheel that is not driven only brakes
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 SCALE_BY_SPEED, SCALE_BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
 FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
-# of the path, per half the mean square of the body pitch in an interval: 1 if the axle keeps its
-# direction, 0 if it follows the body, negative if bumps are shorter than the wheelbase
+# relative change of the path per half the mean square of the body pitch in an interval, (S11a): 1
+# if the axle keeps its direction, 0 if it follows the body, negative if bumps are shorter than the
+# wheelbase
 SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
-# of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
-# change, rad per m/s^3: the body reacts with a delay, tyres immediately
+# pitch and yaw of the forward axis by forward and left acceleration, rad per m/s^2, and by their
+# rates of change, rad per m/s^3, (S12): the body reacts with a delay, tyres immediately
 BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
-# m, ahead of the odometer: points about which the body pitches on hills, in addition on bumps,
-# and in turns about its own left axis, on banked ground; and m/rad: the last times the roll of the
-# ground in the mean of the leg, which tilts that axis
+# points about which the body pitches, m ahead of the odometer: on hills; in addition on bumps; in
+# turns about its own left axis, on banked ground. Last the lift of the axle by turns, m/rad: the
+# third point times the mean roll of the ground, which tilts that axis
 PITCH_CENTRES = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
-# of each leg alone: its ground and its fixes
+# constants that other legs do not share: those of its ground and its fixes
 LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
-# deviations from an ideal vehicle
+# deviations from ideal sensors and an ideal vehicle, (S28)
 IMPERFECTIONS = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
-# kinds of deviations with one common size each, and their numbers of constants
+# their kinds, with one common size each: numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
@@ -123,36 +124,36 @@ KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'acceleromete
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')
-# of a GNSS velocity: delay of its stamps, s, square of the time constant of the receiver's filter,
-# s^2, and relative scale error
+# GNSS velocity: delay of its stamps, s, squared time constant of the receiver's filter, s^2, and
+# relative scale error
 VELOCITY = constants_from('velocity_delay', 'velocity_scale')
 VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
-# of heights by air pressure: m, m/s by weather, m per (m/s)^2 by dynamic pressure, relative by air
-# temperature
+# heights by air pressure, (S19a): zero, m; weather, m/s; dynamic pressure, m per (m/s)^2; air
+# temperature, relative
 PRESSURE = constants_from('pressure_offset', 'pressure_scale')
 M = len(CONSTANTS)
-NO_ERROR = 1e-12    # definition: prior sigma of constants that do not apply, in any unit
+NO_ERROR = 1e-12    # definition: prior sigma of a constant that is fixed, in any unit
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Values of all unknowns."""
+    """Values of all unknowns; position, velocity, attitude and biases are those of the IMU."""
 
     t: Floats             # (N,) s, keyframes
-    p_n: Floats           # (N, 3) m, of the IMU
+    p_n: Floats           # (N, 3) m
     v_n: Floats           # (N, 3) m/s
-    C_nb: Floats          # (N, 3, 3)
+    C_nb: Floats          # (N, 3, 3) from b, the IMU's axes, to n: east, north, up at the origin
     gyro_bias: Floats     # (N, 3) rad/s, in b
-    accel_bias: Floats    # (N, 3) m/s^2
+    accel_bias: Floats    # (N, 3) m/s^2, in b
     travel_error: Floats  # (N,) scale units
-    slow_n: Floats        # (N, 3) m, slow part of the fix error
+    slow_n: Floats        # (N, 3) m, time-correlated fix error
     constants: Floats     # (M,) as CONSTANTS, ln K first
-    # (3,) up in b, mean of the leg: by it the IMU's roll on the vehicle is observable
+    # (3,) up axis of n in b, mean of the leg: it determines the roll of the IMU in the vehicle
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @cached_property
     def scale(self) -> float:
-        """Return K."""
+        """Return the scale factor K, metres per scale unit."""
         return float(np.exp(self.constants[LN_K]))
 
     @cached_property
@@ -166,12 +167,12 @@ class State:
         return C_bv(self.forward, self.up_b)
 
     def keyframe_arrays(self) -> dict[str, Floats]:
-        """Return the arrays with a row for each keyframe, by name."""
+        """Return the arrays with a row for each keyframe, by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self)
                 if f.name not in ('constants', 'up_b')}
 
     def with_mean_up(self) -> 'State':
-        """Return the state with the mean up axis of its attitudes: the roll of the IMU."""
+        """Return the state with ``up_b`` computed from its attitudes."""
         return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
 
     @cached_property
@@ -179,22 +180,22 @@ class State:
         """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
         C, up = self.C_bv, self.up_b
         by_yaw, by_pitch = forward_gradient(self.constants[YAW], self.constants[PITCH])
-        return _turned_axes(C, up, by_yaw), _turned_axes(C, up, by_pitch)
+        return _axes_gradient(C, up, by_yaw), _axes_gradient(C, up, by_pitch)
 
     def updated(self, step: Floats, step_constants: Floats) -> 'State':
-        """Return the state with an increment of every unknown: (N, n), (M,)."""
+        """Return the state after a step of every unknown: (N, n), (M,)."""
         slow = self.slow_n + step[:, SLOW] if step.shape[1] > WITHOUT_SLOW else self.slow_n
         return replace(
             self, p_n=self.p_n + step[:, P], v_n=self.v_n + step[:, V],
             C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],
             accel_bias=self.accel_bias + step[:, BA],
             travel_error=self.travel_error + step[:, E], slow_n=slow,
-            constants=upright(self.constants + step_constants))
+            constants=limit_pitch(self.constants + step_constants))
 
 
-def upright(constants: Floats) -> Floats:
+def limit_pitch(constants: Floats) -> Floats:
     """
-    Return equivalent constants with a pitch within a quarter turn: same forward axis, up positive.
+    Return constants with the same forward axis and a pitch within 90 deg.
 
     Far from the solution, a step may move the pitch beyond 90 deg and invert the lever arms.
     """
@@ -216,8 +217,8 @@ def C_bv(forward: Floats, up: Floats) -> Floats:
     return np.stack([forward, left, np.cross(forward, left)], -1)
 
 
-def _turned_axes(C: Floats, up: Floats, by_forward: Floats) -> Floats:
-    """Return the derivative of C_bv, from that of the forward axis: (3, 3)."""
+def _axes_gradient(C: Floats, up: Floats, by_forward: Floats) -> Floats:
+    """Return the derivative of C_bv from that of the forward axis, ``by_forward``: (3, 3)."""
     forward, left = C[:, 0], C[:, 1]
     size = np.linalg.norm(np.cross(up, forward))
     by_left = np.cross(up, by_forward) / size
@@ -234,14 +235,14 @@ def forward_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """Prior sigmas of the first biases and the constants: (3,), (3,), (M,), inf where none is."""
+    """Priors of the biases at the first keyframe, with mean zero, and of the constants, (S21)."""
 
-    gyro_bias: Floats
-    accel_bias: Floats
-    constants: Floats
-    centre: Floats               # (M,) of the constants
+    gyro_bias_sigma: Floats      # (3,) rad/s
+    accel_bias_sigma: Floats     # (3,) m/s^2
+    sigma: Floats                # (M,) of the constants, inf: no prior, NO_ERROR: fixed
+    mean: Floats                 # (M,) of the constants
 
     @property
     def used_count(self) -> int:
-        """Return the number of constants up to the last one that a row depends on."""
-        return int(np.flatnonzero(self.constants > NO_ERROR)[-1]) + 1
+        """Return the number of constants up to the last one that is not fixed."""
+        return int(np.flatnonzero(self.sigma > NO_ERROR)[-1]) + 1

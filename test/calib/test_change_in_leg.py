@@ -108,11 +108,11 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
     constants[[LN_K, YAW]] += 0.01
     equations = equations_at(problem, fit, constants)
     found = []
-    for taken in (1.0, 0.4):
+    for fraction in (1.0, 0.4):
         weighted = equations.at(fit.levels)
         full = solve(weighted.normal())
-        solved = replace(full, step=taken * full.step, step_constants=taken * full.step_constants,
-                         taken=taken)
+        solved = replace(full, step=fraction * full.step, step_fraction=fraction,
+                         step_constants=fraction * full.step_constants)
         found.append([step.size
                       for step in find_constant_steps(weighted.apply_step(solved), solved)])
     sigma = [step.sigma for step in fit.constant_steps]
@@ -168,7 +168,7 @@ def test_a_scale_that_changes_gradually_has_no_step():
 @pytest.mark.parametrize('constant', [LN_K, YAW])
 def test_a_change_that_does_not_matter_is_not_reported(constant):
     for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
-        fit = SimpleNamespace(steps=(ConstantStep(constant, 100.0, size, size / 7),))
+        fit = SimpleNamespace(constant_steps=(ConstantStep(constant, 100.0, size, size / 7),))
         assert len(_change_reasons(fit)) == count
 
 

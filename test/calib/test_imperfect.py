@@ -163,8 +163,8 @@ def test_an_imu_has_the_turn_on_bias_of_its_own_grade_as_sold(changes, accel):
     """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
     _, config, leg = made(imu_grade='consumer', duration=135.0)
     priors = make_problem(leg, with_settings(config, changes)).priors
-    assert priors.accel_bias[:2] == pytest.approx(accel)
-    assert priors.gyro_bias == pytest.approx(TURN_ON['consumer'][0])
+    assert priors.accel_bias_sigma[:2] == pytest.approx(accel)
+    assert priors.gyro_bias_sigma == pytest.approx(TURN_ON['consumer'][0])
 
 
 def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_one():

@@ -46,7 +46,7 @@ def test_quantisation_explains_noise_of_its_own_size_only():
 def problem(leg, rest):
     """Return what the cause is found by; rest: s of standstill in front."""
     keys = np.arange(0.0, leg.t_imu[-1], 1.0)
-    return SimpleNamespace(leg=leg, still=keys < rest,
+    return SimpleNamespace(leg=leg, at_rest=keys < rest,
                            imu=SimpleNamespace(t=keys, key=np.arange(len(keys))))
 
 

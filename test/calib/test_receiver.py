@@ -72,10 +72,11 @@ def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
 
 
 def fixes_of(error, t):
-    """Return what long_run takes of fixes every second with these errors (m, 3), sigma 1 m."""
+    """Return fixes every second as long_span_factors uses them: errors (m, 3), sigma 1 m."""
     return SimpleNamespace(
         k=np.arange(len(t)), state=SimpleNamespace(t=t), errors=lambda: error,
-        points=SimpleNamespace(tau=np.zeros(len(t))), root=np.tile(np.eye(3), (len(t), 1, 1)))
+        points=SimpleNamespace(tau=np.zeros(len(t))),
+        whitening=np.tile(np.eye(3), (len(t), 1, 1)))
 
 
 def test_errors_as_the_model_has_them_are_left_as_they_are():

@@ -96,11 +96,11 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
             add(np.concatenate([-decay * single[SLOW], single[SLOW]], axis=1),
                 (block(k), block(k + 1)), np.diag(1 / np.sqrt(power * (1 - decay**2))))
     first = np.concatenate([*(np.broadcast_to(sigma, 3) for _, sigma in START_SIGMAS.values()),
-                            problem.priors.gyro_bias, problem.priors.accel_bias])
+                            problem.priors.gyro_bias_sigma, problem.priors.accel_bias_sigma])
     add(single[:15], (block(0),), np.diag(1 / first))
     if n == WITH_SLOW:
         add(single[SLOW], (block(0),), np.diag(1 / np.sqrt(power)))
-    prior = problem.priors.constants.copy()
+    prior = problem.priors.sigma.copy()
     prior[IMPERFECTIONS] *= np.sqrt(SIZE)         # the first sizes
     add(np.eye(M), (border,), np.diag(1 / prior))
     A = np.concatenate(rows)

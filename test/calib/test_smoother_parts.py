@@ -244,11 +244,11 @@ def slope(at, levels, name):
     return (above - below) / (2 * h)
 
 
-def sized(problem, where, sigma, centre):
+def sized(problem, where, sigma, mean):
     """Return a problem with other priors of some constants."""
-    constants, centres = problem.priors.constants.copy(), problem.priors.centre.copy()
-    constants[where], centres[where] = sigma, centre
-    return replace(problem, priors=replace(problem.priors, constants=constants, centre=centres))
+    sigmas, means = problem.priors.sigma.copy(), problem.priors.mean.copy()
+    sigmas[where], means[where] = sigma, mean
+    return replace(problem, priors=replace(problem.priors, sigma=sigmas, mean=means))
 
 
 # alone and two of a kind. The drive knows them to 1e-4 s^2 and 6e-4: of their priors by 1e-4

@@ -100,7 +100,7 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     usual = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
                       for name in CONSTANTS[IMPERFECTIONS]])
     problem = make_problem(leg, config)
-    problem.priors.constants[IMPERFECTIONS] = usual
+    problem.priors.sigma[IMPERFECTIONS] = usual
     covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
         Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
@@ -160,7 +160,7 @@ def test_the_gyro_scale_has_the_configured_sigma():
     _, config, leg = made(**SHORT)
     for required, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         asking = with_settings(config, {'imu.gyro_scale_sigma': required})
-        assert make_problem(leg, asking).priors.constants[GYRO.start] == prior
+        assert make_problem(leg, asking).priors.sigma[GYRO.start] == prior
 
 
 def test_an_imu_worse_than_its_grade_is_said():

@@ -144,7 +144,7 @@ class MotionRows(Factor):
                 for name, mask in masks.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
-        n, columns = self.n, out.at(INTERVAL)
+        n, columns = self.n, out.columns(INTERVAL)
         level_selector = np.eye(len(INTERVAL))[self.noise.component]     # (c, levels) 0 or 1
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)

@@ -117,7 +117,7 @@ class TravelError(Factor):
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
-        i, = out.at((self.name,))
+        i, = out.columns((self.name,))
         g = self.weight * self.state.travel_error / self.variance
         out.g[:, E, i] += g
         out.square[i, i] += g @ self.state.travel_error

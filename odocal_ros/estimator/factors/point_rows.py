@@ -183,7 +183,7 @@ class PointRows(Factor):
     def add_levels(self, out: LevelRightHandSides) -> None:
         if len(self.k) < LEAST_ROWS:
             return
-        columns = out.at(self.levels_of)
+        columns = out.columns(self.levels_of)
         q = np.zeros((*self.r.shape, len(columns)))
         for i, own in enumerate(self.levels_of.values()):
             q[:, own, i] = self.r[:, own]

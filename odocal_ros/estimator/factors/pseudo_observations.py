@@ -74,12 +74,12 @@ class PriorRows(Factor):
     name = 'priors'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
-        self.state, self.base = point.state, point.priors
+        self.state, self.usual_priors = point.state, point.priors
         self.own = problem.unshared_constants | {'slow_fix_errors': layout.FIX_ERRORS,
                                   'vertical_motion': layout.LIFT}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
-                       if (problem.priors.constants[where] > layout.NO_ERROR).any()}
+                       if (problem.priors.sigma[where] > layout.NO_ERROR).any()}
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -88,9 +88,9 @@ class PriorRows(Factor):
     def weigh(self, levels: Levels) -> None:
         """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
         size = np.array([levels[name] for name in SIZES])[layout.KIND_OF]
-        constants = self.base.constants.copy()
-        constants[layout.IMPERFECTIONS] *= np.sqrt(size)
-        self.priors = replace(self.base, constants=constants)
+        sigma = self.usual_priors.sigma.copy()
+        sigma[layout.IMPERFECTIONS] *= np.sqrt(size)
+        self.priors = replace(self.usual_priors, sigma=sigma)
         self.log_R = float(np.log(size).sum())
 
     def sizes(self, marginals: JointMarginals) -> dict[str, float]:
@@ -102,8 +102,8 @@ class PriorRows(Factor):
         effect it is the most likely size: the mean is that of the few vehicles with the effect.
         """
         at = 2 * self.n + np.arange(layout.IMPERFECTIONS.start, layout.IMPERFECTIONS.stop)
-        usual = self.base.constants[layout.IMPERFECTIONS]**2
-        weight = 1 / self.priors.constants[layout.IMPERFECTIONS]**2
+        usual = self.usual_priors.sigma[layout.IMPERFECTIONS]**2
+        weight = 1 / self.priors.sigma[layout.IMPERFECTIONS]**2
         total = 1 / marginals[0][at, at]
         data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
         known = data / (data + 1 / (SIZE * usual))
@@ -118,9 +118,9 @@ class PriorRows(Factor):
         return dict(zip(SIZES, np.where(spread > 1, likely, mean).tolist(), strict=True))
 
     def add_levels(self, out: LevelRightHandSides) -> None:
-        columns = out.at(SIZES)
+        columns = out.columns(SIZES)
         off = self._constants_off()[layout.IMPERFECTIONS]
-        sigma = self.priors.constants[layout.IMPERFECTIONS]
+        sigma = self.priors.sigma[layout.IMPERFECTIONS]
         of = np.eye(len(SIZES))[layout.KIND_OF]
         out.g_constants[layout.IMPERFECTIONS, columns] += of * (off / sigma**2)[:, None]
         out.square[columns, columns] += of.T @ (off / sigma)**2
@@ -128,11 +128,11 @@ class PriorRows(Factor):
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""
         state, priors = self.state, self.priors
-        yield layout.BG, state.gyro_bias[0], priors.gyro_bias
-        yield layout.BA, state.accel_bias[0], priors.accel_bias
+        yield layout.BG, state.gyro_bias[0], priors.gyro_bias_sigma
+        yield layout.BA, state.accel_bias[0], priors.accel_bias_sigma
 
     def _constants_off(self) -> Floats:
-        return self.state.constants - self.priors.centre
+        return self.state.constants - self.priors.mean
 
     def add(self, out: Normal) -> None:
         # the first keyframe has a wide prior at its value
@@ -142,28 +142,28 @@ class PriorRows(Factor):
             add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
             add_prior(out, 0, columns, sigma**2, value)
-        w, m = 1 / self.priors.constants**2, self.m
+        w, m = 1 / self.priors.sigma**2, self.m
         out.corner[range(m), range(m)] += w[:m]
         out.g_constants -= (w * self._constants_off())[:m]
         out.absent = w[m:]
 
     def cost(self) -> float:
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
-        out: float = total + (self._constants_off()**2 / self.priors.constants**2).sum()
+        out: float = total + (self._constants_off()**2 / self.priors.sigma**2).sum()
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         first = self.parameter_covariances(marginals[0][None])[0]
-        yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias
-        yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias
+        yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias_sigma
+        yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias_sigma
         for name, where in self.own.items():
             if where.stop <= self.m:
-                yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]
+                yield name, first[:, 2 * self.n:][:, where] / self.priors.sigma[where]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""
         for name, where in self.shared.items():
-            yield name, covariance[:PARAMETER_COUNT, where] / self.priors.constants[where]
+            yield name, covariance[:PARAMETER_COUNT, where] / self.priors.sigma[where]
 
 
 class StandstillRows(Factor):

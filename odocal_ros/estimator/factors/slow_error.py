@@ -136,7 +136,7 @@ class SlowError(factor.Factor):
             g.append(by_time)
             q.append(self._process(by_time))
             names.append('correlation_time')
-        columns = out.at(names)
+        columns = out.columns(names)
         for i, own in zip(columns, g, strict=True):
             out.g[:, SLOW, i] += own
         out.square[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]

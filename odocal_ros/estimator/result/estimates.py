@@ -130,14 +130,14 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     gain = np.linalg.solve(leg_rows[:, layout.LEG_CONSTANTS], leg_rows).T
     g_reduced = g_reduced - gain @ g_reduced[layout.LEG_CONSTANTS]
     reduced = reduced - gain @ leg_rows
-    weight = 1 / priors.constants**2
-    free = priors.constants > layout.NO_ERROR
+    weight = 1 / priors.sigma**2
+    free = priors.sigma > layout.NO_ERROR
     free[layout.LEG_CONSTANTS] = False
     return MarginalInformation(
         layout.CONSTANTS, at + setting_values,
         (reduced - np.diag(weight)) * np.outer(free, free),
-        (g_reduced + weight * (at - priors.centre)) * free, priors.centre + setting_values,
-        fit.initial_priors.constants, priors.constants).with_errors(
+        (g_reduced + weight * (at - priors.mean)) * free, priors.mean + setting_values,
+        fit.initial_priors.sigma, priors.sigma).with_errors(
             fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
 
 

@@ -113,8 +113,8 @@ def _sensors(problem: Problem) -> list[str]:
 def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
     """Return texts of the biases that exceed the grade."""
     gyro_sold, accel_sold = turn_on_bias(config.imu)
-    biases = {'gyro': (fit.state.gyro_bias[0], problem.priors.gyro_bias, gyro_sold),
-              'accel': (fit.state.accel_bias[0], problem.priors.accel_bias, accel_sold)}
+    biases = {'gyro': (fit.state.gyro_bias[0], problem.priors.gyro_bias_sigma, gyro_sold),
+              'accel': (fit.state.accel_bias[0], problem.priors.accel_bias_sigma, accel_sold)}
     texts = []
     for name in _sensors(problem):
         bias, sigma, sold = biases[name]

@@ -58,8 +58,8 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMa
         'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
         'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
     sigma = np.sqrt(np.diagonal(near[0])[BA]) * widen
-    biases = zip('xyz', fit.state.accel_bias[0], sigma, sigma / fit.initial_priors.accel_bias,
-                 strict=True)
+    ratio = sigma / fit.initial_priors.accel_bias_sigma
+    biases = zip('xyz', fit.state.accel_bias[0], sigma, ratio, strict=True)
     return {'odometer': odometer} | ({'accelerometer_bias': {
         axis: {'value': float(value), 'sigma': float(s), 'ratio': float(ratio)}
         for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})

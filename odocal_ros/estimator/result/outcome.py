@@ -116,7 +116,7 @@ def _posterior(problem: Problem, fit: Fit, factor: float) -> _Posterior:
     for error in beyond_fit:
         covariance[error.constant, error.constant] += error.sigma**2
     return _Posterior(factor, covariance, np.sqrt(np.diag(covariance)),
-                      np.sqrt(np.diag(fit.covariance)) / fit.priors.constants, beyond_fit)
+                      np.sqrt(np.diag(fit.covariance)) / fit.priors.sigma, beyond_fit)
 
 
 def _estimate(leg: SmootherLeg, fit: Fit, posterior: _Posterior,
@@ -150,7 +150,7 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
     """Return the estimates of the first gyro bias, and ratios of sigma to prior, by name."""
     sigma = np.sqrt(np.diagonal(marginals[0])[layout.BG]) * factor
     names = [f'gyro_bias_{axis}' for axis in 'xyz']
-    ratio = dict(zip(names, (sigma / fit.initial_priors.gyro_bias).tolist(), strict=True))
+    ratio = dict(zip(names, (sigma / fit.initial_priors.gyro_bias_sigma).tolist(), strict=True))
     values = dict(zip(names, zip(fit.state.gyro_bias[0].tolist(), sigma.tolist(), strict=True),
                       strict=True))
     return {name: Estimate(*values[name], 'rad/s') for name in names
