@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odocal command: its subcommands, errors in one line, and safe output to the terminal."""
+"""The odocal command: subcommands, exit codes, errors as text, safe output to the terminal."""
 
 import argparse
 import importlib
@@ -19,7 +19,7 @@ from odocal_ros.errors import BadTopics, BadUsage, OdocalError, unknown_name
 from odocal_ros.offline import cli
 from odocal_ros.safe_io.text_formats import brief_line, for_terminal
 
-# name: (module, or package with it as an entry point; description)
+# name: (its module, or the package that has it as an entry point; description)
 COMMANDS = {
     'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
@@ -35,6 +35,7 @@ COMMANDS = {
     'patent': ('odocal_reproductions', 'compute the embodiment of CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
+# formats of tqdm for a phase: fraction done known, or not
 BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'
 
@@ -57,7 +58,7 @@ class OdocalCommand:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Print errors in one line instead of the whole usage."""
+    """Reports errors in one line, without the whole usage."""
 
     def error(self, message: str) -> NoReturn:
         """Raise an error that ``main`` reports in one line, with exit code 2."""
@@ -75,14 +76,15 @@ class _Usage(OdocalError):
     """The command line cannot be parsed."""
 
 
-def _parser(names: set[str]) -> argparse.ArgumentParser:
+def _parser(command_name: str) -> argparse.ArgumentParser:
+    """Return the parser, with the options of one command: only its module is imported."""
     parser = _Parser(prog='odocal', description="Calibrate a vehicle's odometer against IMU and "
                      'GNSS: scale factor and yaw mounting angle, with reliable uncertainties.')
     parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
     for name, (_, help_line) in COMMANDS.items():
         sub = commands.add_parser(name, help=help_line, description=help_line)
-        if name in names:      # only this command is imported: --help stays quick
+        if name == command_name:
             command = _module_of(name)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)
@@ -90,14 +92,15 @@ def _parser(names: set[str]) -> argparse.ArgumentParser:
 
 
 def _module_of(name: str) -> ModuleType:
-    home = COMMANDS[name][0]
-    if home.startswith('odocal_ros.'):
-        return importlib.import_module(home)
+    """Return the module of a command, which has ``add_arguments`` and ``run``."""
+    origin = COMMANDS[name][0]
+    if origin.startswith('odocal_ros.'):
+        return importlib.import_module(origin)
     from importlib.metadata import entry_points
     for entry in entry_points(group='odocal.commands', name=name):
         module: ModuleType = entry.load()
         return module
-    raise BadUsage(f'{name} is a command of {home}, which is not installed; install it from a '
+    raise BadUsage(f'{name} is a command of {origin}, which is not installed; install it from a '
                    'checkout of odocal_ros: pip install ./reproductions')
 
 
@@ -112,7 +115,7 @@ def main(argv: list[str] | None = None) -> int:
         if argv and argv[0] not in COMMANDS and not argv[0].startswith('-'):
             raise _Usage(f'odocal: no command {argv[0]!r}; {unknown_name(argv[0], COMMANDS)} '
                          '(see odocal --help)')
-        parser = _parser({a for a in argv[:1] if a in COMMANDS})
+        parser = _parser(argv[0] if argv else '')
         args = parser.parse_args(argv)
         if args.command is None:
             parser.print_help()

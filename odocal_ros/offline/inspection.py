@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read a bag and return the content of ``odocal inspect`` as plain values."""
+"""
+Content of ``odocal inspect``: facts of each topic, the likely inputs, findings, replay command.
+
+A bag is read once with the readers of all possible inputs; a second time, only the odometer, if
+another field or another meaning of its values turns out to follow the path of the fixes.
+"""
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
@@ -20,7 +25,7 @@ from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.message_fields import IMU, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.transforms import add_static_readers
+from odocal_ros.messages.transforms import add_static_readers, STATIC
 from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import inspect_drive, missing_input_reasons
 from odocal_ros.offline.suggest import likely_mapping, replay_command, replay_refusal
@@ -33,19 +38,20 @@ from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES, with_settings
 from odocal_ros.settings.config_file import parse_set
 
-# they affect only methods with an initial alignment, or with the end points alone
-ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}
+# reasons that affect the two-point method only: its initial alignment and its end points
+TWO_POINT_CODES = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE,
+                   Code.LEG_NOT_STRAIGHT}
 
 
 class _TopicSamples:
-    """Stores the samples of one reader; an error of reading is stored in ``trouble``."""
+    """A reader that stores its samples; an error is stored in ``trouble``, for other topics."""
 
-    unreadable = 0      # so that one bad topic does not end the reading of the others
+    unreadable = 0      # as the bag sees it: one bad topic must not end the reading of the others
 
     def __init__(self, reader: Reader) -> None:
         self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
-        listed = reader.msgtype in wheel_survey.FIELDS
-        self.values = wheel_survey.Values(reader.msgtype) if listed else None
+        has_list = reader.msgtype in wheel_survey.FIELDS
+        self.values = wheel_survey.Values(reader.msgtype) if has_list else None
         self.form_by_fixes: OdometerForm | None = None
 
     @property
@@ -55,7 +61,7 @@ class _TopicSamples:
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
-        """Read and keep a block."""
+        """Store the samples of a block of messages; return none."""
         if self.values:
             self.values.rows(raws, received_ns)
         try:
@@ -73,24 +79,24 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
     samples_by_topic, refused = _make_samples(bag, config, overrides)
-    search = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
-    # these readers return no rows
-    bag.read({**samples_by_topic, **search, **_static(samples_by_topic, bag)}, print)
+    collectors = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
+    # these readers store samples and return none, so that the second argument is not called
+    bag.read({**samples_by_topic, **collectors, **_static(samples_by_topic, bag)}, print)
     mapping, config = likely_mapping(bag.topics, config, overrides)
     imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
     turn_rate = _turn_rate(imu) if imu else None
     fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
-    lists = {name: topic_samples.values.facts(turn_rate, fixes)
-             for name, topic_samples in samples_by_topic.items() if topic_samples.values}
-    matches = _matches(bag, samples_by_topic, lists, fixes, config) if fixes else {}
+    motions = {name: topic_samples.values.facts(turn_rate, fixes)
+               for name, topic_samples in samples_by_topic.items() if topic_samples.values}
+    matches = _matches(bag, samples_by_topic, motions, fixes, config) if fixes else {}
     not_following = odometer_search.topics_not_following(matches)
     mapping, initial_config = likely_mapping(bag.topics, config, overrides, not_following)
-    topics = [_topic(bag, info, samples_by_topic.get(name), refused.get(name, ''))
+    topics = [_topic_facts(bag, info, samples_by_topic.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
     for facts in topics:
         if 'odometer' in facts:
             facts['odometer']['still'] = facts['name'] in not_following
-        if fixes and (fields := search.get(facts['name'])) and not fields.trouble:
+        if fixes and (fields := collectors.get(facts['name'])) and not fields.trouble:
             facts['fields'] = fields.facts(fixes)
     odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
     found = _bag_facts(bag, path) | {
@@ -103,9 +109,9 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
             best := odometer_search.best_topic(topics, overrides.get('odometer', ''))):
         mapping.pop('odometer_right', None)
         mapping['odometer'] = best['name']
-        options = search[best['name']].settings(best['fields']['found'], turn_rate)
+        options = collectors[best['name']].settings(best['fields']['found'], turn_rate)
     else:
-        options = _wheel_options(samples_by_topic, mapping, initial_config, topics, lists)
+        options = _wheel_options(samples_by_topic, mapping, initial_config, topics, motions)
     config = with_settings(initial_config, dict(map(parse_set, options)))
     if options:
         _read_again(bag, samples_by_topic, mapping['odometer'], config, topics)
@@ -135,11 +141,11 @@ def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
 def _finding_facts(findings: list[Reason], config: Config,
                    options: list[str]) -> list[dict[str, Any]]:
     """Return findings as facts; ``only`` : the method that they affect, None: all."""
-    wheels = config.odometer.keys or any(
+    has_wheels = config.odometer.keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
-    ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
+    codes = TWO_POINT_CODES - {Code.NO_STANDSTILL} if has_wheels else TWO_POINT_CODES
     return [reason.as_dict() | {'only': 'two_point' if (
-        config.method != 'two_point' and reason.code in ends) else None}
+        config.method != 'two_point' and reason.code in codes) else None}
         for reason in dict.fromkeys(findings)]
 
 
@@ -165,18 +171,15 @@ def _make_samples(bag: Bag, config: Config,
 
 def _static(samples_by_topic: dict[str, _TopicSamples], bag: Bag) -> dict[str, _TopicSamples]:
     """Return the readers of static transforms; they share the recorder of their TF topic."""
-    found = {}
     readers = {name: topic_samples.reader for name, topic_samples in samples_by_topic.items()}
-    for name, reader in add_static_readers(readers, bag.topics).items():
-        if name in samples_by_topic:
-            topic_samples = samples_by_topic[name]
-        else:
-            found[name] = _TopicSamples(reader)
-            found[name].recorder = topic_samples.recorder
+    found = {name: _TopicSamples(reader) for name, reader in add_static_readers(
+        readers, bag.topics).items() if name not in readers}
+    for name, static in found.items():
+        static.recorder = samples_by_topic[name.removesuffix(STATIC)].recorder
     return found
 
 
-def _topic(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
+def _topic_facts(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
            trouble: str) -> dict[str, Any]:
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
@@ -209,16 +212,17 @@ def _topic(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
 
 
 def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
-             lists: dict[str, list[dict[str, Any]]], fixes: FixPath,
+             motions: dict[str, list[dict[str, Any]]], fixes: FixPath,
              config: Config) -> dict[str, Match]:
     """
     Return the comparison of each odometer topic with the path of the fixes.
 
-    A topic of one number that follows it only with another meaning gets this meaning.
+    motions : motion of each value of topics of lists. A topic of one number that follows the path
+    only with another meaning gets this meaning.
     """
-    matches = {name: Match(float(any(one['scale'] for one in motions)), 0.0,
-                           any(one['scale'] for one in motions))
-               for name, motions in lists.items() if motions}
+    following = {name: any(one['scale'] for one in values)
+                 for name, values in motions.items() if values}
+    matches = {name: Match(float(follows), 0.0, follows) for name, follows in following.items()}
     for name, topic_samples in samples_by_topic.items():
         form, rows = topic_samples.reader.form, topic_samples.recorder.rows('odometer')
         if form and name not in matches:
@@ -231,30 +235,30 @@ def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
 
 def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str, str],
                    config: Config, topics: list[dict[str, Any]],
-                   lists: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """Return the settings for the odometer; add the travel of each joint to ``topics``."""
+                   motions: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Return the settings for the odometer; add the motion of each joint to ``topics``."""
     options: list[str] = []
     is_unconfigured = not (config.odometer.keys or config.odometer.field)
     for facts in topics:
-        if facts['name'] not in lists:
+        if facts['name'] not in motions:
             continue
-        topic_samples, motions = samples_by_topic[facts['name']], lists[facts['name']]
-        facts['values'] = motions
-        if len(motions) > 1:
-            facts['moves'] = wheel_survey.motion_texts(motions)
+        topic_samples, values = samples_by_topic[facts['name']], motions[facts['name']]
+        facts['values'] = values
+        if len(values) > 1:
+            facts['moves'] = wheel_survey.motion_texts(values)
         form = topic_samples.reader.form
         assert form is not None      # a topic of lists is an odometer's
         if form.chosen:
             facts['chosen'] = form.chosen
         if facts['name'] == mapping.get('odometer') and is_unconfigured:
             named = topic_samples.reader.wheels if form.sides else ()
-            rolling = {one['key'] for one in motions if one['rolls']}
+            rolling = {one['key'] for one in values if one['rolls']}
             if len(named) > 1 and rolling.issuperset(named):
                 options += [f'odometer.{side}={key}' for side, key in zip(
                     SIDES, named, strict=True)]
             else:
-                options += (wheel_survey.wheel_settings(motions)
-                            or wheel_survey.single_wheel_setting(motions,
+                options += (wheel_survey.wheel_settings(values)
+                            or wheel_survey.single_wheel_setting(values,
                                                                  topic_samples.reader.wheels))
     odometer = samples_by_topic.get(mapping.get('odometer', ''))
     if odometer and odometer.form_by_fixes:
@@ -264,15 +268,16 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
 
 def _read_again(bag: Bag, samples_by_topic: dict[str, _TopicSamples], topic: str, config: Config,
                 topics: list[dict[str, Any]]) -> None:
+    """Read the odometer with the settings found; add its facts to ``topics``."""
     reader = make_reader('odometer', bag.topics[topic].msgtype, config)
     topic_samples = samples_by_topic[topic] = _TopicSamples(reader)
     bag.read({topic: topic_samples}, print)
     facts = next(facts for facts in topics if facts['name'] == topic)
-    facts.update(_topic(bag, bag.topics[topic], topic_samples, '') | facts)
+    facts.update(_topic_facts(bag, bag.topics[topic], topic_samples, '') | facts)
 
 
 def _turn_rate(imu: _TopicSamples) -> tuple[Ints, Floats] | None:
-    """Return stamps and the turn rate to the left, rad/s, None without usable rows."""
+    """Return stamps, ns, and the turn rate to the left, rad/s, (n,); None without usable rows."""
     rows = imu.recorder.rows('imu')
     rows = take(rows, ~(is_impossible('f_i', rows.f_i) | is_impossible('w_i', rows.w_i)))
     if not len(rows.stamp_ns):
@@ -283,6 +288,7 @@ def _turn_rate(imu: _TopicSamples) -> tuple[Ints, Floats] | None:
 
 def _combined_recorder(samples_by_topic: dict[str, _TopicSamples],
                        mapping: dict[str, str]) -> LegRecorder:
+    """Return the samples of the selected topics in one recorder, by slot."""
     recorder = LegRecorder()
     for slot, topic in mapping.items():
         if topic not in samples_by_topic:

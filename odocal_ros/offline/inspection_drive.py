@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Findings from the inputs of a bag together: units, axes, standstills, legs."""
+"""
+Findings of ``odocal inspect`` from IMU, odometer and fixes of a bag together.
+
+Units and axes of the IMU, direction of the odometer, path length, standstills and legs; each
+problem is a ``Reason``, and its remedy is a setting for the replay if there is one.
+"""
 
 from dataclasses import replace
 import math
@@ -56,7 +61,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
     if not all(len(recorder.rows(slot).stamp_ns) for slot in ('imu', 'odometer')):
         return []
     try:
-        (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)
+        (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)      # ns
         leg = recorder.close(first, last, preroll=0.0)
     except (BadData, BadUsage) as error:
         findings.append(Reason(Code.CLOCKS_DIFFER, str(error), TOO_FAR))
@@ -69,7 +74,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         known = {reason.code for reason in findings}
         findings += [r for r in missing_data_reasons(leg, inputs) if r.code not in known]
         return []
-    base = (first - bag.start_ns) * 1e-9
+    base = (first - bag.start_ns) * 1e-9      # s: times of the leg start at its first sample
     options, w_i, f_i = _unit_options(inputs, config, findings)
     located = locate_fixes(inputs, config)
     still_reasons = [reason for reason in motion_reasons(
@@ -80,16 +85,16 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         return options
     stops, speeds = survey.stops_and_speeds(inputs, located.rough, config)
     path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.least_motion)
-    driven = _travel_between_fixes(inputs)
-    long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
-    scale = path_length / driven if long and driven else located.rough or None
+    travel = _travel_between_fixes(inputs)
+    is_long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
+    scale = path_length / travel if is_long and travel else located.rough or None
     # speeds with the printed scale
     scale_ratio = scale / located.rough if scale and located.rough else 1.0
     found['drive'] = {
         'distance': path_length, 'chord': chord, 'fix_sigma': located.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': speeds[0] * scale_ratio, 'fastest': speeds[1] * scale_ratio,
-        'usable_fixes': len(inputs.t_fix), 'travel': driven}
+        'usable_fixes': len(inputs.t_fix), 'travel': travel}
     if scale:
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
@@ -120,7 +125,7 @@ def _unit_options(inputs: Inputs, config: Config,
     if not np.array_equal(inputs.C_bi, np.eye(3)):
         w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi
     options = []
-    if 0.85 < np.linalg.norm(medians(f_i)) < 1.15:
+    if 0.85 < np.linalg.norm(medians(f_i)) < 1.15:      # in g
         options.append(f'imu.accel_scale={9.80665 * config.imu.accel_scale:.10g}')
     if np.percentile(lengths(w_i - medians(w_i)), 99.9) > MAX_RATE:
         options.append(f'imu.gyro_scale={RAD_PER_DEG * config.imu.gyro_scale!r}')
@@ -139,10 +144,10 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, config: Config,
                   found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return settings for odometer sign and IMU orientation; check the gyro."""
-    set_already = bool(np.any(config.imu.mounting_rpy))
+    is_configured = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
     options = []
-    if not set_already and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
+    if not is_configured and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
     m = mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
@@ -152,10 +157,10 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
         'accelerometer': inputs.has_accelerometer, 'rpy': m.rpy, 'assumed_forward': m.assumed,
-        'off': m.off, 'unclear': m.unclear + '; imu.mounting_rpy is used as set' * set_already,
+        'off': m.off, 'unclear': m.unclear + '; imu.mounting_rpy is used as set' * is_configured,
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
-        'needed': m.rpy is not None and not agrees and not set_already}
+        'needed': m.rpy is not None and not agrees and not is_configured}
     orientation = estimate_orientation(inputs, located.rough) \
         if inputs.has_accelerometer and located.rough else None
     ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
@@ -216,6 +221,7 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
 
 def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
                           config: Config) -> list[Reason]:
+    """Return the reasons for missing or unusable inputs, and for parts that the drive lacks."""
     topics = {topic['name']: topic for topic in found['topics']}
     reasons = []
     for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,

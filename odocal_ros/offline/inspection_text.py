@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The findings of ``odocal inspect`` as text."""
+"""Text of ``odocal inspect``: the values of ``inspection.inspect`` as one screen."""
 
 from collections.abc import Callable, Iterable, Iterator
 import math
@@ -16,11 +16,12 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
 
 
 def text(found: dict[str, Any]) -> str:
+    """Return the text of a bag; ``found``: result of ``inspection.inspect``."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']
                if {'timing', 'moves', 'fields', 'trouble'} & topic.keys()]
-    blocks += [_drive(found), _findings(found), _length_text(found)]
+    blocks += [_drive(found), _findings(found), _command(found)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
 
@@ -202,6 +203,7 @@ def _leg(leg: dict[str, Any]) -> str:
 
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:
+    """Return the orientation of the IMU in the vehicle, and how it is known."""
     if not mounting['accelerometer']:
         return wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
                         'not upright, set imu.mounting_rpy')
@@ -240,7 +242,7 @@ def _findings(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _length_text(found: dict[str, Any]) -> list[str]:
+def _command(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
         lines.append('replay without options fails:')

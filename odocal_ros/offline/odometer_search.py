@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search for the odometer of a bag: topics of unknown types, and topics that do not move."""
+"""
+Search for the odometer of a bag among topics whose type does not define a meaning.
+
+Every number of a message may be a count, an increment or a speed: it is one if the travel that it
+gives follows the path of the fixes (``survey.FixPath``).
+"""
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -29,20 +34,21 @@ from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 MOST_MESSAGES, MOST_FIELDS, MOST_VALUES = 10_000, 128, 400_000
 MOST_ELEMENTS = 16       # judgement: of an array
 MOST_BYTES = 2**14       # judgement: of a message; images and point clouds are longer
-# stamps, and positions: one axis of a straight drive grows with distance
-NO_TRAVEL = ('header', 'stamp', 'seq', 'pose', 'latitude', 'longitude', 'altitude')
-INCREMENTS = ('delta', 'diff', 'increment', 'since')
+# fields that are not searched: stamps, and positions, whose axis may grow with distance
+NOT_SEARCHED = ('header', 'stamp', 'seq', 'pose', 'latitude', 'longitude', 'altitude')
+INCREMENT_WORDS = ('delta', 'diff', 'increment', 'since')
 # format: of counters of 8, 16 and 32 bits
 ROLLOVERS = (2**8, 2**16, 2**32)
 MOST_TOPICS = 20       # judgement: topics of unknown types that are searched
-RECEIVER = (*GNSS, 'navsat', 'nmea', 'ubx')
-STANDARD = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs', 'diagnostic_msgs')
+RECEIVER_WORDS = (*GNSS, 'navsat', 'nmea', 'ubx')      # topics of GNSS receivers
+STANDARD_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
+                     'diagnostic_msgs')
 
 
 class Fields:
-    """Collects the numbers in evenly selected messages of one topic."""
+    """Collects all numbers in evenly selected messages of one topic, as a reader of a bag."""
 
-    unreadable = 0       # as of a reader of a bag: an unreadable topic is no error
+    unreadable = 0       # an unreadable topic is no error
 
     def __init__(self, count: int) -> None:
         self.count, self.trouble = count, ''
@@ -101,11 +107,11 @@ class Fields:
             'settings': _settings(field, f'odometer.field={field["path"]}')} for field in found]}
 
     def settings(self, found: Sequence[dict[str, Any]],
-                 turned: tuple[Ints, Floats] | None) -> list[str]:
+                 turn_rate: tuple[Ints, Floats] | None) -> list[str]:
         """
         Return the settings for left and right wheels, or for the best field.
 
-        found : fields of ``facts``.   turned : arrival times and turn rate to the left, rad/s;
+        found : fields of ``facts``.   turn_rate : times, ns, and turn rate to the left, rad/s;
         None without an IMU.
         """
         best, t_ns = found[0], self._t_ns
@@ -114,10 +120,10 @@ class Fields:
         wheels = [field for field in found if all(
             field[key] == best[key] for key in ('quantity', 'wrap', 'whole'))
             and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]
-        if turned is not None and 1 < len(wheels) <= len(WHEELS):
+        if turn_rate is not None and 1 < len(wheels) <= len(WHEELS):
             s = np.stack([self._travel[field['path']] for field in wheels], -1)
             named = find_sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
-                               ((turned[0] - t_ns[0]) * 1e-9, turned[1]))
+                               ((turn_rate[0] - t_ns[0]) * 1e-9, turn_rate[1]))
             if options := wheel_settings([{'key': field['path'], 'side': side}
                                           for field, side in zip(wheels, named, strict=True)]):
                 return _settings(best, *options)
@@ -125,7 +131,7 @@ class Fields:
 
 
 def _settings(field: dict[str, Any], *names: str) -> list[str]:
-    """Return the settings that select a field, after those that name it."""
+    """Return the settings that name a field, then those for its meaning."""
     usual = 'cumulative' if field['whole'] else 'rate'
     return [*names, *[f'odometer.quantity={field["quantity"]}'] * (field['quantity'] != usual),
             *[f'odometer.wrap={field["wrap"]}'] * (field['wrap'] > 0),
@@ -140,7 +146,7 @@ def rank(field: dict[str, Any]) -> tuple[bool, float]:
 def _numbers(message: object, prefix: str) -> Iterator[tuple[str, Any]]:
     """Yield path and value of each number of a message."""
     for name in getattr(type(message), '__dataclass_fields__', ()):
-        if not name.startswith('__') and name not in NO_TRAVEL:
+        if not name.startswith('__') and name not in NOT_SEARCHED:
             yield from _numbers_of(getattr(message, name), prefix + name)
 
 
@@ -180,7 +186,7 @@ def _best_meaning(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: F
 
 def _quantities(name: str) -> tuple[str, str]:
     """Return the possible meanings of a value, by its name."""
-    per_message = any(word in name.lower() for word in INCREMENTS)
+    per_message = any(word in name.lower() for word in INCREMENT_WORDS)
     return 'cumulative', 'increment' if per_message else 'rate'
 
 
@@ -209,8 +215,8 @@ def _may_be_odometer(info: TopicInfo) -> bool:
     """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in SYSTEM_TOPICS
-            and package not in STANDARD and '/calibrator/' not in info.name
-            and not any(word.startswith((*RECEIVER, *COMMANDS))
+            and package not in STANDARD_PACKAGES and '/calibrator/' not in info.name
+            and not any(word.startswith((*RECEIVER_WORDS, *COMMANDS))
                         for word in re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())))
 
 

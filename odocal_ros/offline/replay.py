@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal replay: the node's pipeline over recorded bags."""
+"""odocal replay: calibrate from recorded bags, with the same computation as the node."""
 
 import argparse
 import os
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_input_arguments(parser: argparse.ArgumentParser,
                         default: str = 'the only topic of a fitting type') -> None:
-    """Declare the options for settings and topics; default: its text in the help of a topic."""
+    """Declare the options for settings and topics; default: text on the topic used without one."""
     add_settings_arguments(parser)
     for slot in TOPICS:
         parser.add_argument(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
@@ -80,23 +80,23 @@ def run(args: argparse.Namespace) -> int:
     if args.marks:
         config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
-    series = [name.strip() for name in ','.join(args.export).split(',') if name.strip()]
-    if series:
+    exports = [name.strip() for name in ','.join(args.export).split(',') if name.strip()]
+    if exports:
         from odocal_ros.library.export import check_names
-        check_names(series)
+        check_names(exports)
     output = output_folder(args.output, args.bags[0], args.force)
     from odocal_ros.calib.result import traces
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
     calibration = calibrate_bag(args.bags, topics_from_arguments(args), config, args.leg,
-                                holdout=args.holdout, listener=_Screen(args))
+                                holdout=args.holdout, listener=_TerminalListener(args))
     for name, trace in traces(calibration.result.legs):
         warn(f'odocal: method {name} failed with an internal error; please report it with '
              f'{trace_file(trace)}')
     code = _report(calibration, output, args)
-    if series:
-        exported = calibration.export(*(output / name for name in series))
-        _Screen(args).note(f'exported: {", ".join(map(str, exported))}')
+    if exports:
+        exported = calibration.export(*(output / name for name in exports))
+        _TerminalListener(args).note(f'exported: {", ".join(map(str, exported))}')
     return code
 
 
@@ -109,18 +109,18 @@ def output_folder(name: str | None, bag: str, force: bool) -> Path:
     return output
 
 
-class _Screen(Listener):
-    """Shows notes and progress on the terminal."""
+class _TerminalListener(Listener):
+    """Prints notes on stderr, and shows the progress of each phase of the calibration."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        self._quiet, self._silent = args.quiet, args.quiet or args.json
+        self._prints_notes, self._shows_phases = not args.quiet, not (args.quiet or args.json)
 
     def note(self, text: str) -> None:
-        if not self._quiet:
+        if self._prints_notes:
             warn(f'odocal: {text}')
 
     def phase(self, title: str) -> Phase:
-        return Phase(title, self._silent)
+        return Phase(title, quiet=not self._shows_phases)
 
 
 def config_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
@@ -167,22 +167,22 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
     from odocal_ros.output.files import Results
     from odocal_ros.output.stored import objection_to_folder, stored_in
     from odocal_ros.output.summary import sentence
-    screen = _Screen(args)
+    listener = _TerminalListener(args)
     existing = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
                       calibration.created)
     with results.name_results_when_interrupted():
-        with screen.phase('writing the results'):
+        with listener.phase('writing the results'):
             written = results.write(args.force)
         if worse := objection_to_folder(existing, output):
-            screen.note(f'{output}: --force replaced a better calibration: {worse}')
+            listener.note(f'{output}: --force replaced a better calibration: {worse}')
         write_error = None if args.quiet or args.json else _show(calibration.result, args)
-        with screen.phase('drawing the report'):
+        with listener.phase('drawing the report'):
             report_error = results.draw()
         if write_error:
             raise write_error
         if report_error:
-            screen.note(f'{results.report[0]}: could not be drawn: {report_error}')
+            listener.note(f'{results.report[0]}: could not be drawn: {report_error}')
         if args.json:
             print_json(calibration.to_dict())
         elif not args.quiet:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from odocal_ros.sim.scenarios import Drive
 
 MANIFEST = 'manifest.csv'
-# fields of SimOptions as options: (metavar, help); help of angles
+# options that are fields of SimOptions: (metavar, help); below, help of angles
 NUMBERS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
@@ -139,7 +139,7 @@ def _flag(name: str) -> str:
 
 
 def degrees(text: str) -> float:
-    """Return degrees in rad; the name is in the error of argparse."""
+    """Return degrees in rad; errors of argparse contain the name of this function."""
     return math.radians(float(text))
 
 
@@ -167,7 +167,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
 
 
 def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
-    """Return SimOptions of the given options, the random vehicle and the requested figures."""
+    """Return SimOptions of the options, a random vehicle if requested, and sensor parameters."""
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real import parsed, Real

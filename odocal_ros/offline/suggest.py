@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Most likely topics of the inputs of a bag, and the replay command with these topics."""
+"""Choice of the most likely topic for each input of a bag, and the replay command with them."""
 
 from collections.abc import Collection, Iterable
 
@@ -13,10 +13,10 @@ from odocal_ros.messages.message_fields import GEODETIC
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.config import Config, with_settings
 
-# judgement: names of wheels and their electronics before those of any odometry
+# judgement: words in topics of wheels and their electronics, preferred to any odometry
 WHEEL_WORDS = ('pulse', 'tick', 'encoder', 'wheel', 'count', 'chassis', 'controller', 'vehicle',
                '/can', 'obd')
-# judgement: IMUs in other sensors
+# judgement: words in topics of IMUs inside other sensors
 OTHER_DEVICE_WORDS = ('zed', 'camera', 'lidar', 'livox', 'ouster')
 
 
@@ -51,7 +51,7 @@ def _left_right_pair(topics: dict[str, TopicInfo], unused: list[str]) -> tuple[s
 
 
 def _sort_keys(slot: str, info: TopicInfo, not_following: Collection[str]) -> dict[str, int | str]:
-    """Return sort keys of a topic by the reason that each stands for; the smallest is best."""
+    """Return reason -> sort key of a topic, the most important first; the smallest is best."""
     usual_name = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     name, kind = info.name.lower(), 0
     fits = int('rtk' in name if slot == 'fix'

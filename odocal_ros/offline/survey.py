@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Survey of a bag's topics: timing, units, quality; path, standstills, straight sections."""
+"""
+Facts of the topics of a bag (timing, units, quality) and of its drive (path, standstills, speeds).
+
+``FixPath`` compares any signal with the path of the fixes: an odometer is proportional to it.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,13 +24,13 @@ from odocal_ros.settings.config import Config, GnssConfig
 from odocal_ros.settings.nominal import G
 
 AXES = 'xyz'
-# minimum share of the variance of the distances between fixes that an odometer explains, and that
-# if the rest is within the fix errors. Tuned by benchmarks/odometer_fields.py and 3 real drives:
-# odometers explain 0.90 or more, time and temperature 0.48 or less; engine speed, gear and
-# consumed energy up to 0.98, so this does not exclude them. Where fix errors are most of the
-# variance (always 1 m/s, fixes of 0.8 m), odometers explain 0.65
+# minimum share of the variance of the distances between fixes that an odometer explains; second
+# number: if the rest is within the fix errors. Tuned by benchmarks/odometer_fields.py and 3 real
+# drives: odometers explain 0.90 or more (0.65 where fix errors are most of the variance: always
+# 1 m/s, fixes of 0.8 m), time and temperature 0.48 or less; engine speed, gear and consumed energy
+# up to 0.98, so this does not exclude them
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
-RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; equal stamps have such rates
+RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; almost equal stamps give such rates
 FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
 # s, judgement: delays have a standard deviation of 0.24 s if stamps are rounded down to seconds,
 # of some ms if a receiver has its epochs at whole seconds
@@ -54,17 +58,16 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     step = np.diff(stamp) * 1e-9
     rising = step[step > 0]
     median_step = median(rising) if len(rising) else 0.0
-    gap = 5.0    # in median intervals: longer is a gap
-    least_gap = 0.1    # s, shorter is jitter
-    gaps = np.flatnonzero(step > max(gap * median_step, least_gap))
-    order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
+    gap_factor, least_gap = 5.0, 0.1    # a gap is longer than 5 median intervals, and than 0.1 s
+    gaps = np.flatnonzero(step > max(gap_factor * median_step, least_gap))
+    longest = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     delay: Floats = np.multiply(received - stamp, 1e-9)
     spread = None if headerless or not len(delay) else float(
         np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4)
     # mean rate outside the gaps; the median interval would be wrong with bursts
-    running = float(rising.sum() - step[gaps].sum())
+    duration = float(rising.sum() - step[gaps].sum())
     return {
-        'rate_hz': rate_of(len(rising) - len(gaps), running),
+        'rate_hz': rate_of(len(rising) - len(gaps), duration),
         'headerless': headerless,
         'header_to_bag': None if headerless or not len(delay) else median(delay),
         'header_to_bag_spread': spread,
@@ -75,7 +78,7 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
         'zero_stamps': int((~stamped).sum()), 'repeated_stamps': int((step == 0).sum()),
         'backward_steps': int((step < 0).sum()), 'gap_count': len(gaps),
         'gaps': [{'at': (int(stamp[k]) - start_ns) * 1e-9, 'length': float(step[k])}
-                 for k in np.sort(order)]}
+                 for k in np.sort(longest)]}
 
 
 def imu_facts(samples: ImuSamples) -> dict[str, Any]:
@@ -91,7 +94,7 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
     mean = medians(f_i) if len(f_i) else np.zeros(3)
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
-    fast = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
+    fastest = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
     has_orientation = ~np.isnan(samples.yaw_variance)
     rotated = has_orientation & (reduce_columns(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
     variance = samples.yaw_variance[rotated]
@@ -102,7 +105,7 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
         'up_i': (mean / size).tolist() if size else [0.0, 0.0, 0.0],
         'force_unit': 'm/s^2' if 0.85 * G < size < 1.15 * G else 'g' if 0.85 < size < 1.15
         else 'unknown',
-        'fastest_turn': fast,
+        'fastest_turn': fastest,
         'not_finite': len(samples.stamp_ns) - min(len(f_i), len(w_i)),
         # an identity that never changes is a default, not an attitude
         'orientation': bool(rotated.mean() > 0.5) if len(rotated) else False,
@@ -126,15 +129,15 @@ def fix_facts(samples: FixSamples) -> dict[str, Any]:
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~is_impossible('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    place = has_position(samples)
-    heights = samples.height[place & ~is_impossible('height', samples.height)]
+    has_place = has_position(samples)
+    heights = samples.height[has_place & ~is_impossible('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {
         'status': dict(zip(map(str, values.tolist()), counts.tolist(), strict=True)),
-        'positions': int(place.sum()), 'covariance_known': int(known.sum()),
+        'positions': int(has_place.sum()), 'covariance_known': int(known.sum()),
         'sigma': {'least': float(sigma.min()), 'median': float(np.median(sigma)),
                   'most': float(sigma.max())} if len(sigma) else None,
-        'position_step': _grid_step(samples.latitude[place]),
+        'position_step': _grid_step(samples.latitude[has_place]),
         'height': {'least': float(heights.min()), 'most': float(heights.max())}
         if len(heights) else None}
 
@@ -242,7 +245,7 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
     is_long = chord >= shortest
-    # the rough scale is too small in curves, where chords are shorter than the path: the
+    # the rough scale is too small with curves, where chords are shorter than the path: the
     # straightest sections determine it best
     ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
@@ -257,5 +260,5 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     while suitable.any():
         i, j = np.unravel_index(np.argmax(np.where(suitable, path_length, 0)), suitable.shape)
         found.append((float(t[i]), float(t[j])))
-        suitable[:j + 1, i:] = False            # all that overlap it
+        suitable[:j + 1, i:] = False            # all sections that overlap it
     return found

@@ -129,7 +129,7 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
 
 
 def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:
-    """Return the choice of the user at the terminal; an empty line selects the first."""
+    """Ask the user at the terminal; an empty line selects the first topic."""
     names = [choice.topic, *choice.other_candidates]
     print_text(f'{len(names)} candidate topics for the {INPUTS[choice.slot].label}:')
     for number, name in enumerate(names, 1):
@@ -158,7 +158,7 @@ def _suggested_options(replay_command: str, without_legs: bool) -> list[str]:
 
 
 def _user_options(args: argparse.Namespace) -> list[str]:
-    """Return the options given by the user that are not part of the suggestion."""
+    """Return the options of the user that the suggested command does not contain."""
     words = []
     for option, given in (('--config', [args.config]), ('--set', args.settings),
                           ('--leg', args.leg), ('--method', [args.method]),

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Motion of each value of a list (joints, an array of counters), to find the wheels."""
+"""
+Motion of each value of a list (joints, an array of counters), to find the wheels among them.
+
+A wheel turns without limit and follows the path of the fixes; in turns, the outer one is faster.
+"""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -51,8 +55,8 @@ class Values:
         """
         Return the motion of each value of the most frequent list.
 
-        imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None without one.
-        path : of the fixes; None without one.
+        imu : stamps, ns, and the turn rate to the left, rad/s, (n,) each; None without an IMU.
+        path : of the fixes; None without fixes.
         """
         if not self._blocks:
             return []
@@ -67,9 +71,9 @@ class Values:
         t = (stamp_ns - stamp_ns[0]) * 1e-9
         s = _travelled(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
-        turns = 4 * np.pi    # rad: an angle of a larger range turns without limit
+        unlimited = 4 * np.pi    # rad: a joint with a larger range turns without limit
         least_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
-        rolls = (span > (turns if self.msgtype == JOINTS
+        rolls = (span > (unlimited if self.msgtype == JOINTS
                          else 0)) & (span > least_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
         matches = [path.match(received_ns, x) for x in s.T] if path else []
@@ -84,7 +88,7 @@ class Values:
 
 
 def _travelled(t: Floats, value: Floats, field: str) -> Floats:
-    """Return running travels: (n, k)."""
+    """Return the travel of each of k values, (n, k), from values (n, k) at t, (n,) s."""
     if field == 'velocity':
         mean = (value[1:] + value[:-1]) / 2 * np.diff(t)[:, None]
         return np.concatenate([np.zeros((1, value.shape[1])), np.cumsum(mean, axis=0)])
@@ -95,10 +99,15 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
 
 
 def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | None) -> list[str]:
-    """Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther."""
+    """
+    Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther.
+
+    t, s : (n,) s and (n, k) travel.   rolls : (k,) values that are wheels.   imu : times, s, and
+    turn rates to the left, rad/s.
+    """
     k = len(rolls)
     sides_found = [''] * k
-    cell = 0.5    # s, cells in which the gyro determines the sides
+    cell = 0.5    # s, interval in which turn and travel are compared
     # with damaged stamps a recording may seem to last for years
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
@@ -143,7 +152,7 @@ def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
 
 
 def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
-    """Return the motion of each value, for people, one line each."""
+    """Return the motion of each value as a line of text."""
     def one(f: dict[str, Any]) -> str:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
         grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''

@@ -111,18 +111,30 @@ def topic(name, time_ns, transforms):
         b''.join(raws[rows]), f'V{size}'))
 
 
-@pytest.fixture(scope='module')
-def tf_bag(tmp_path_factory):
+def with_tf(folder, name='/tf'):
     """Return a bag of a robot with its positions as poses and as TF."""
     made = simulate(SimOptions(scenario='indoor', duration=60.0, reference='pose', imu_rate=50.0))
     fix = made.fix
     moving = [make.transform(int(t), p, 'base_link', 'map')
               for t, p in zip(fix.stamp_ns, made.positions(), strict=True)]
     # sent once, after the first positions
-    static = topic('/tf_static', [fix.received_ns[20]], [
+    static = topic(f'{name}_static', [fix.received_ns[20]], [
         make.transform(0, (0.0, 0.0, 0.0), 'prism', 'base_link')])
-    return write_bag(tmp_path_factory.mktemp('tf') / 'bag', [
-        *drive_topics(made), topic('/tf', fix.received_ns, moving), static])
+    return write_bag(folder / 'bag', [*drive_topics(made), topic(name, fix.received_ns, moving),
+                                      static])
+
+
+@pytest.fixture(scope='module')
+def tf_bag(tmp_path_factory):
+    return with_tf(tmp_path_factory.mktemp('tf'))
+
+
+def test_positions_before_the_static_transform_are_of_the_tf_topic(tmp_path, capsys):
+    bag = with_tf(tmp_path, '/a/tf')       # before the other topics, by name
+    assert cli.main(['inspect', str(bag), '--json', '--fix-topic', '/a/tf', *FRAMES]) == 0
+    topics = {one['name']: one for one in json.loads(capsys.readouterr().out)['topics']}
+    count = topics['/pose']['fix']['positions']
+    assert topics['/a/tf']['fix']['positions'] == pytest.approx(count, abs=1)
 
 
 def test_replay_by_tf_is_replay_by_poses(tf_bag, tmp_path):
