@@ -80,7 +80,7 @@ def test_odocal_commands_parse():
         assert words[0] in cli.COMMANDS, line
         if len(words) == 1:      # a mention, no command line
             continue
-        args = cli._parser({words[0]}).parse_args(words)
+        args = cli._parser(words[0]).parse_args(words)
         assert args.command == words[0], line
 
 

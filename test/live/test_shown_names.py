@@ -205,7 +205,7 @@ def test_run_and_odocal_name_commands_of_the_package():
         assert package == 'odocal_ros'
         assert executable in entries
     for command, *options in of('odocal'):
-        assert cli._parser({command}).parse_args([command, *options]).command == command
+        assert cli._parser(command).parse_args([command, *options]).command == command
 
 
 def test_launch_names_a_file_and_arguments_that_are_there():
