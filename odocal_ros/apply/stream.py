@@ -20,11 +20,11 @@ from odocal_ros.apply.attitude import rotate_vector, Vector, ZERO
 from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.screening.glitches import (
-    BACK_SHARE,
     EQUAL_NEIGHBOURS,
     FORCE_STEP,
     GLITCH_TIME,
-    ROWS_BESIDE,
+    NEIGHBOUR_ROWS,
+    RETURN_SHARE,
     SINGLE_FORCE,
     SINGLE_TIMES,
     SINGLE_TURN,
@@ -43,7 +43,7 @@ TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
 STRANGE_TURN_TIME = 1.0        # s; judgement: a longer turn after a step is real
 ALONE_CHANGE = 2.5        # rad/s^2; judgement: least isolated step; turns start more slowly
 SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
-SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` uses
+SINGLE_ROWS = NEIGHBOUR_ROWS + 4      # definition: rows that ``is_single`` uses
 
 
 class Row(NamedTuple):
@@ -87,7 +87,7 @@ class SpikeScreen:
     def __init__(self) -> None:
         self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
         self._since = 0.0                   # s, begin of equal rows
-        self._kept: deque[Row] = deque(maxlen=ROWS_BESIDE + 1)
+        self._kept: deque[Row] = deque(maxlen=NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
         self._step_size = ZERO                # rad/s, implausible step of the gyro
         self._before = ZERO                 # rad/s, rate before the step
@@ -120,12 +120,12 @@ class SpikeScreen:
     def _isolated_axes(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """Return a mask of the gyro axes with an isolated step: a turn starts over several."""
         kept = self._kept
-        if self._dropped or len(kept) <= ROWS_BESIDE or (
+        if self._dropped or len(kept) <= NEIGHBOUR_ROWS or (
                 _largest(kept[-1].w_b, rows[0].w_b) <= SINGLE_TURN):
             return ()
         steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
                  for one, other in pairwise((*kept, *rows))]
-        current_step = steps.pop(ROWS_BESIDE)
+        current_step = steps.pop(NEIGHBOUR_ROWS)
         least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
         return tuple(size > max(least, SINGLE_TIMES * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
@@ -133,7 +133,7 @@ class SpikeScreen:
     def _is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
         return self._step_size is not ZERO and (row.t > self._until or all(
-            abs(w - before) <= BACK_SHARE * size for w, before, size in zip(
+            abs(w - before) <= RETURN_SHARE * size for w, before, size in zip(
                 row.w_b, self._before, self._step_size, strict=True) if size))
 
     def _implausible_part(self, last: Row, row: Row, isolated: Sequence[bool]) -> Vector:
@@ -168,7 +168,7 @@ class SpikeScreen:
         """Return the number of the row where the values are back after a step, None without."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
-            if all(left <= BACK_SHARE * size for left, size, bound in zip(
+            if all(left <= RETURN_SHARE * size for left, size, bound in zip(
                     _step(last, row), step, exceeds, strict=True) if bound):
                 return k
         return None

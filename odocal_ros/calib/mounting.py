@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Complexes, Floats, medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.imu_orientation import AXES, bin_accelerations, FEWEST_BINS_FACING
+from odocal_ros.screening.imu_orientation import AXES, bin_accelerations, ORIENTATION_BINS
 from odocal_ros.screening.inputs import Inputs
 
 # rad of yaw from nominal: beyond it a nominal rotation or heading is wrong; beyond it reversed.
@@ -133,7 +133,7 @@ def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
     """Return the angle from accelerations A to forces F and its sigma, rad; pi if unknown."""
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
-    if len(A) < FEWEST_BINS_FACING or power < 1e-3 * len(A) * 0.05:     # hardly any acceleration
+    if len(A) < ORIENTATION_BINS or power < 1e-3 * len(A) * 0.05:     # hardly any acceleration
         return 0.0, np.pi
     gain = np.vdot(A, F) / power
     if not gain:            # no accelerometer

@@ -30,7 +30,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data_reasons
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.clocks import TOO_FAR
+from odocal_ros.screening.clocks import SYNCHRONISE_REMEDY
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
 from odocal_ros.screening.imu_orientation import (
@@ -64,7 +64,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
         (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)      # ns
         leg = recorder.close(first, last, preroll=0.0)
     except (BadData, BadUsage) as error:
-        findings.append(Reason(Code.CLOCKS_DIFFER, str(error), TOO_FAR))
+        findings.append(Reason(Code.CLOCKS_DIFFER, str(error), SYNCHRONISE_REMEDY))
         return []
     config = settings_by_frame(leg.fix, config)
     leg, inputs, reasons = screen_aligned(leg, config)

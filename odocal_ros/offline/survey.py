@@ -16,9 +16,9 @@ from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_cho
 from odocal_ros.data.arrays import Floats, Ints, lengths, median, medians, reduce_columns
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
-from odocal_ros.screening.fix_screen import has_position, median_origin, usable_fixes
+from odocal_ros.screening.fix_screen import has_position, usable_fixes
 from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
-from odocal_ros.screening.inputs import Inputs, LocatedFixes
+from odocal_ros.screening.inputs import Inputs, LocatedFixes, median_origin
 from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.config import Config, GnssConfig
 from odocal_ros.settings.nominal import G

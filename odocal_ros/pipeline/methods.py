@@ -39,8 +39,7 @@ from odocal_ros.pipeline.prepared_leg import (
 )
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.fix_screen import median_origin
-from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.inputs import Inputs, median_origin
 
 # judgement: relative computing time of the methods, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'smoother': 20}

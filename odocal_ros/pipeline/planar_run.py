@@ -28,8 +28,7 @@ from odocal_ros.nav.time_series import integral_at
 from odocal_ros.pipeline.methods import leg_result
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.fix_screen import median_origin
-from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.inputs import Inputs, median_origin
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
 from odocal_ros.settings.nominal import grade_of, nominal_scale

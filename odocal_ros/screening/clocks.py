@@ -35,26 +35,27 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 
 OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
-# judgement, s: least step of a clock that is detected; rows on each side that give the lag
-CLOCK_SET, LAG_NEIGHBOURS = 0.01, 50
+# judgement: least step of a clock that is detected, s; rows before and after it whose median lag
+# gives its size
+CLOCK_STEP, STEP_LAG_ROWS = 0.01, 50
 OFFSET_CELL = 0.25          # s, judgement: of means; an acceleration of the vehicle takes longer
 FARTHEST_OFFSET = 90.0      # s, judgement: largest offset that is found
-# s, judgement: slower changes are slopes in the force, and traffic in the speed
+# s, judgement: slower changes of force (slopes) and of speed (traffic) are removed
 SLOW_FORCE, SLOW_SPEED = 20.0, 60.0
 # s, judgement: duration of one acceleration, which counts as one sample
-EVENT = 4.0
-# statistical: log likelihood of the best offset less that of small ones and of all farther than
-# EVENT from it; the margin above 10 (once in 20,000) is for signals that repeat themselves
-LEAST_LOG_ODDS = 20.0
+ACCELERATION_S = 4.0
+# statistical: log likelihood of the best offset less that of small ones and of all more than
+# ACCELERATION_S away; the margin above 10 (once in 20,000) is for signals that repeat themselves
+DELAY_LOG_ODDS = 20.0
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
-TOO_FAR = ('Stamp all sensors with one clock, or set arrival_time of imu, odometer or gnss: '
-           'the difference exceeds the range of time_offset. '
-           'If a bag is played, use ros2 bag play --clock at normal speed and start the node '
-           'with use_sim_time:=true.')
+SYNCHRONISE_REMEDY = (
+    'Stamp all sensors with one clock, or set arrival_time of imu, odometer or gnss: the '
+    'difference exceeds the range of time_offset. If a bag is played, use ros2 bag play --clock '
+    'at normal speed and start the node with use_sim_time:=true.')
 
 
 def stamp_offsets(config: Config) -> dict[str, float]:
-    """Return the s to add to the stamps of each input; 0 for the IMU, which stamps the marks."""
+    """Return the seconds to add to the stamps of each input; 0 for the IMU, the reference."""
     def of(group: str) -> float:
         return float(getattr(config, group).time_offset) if group else 0.0
     return {slot: of(one.clock) - of('imu') for slot, one in INPUTS.items()}
@@ -62,18 +63,15 @@ def stamp_offsets(config: Config) -> dict[str, float]:
 
 def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
     """Return reasons for clocks that differ from the IMU's at equal times of arrival."""
-    topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = stamp_offsets(config)
     found: list[Reason] = []
     imu = _stamped(leg.imu)
-    if len(imu.stamp_ns) < 2:
-        return found
-    for slot in topics:
+    for slot in TOPICS:
         samples = _stamped(leg.rows(slot))
-        if not len(samples.stamp_ns):
+        if min(len(imu.stamp_ns) - 1, len(samples.stamp_ns)) < 1 or (
+                slot == 'fix' and config.reference.points):
             continue
-        ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
-        ahead += offset[slot]
+        ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples)) + offset[slot]
         if abs(ahead) > CLOCK_DIFFERENCE_LIMIT:
             group = INPUTS[slot].clock
             hint = f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
@@ -87,12 +85,12 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
 
 def clock_remedy(ahead: float) -> str:
     """Return the remedy for a clock that is ``ahead`` s ahead of the IMU clock."""
-    return TOO_FAR if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
+    return SYNCHRONISE_REMEDY if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
 
 def _stamped(samples: SomeSamples) -> SomeSamples:
-    good = samples.stamp_ns > 0
-    return samples if good.all() else take(samples, good)
+    has_stamp = samples.stamp_ns > 0
+    return samples if has_stamp.all() else take(samples, has_stamp)
 
 
 def _lag(samples: Samples) -> Floats:
@@ -123,32 +121,35 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
     return found
 
 
-def _may_be_odd(stamp_ns: Ints) -> Bools:
+def _may_be_clock_step(stamp_ns: Ints) -> Bools:
     step: Floats = np.diff(stamp_ns) * 1e-9
-    return (step <= 0) | (step > CLOCK_SET)
+    return (step <= 0) | (step > CLOCK_STEP)
 
 
 def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
-    """Return a leg without the steps of clocks that were set during it; CLOCK_SET of each."""
+    """Return a leg without the steps of clocks that were set during it; CLOCK_SET for each."""
     rows: dict[str, Samples] = {}
     found: list[Reason] = []
     for slot in ('imu', *TOPICS):
-        sent = _stamped(leg.rows(slot))
-        at, moved = _clock_steps(sent)
-        if not len(at):
+        stamped = _stamped(leg.rows(slot))
+        last_rows, sizes = _clock_steps(stamped)
+        if not len(last_rows):
             continue
-        piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # ends at a step
-        lag = [abs(np.median(_lag(take(sent, piece == k)))) for k in range(len(at) + 1)]
-        shift = running_sum(np.round(moved * 1e9).astype(np.int64))
+        # sections between steps; the stamps of the one with the smallest lag are kept
+        section = np.searchsorted(last_rows, np.arange(len(stamped.stamp_ns)))
+        lag = [abs(np.median(_lag(take(stamped, section == k))))
+               for k in range(len(last_rows) + 1)]
+        shift = running_sum(np.round(sizes * 1e9).astype(np.int64))
         shift -= shift[int(np.argmin(lag))]
-        whole = leg.rows(slot)
-        stamp_ns = whole.stamp_ns.copy()
-        stamp_ns[stamp_ns > 0] -= shift[piece]
-        rows[slot] = replace(whole, stamp_ns=stamp_ns)
-        found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+z.3f} s '
-                         f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s; '
-                         f'{"earlier" if shift[piece[k]] else "later"} stamps were corrected')
-                  for k, by in zip(at, moved, strict=True)]
+        samples = leg.rows(slot)
+        stamp_ns = samples.stamp_ns.copy()
+        stamp_ns[stamp_ns > 0] -= shift[section]
+        rows[slot] = replace(samples, stamp_ns=stamp_ns)
+        found += [Reason(
+            Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {size:+z.3f} s at t = '
+            f'{(stamped.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s; '
+            f'{"earlier" if shift[section[k]] else "later"} stamps were corrected')
+            for k, size in zip(last_rows, sizes, strict=True)]
         if slot == 'imu':
             leg = replace(leg, start_ns=leg.start_ns - int(shift[0]),
                           stop_ns=leg.stop_ns - int(shift[-1]))
@@ -156,23 +157,22 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 
 def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
-    """Return the rows after which a clock was set, and its steps, s: arrivals do not step."""
-    if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
-            _may_be_odd, samples.stamp_ns).any():
+    """Return the rows after which a clock was set, and by how much, s: arrivals do not step."""
+    if len(samples.stamp_ns) < 2 * STEP_LAG_ROWS or not by_step(
+            _may_be_clock_step, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
-    ahead = lag[:-1] - lag[1:]
-    stamps = np.abs(step - np.median(step)) > np.maximum(CLOCK_SET, np.abs(ahead) / 4)
-    odd = np.flatnonzero(stamps & (np.abs(ahead) > CLOCK_SET / 2))
-    at, moved = [], []
-    for k in odd.tolist():
-        before, after = slice(max(k + 1 - LAG_NEIGHBOURS, 0), k), slice(k + 1, k + LAG_NEIGHBOURS)
-        by = float(np.median(lag[before.start:k + 1]) - np.median(lag[k + 1:after.stop + 1]))
-        if (abs(by) >= CLOCK_SET and abs(ahead[k] - by) <= 0.3 * abs(by)
-                and (step[before] >= 0).all() and (step[after] >= 0).all()):
-            at.append(k)
-            moved.append(by)        # of the stamps, relative to arrival
-    return np.array(at, np.int64), np.array(moved)
+    advance = lag[:-1] - lag[1:]        # of stamps over arrivals
+    odd_step = np.abs(step - np.median(step)) > np.maximum(CLOCK_STEP, np.abs(advance) / 4)
+    rows, sizes = [], []
+    for k in np.flatnonzero(odd_step & (np.abs(advance) > CLOCK_STEP / 2)).tolist():
+        first, last = max(k + 1 - STEP_LAG_ROWS, 0), k + STEP_LAG_ROWS
+        size = float(np.median(lag[first:k + 1]) - np.median(lag[k + 1:last + 1]))
+        if (abs(size) >= CLOCK_STEP and abs(advance[k] - size) <= 0.3 * abs(size)
+                and (step[first:k] >= 0).all() and (step[k + 1:last] >= 0).all()):
+            rows.append(k)
+            sizes.append(size)
+    return np.array(rows, np.int64), np.array(sizes)
 
 
 def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, float]]:
@@ -190,54 +190,58 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
                       _without_slow_changes(force, SLOW_FORCE))
     if odometer:
         yield 'odometer', odometer
-    place = np.stack([np.interp(edges, t_fix, axis) for axis in located.fixes_n[:, :2].T], -1)
-    fix = _delay(_without_slow_changes(_chords(place), SLOW_SPEED),
+    position = np.stack([np.interp(edges, t_fix, axis) for axis in located.fixes_n[:, :2].T], -1)
+    fix = _delay(_without_slow_changes(_chords(position), SLOW_SPEED),
                  _without_slow_changes(_chords(travel.at(edges)[:, None]), SLOW_SPEED), odometer)
     if fix:
         yield 'gnss', fix
 
 
-def _chords(place: Floats) -> Floats:
-    """Return the distances between the means of adjacent EVENTs: (n, 1)."""
-    cells = round(EVENT / OFFSET_CELL)
-    total = np.cumsum(np.pad(place, ((cells, cells), (0, 0)), mode='edge'), axis=0)
+def _chords(position: Floats) -> Floats:
+    """Return distances between means over adjacent ACCELERATION_S, times a constant: (n, 1)."""
+    cells = round(ACCELERATION_S / OFFSET_CELL)
+    total = np.cumsum(np.pad(position, ((cells, cells), (0, 0)), mode='edge'), axis=0)
     mean = total[cells:] - total[:-cells]
-    out: Floats = np.linalg.norm(mean[cells:] - mean[:-cells], axis=1)[:, None]
-    return out
+    chords: Floats = np.linalg.norm(mean[cells:] - mean[:-cells], axis=1)[:, None]
+    return chords
 
 
 def _without_slow_changes(x: Floats, slow: float) -> Floats:
-    """Return columns without their changes slower than some seconds: (n, k)."""
+    """Return columns minus their running means over ``slow`` s: (n, k)."""
     half = min(round(slow / OFFSET_CELL / 2), (len(x) - 1) // 2)
     total = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode='edge'), axis=0)
     return x - (total[2 * half + 1:] - total[:-2 * half - 1]) / (2 * half + 1)
 
 
 def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
-    """Return the delay, s, of y (n, 1) by its fit with x (n, k); 0: not above OFFSET_REACH."""
+    """
+    Return the delay, s, at which x (n, k) explains most of y (n, 1); 0 if small or uncertain.
+
+    x_delay : known delay of x, s, which is added.   Small is up to OFFSET_REACH.
+    """
     reach = round(FARTHEST_OFFSET / OFFSET_CELL)
     size = 2 * max(len(x), reach)
     product = np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj()
-    at = np.arange(-reach, reach + 1)
-    correlation = np.fft.irfft(product, axis=0)[at]
+    cells = np.arange(-reach, reach + 1)
+    correlation = np.fft.irfft(product, axis=0)[cells]
     share = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
         float((y**2).sum()), 1e-12)
     best = 1 + int(np.argmax(share[1:-1]))
-    before, here, after = share[best - 1:best + 2]      # their parabola has its maximum there:
-    top = (after - before) / max(2 * (2 * here - before - after), 1e-12)
-    delay_s = OFFSET_CELL * (at[best] + np.clip(top, -0.5, 0.5))
-    small = np.abs(OFFSET_CELL * at + x_delay) <= OFFSET_REACH
-    others = share[(np.abs(OFFSET_CELL * at - delay_s) > EVENT) | small].max()
-    events = len(y) * OFFSET_CELL / EVENT
-    left = np.maximum(1.0 - np.array([others, here]), 1e-6)      # of the variance
-    log_odds = events / 2 * np.log(left[0] / left[1])
-    return float(delay_s + x_delay) if log_odds > LEAST_LOG_ODDS else 0.0
+    before, here, after = share[best - 1:best + 2]
+    parabola_top = (after - before) / max(2 * (2 * here - before - after), 1e-12)
+    delay_s = OFFSET_CELL * (cells[best] + np.clip(parabola_top, -0.5, 0.5))
+    small = np.abs(OFFSET_CELL * cells + x_delay) <= OFFSET_REACH
+    others = share[(np.abs(OFFSET_CELL * cells - delay_s) > ACCELERATION_S) | small].max()
+    samples = len(y) * OFFSET_CELL / ACCELERATION_S
+    unexplained = np.maximum(1.0 - np.array([others, here]), 1e-6)      # share of the variance
+    log_odds = samples / 2 * np.log(unexplained[0] / unexplained[1])
+    return float(delay_s + x_delay) if log_odds > DELAY_LOG_ODDS else 0.0
 
 
 def shift_stamps(samples: SomeSamples, by_ns: int, imu: ImuSamples) -> SomeSamples:
     """Return samples with moved stamps; arrivals too, unless stamps then lag like the IMU's."""
-    lag, usual = (float(np.median(one.received_ns - one.stamp_ns)) if len(one.stamp_ns) else 0.0
-                  for one in (samples, imu))
-    by_stamps = abs(lag - by_ns - usual) < abs(lag - usual)
-    return replace(samples, received_ns=samples.received_ns + (0 if by_stamps else by_ns),
+    lag, imu_lag = (float(np.median(one.received_ns - one.stamp_ns)) if len(one.stamp_ns) else 0.0
+                    for one in (samples, imu))
+    only_stamps = abs(lag - by_ns - imu_lag) < abs(lag - imu_lag)
+    return replace(samples, received_ns=samples.received_ns + (0 if only_stamps else by_ns),
                    stamp_ns=samples.stamp_ns + by_ns * (samples.stamp_ns > 0))

@@ -17,116 +17,123 @@ import numpy as np
 
 from odocal_ros.data.arrays import chunks, Floats, Ints, PIECE_ROWS, runs, work_array
 
-BLOCK_TIME = 1.0          # s, judgement: of rows whose mean shows a lost row
-WINDOW_BLOCKS = 20        # judgement: duration of a mean; at 100 Hz jitter / sqrt(2000) remains
+BLOCK_TIME = 1.0          # s, judgement: of rows whose mean time shows a lost row
+WINDOW_BLOCKS = 20        # judgement: blocks of a mean; at 100 Hz jitter / sqrt(2000) remains
 JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is corrected
 TESTED_ROWS = 20_000      # judgement: largest number of tested rows
 TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance
-BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
-LEAST_STEP = 1e-9              # s, judgement: minimum difference between rows
-SURE_SIGMAS = 4.0         # statistical: significance of smoother rows: by chance once in 30,000
+# definition: a row and the two before and after it, whose cubic predicts its values
+OFFSETS, MIDDLE, NEIGHBOURS = np.arange(-2, 3), 2, (0, 1, 3, 4)
+LEAST_STEP = 1e-9         # s, judgement: minimum difference between rows
+SMOOTHER_SIGMAS = 4.0     # statistical: significance of smoother rows: by chance once in 30,000
 
 
 def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     """Return the sampling times (n,), s, of rows by stamps t; w, f: (n, 3), in any unit."""
-    usual = _interval(t)
-    per = int(BLOCK_TIME / usual) if usual > 0 else 0
-    if per < 10 or len(t) < WINDOW_BLOCKS * per:
+    interval = _interval(t)
+    per_block = int(BLOCK_TIME / interval) if interval > 0 else 0
+    if per_block < 10 or len(t) < WINDOW_BLOCKS * per_block:
         return t
-    rhythm = _EvenTimes(t, usual, per)
-    tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + BESIDE
-    sent, even = t[tested], rhythm.at(t, tested)
-    jitters = np.median(np.abs(sent - even)) > JITTER_SHARE * usual
-    if not jitters or not _is_smoother(sent, even, (column[tested] for column in (*w.T, *f.T))):
-        return t
-    return rhythm.times(t)
+    even_times = _EvenTimes(t, interval, per_block)
+    tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + OFFSETS
+    stamps, even = t[tested], even_times.at(t, tested)
+    has_jitter = np.median(np.abs(stamps - even)) > JITTER_SHARE * interval
+    values = (column[tested] for column in (*w.T, *f.T))
+    return even_times.all(t) if has_jitter and _is_smoother(stamps, even, values) else t
 
 
 def _interval(t: Floats) -> float:
     """Return the interval of rows, s, by the median duration of 100 intervals."""
-    stretch = t[::100]
-    return float(np.median(np.diff(stretch))) / 100 if len(stretch) > 1 else 0.0
+    every_100th = t[::100]
+    return float(np.median(np.diff(every_100th))) / 100 if len(every_100th) > 1 else 0.0
 
 
 class _EvenTimes:
     """
     Even times by the mean stamps of blocks without lost rows; other rows keep their stamps.
 
-    lost : (b,) bool, blocks of ``per`` rows with a lost row in them or in an adjacent one.
-    knots, late : (k,) row numbers, and their time minus row number times interval, s.
+    interval : s between rows.   per_block : rows of a block.
+    lost : (b,) bool, blocks with a lost row in them or in an adjacent one.
+    knots, lateness : (k,) row numbers, and their time minus row number times interval, s.
     """
 
-    def __init__(self, t: Floats, usual: float, per: int) -> None:
-        self.usual, self.per = usual, per
-        mean = self._means(t)
-        self.lost = np.zeros(len(mean), bool)
-        # a lost row: across the block that may contain it
-        jump = np.abs(mean[2:] - mean[:-2]) > usual / 2
+    def __init__(self, t: Floats, interval: float, per_block: int) -> None:
+        self.interval, self.per_block = interval, per_block
+        lateness = self._mean_lateness(t)
+        self.lost = np.zeros(len(lateness), bool)
+        # a lost row changes the lateness by an interval, across the block that contains it
+        jump = np.abs(lateness[2:] - lateness[:-2]) > interval / 2
         for shift in range(3):
             self.lost[shift:shift + len(jump)] |= jump
-        lines = [self._line(mean, a, b) for a, b in runs(~self.lost)]
-        self.knots, self.late = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
+        lines = [self._line(lateness, a, b) for a, b in runs(~self.lost)]
+        self.knots, self.lateness = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
-    def _means(self, t: Floats) -> Floats:
+    def _mean_lateness(self, t: Floats) -> Floats:
         """Return the trimmed mean of stamp minus row number times interval, of each block, s."""
-        blocks, found = len(t) // self.per, []
+        n, blocks, means = self.per_block, len(t) // self.per_block, []
         for some in np.array_split(np.arange(blocks), 1 + len(t) // PIECE_ROWS):
-            rows = np.arange(some[0] * self.per, (some[-1] + 1) * self.per)
-            late = np.sort((t[rows] - self.usual * rows).reshape(-1, self.per), axis=1)
-            found.append(late[:, self.per // 10:self.per - self.per // 10].mean(axis=1))
-        return np.concatenate(found)
+            rows = np.arange(some[0] * n, (some[-1] + 1) * n)
+            lateness = np.sort((t[rows] - self.interval * rows).reshape(-1, n), axis=1)
+            means.append(lateness[:, n // 10:n - n // 10].mean(axis=1))
+        return np.concatenate(means)
 
-    def _line(self, mean: Floats, first: int, last: int) -> Floats:
-        """Return knots of blocks without a loss: a line plus the deviations of windows."""
+    def _line(self, lateness: Floats, first: int, last: int) -> Floats:
+        """Return knots and lateness of blocks without a loss: a line plus means of windows."""
         blocks = np.arange(first, last)
-        middle = (blocks + 0.5) * self.per
-        slope, start = np.polyfit(middle, mean[first:last], 1) if len(blocks) > 1 \
-            else (0.0, mean[first])
-        off = mean[first:last] - start - slope * middle
+        middle = (blocks + 0.5) * self.per_block
+        slope, start = np.polyfit(middle, lateness[first:last], 1) if len(blocks) > 1 \
+            else (0.0, lateness[first])
+        residual = lateness[first:last] - start - slope * middle
         windows = np.array_split(blocks - first, max(1, len(blocks) // WINDOW_BLOCKS))
-        by = np.array([off[window].mean() for window in windows])[[0, *range(len(windows)), -1]]
-        knots = np.array([first * self.per, *(middle[window].mean() for window in windows),
-                          last * self.per - 1])
-        return np.stack([knots, start + slope * knots + by])
+        means = np.array([residual[window].mean() for window in windows])
+        knots = np.array([first * self.per_block, *(middle[window].mean() for window in windows),
+                          last * self.per_block - 1])
+        return np.stack([knots, start + slope * knots + np.pad(means, 1, mode='edge')])
 
     def at(self, t: Floats, rows: Ints) -> Floats:
-        """Return the times of rows, s, in the shape of ``rows``."""
+        """Return the times of rows, s, in the shape of ``rows``; their stamps t near a loss."""
         if not len(self.knots):
             return t[rows]
-        even = self.usual * rows + np.interp(rows, self.knots, self.late)
-        lost = self.lost[np.minimum(rows // self.per, len(self.lost) - 1)]
+        even = self.interval * rows + np.interp(rows, self.knots, self.lateness)
+        lost = self.lost[np.minimum(rows // self.per_block, len(self.lost) - 1)]
         return np.where(lost, t[rows], even)
 
-    def times(self, t: Floats) -> Floats:
-        """Return the times of all rows, rising, also between even times and stamps."""
+    def all(self, t: Floats) -> Floats:
+        """Return the times of all rows with stamps t, strictly rising: (n,) s."""
         found, last = work_array(len(t)), -np.inf
-        for rows in chunks(len(t)):
-            own = np.arange(rows.start, rows.stop)
-            part = np.maximum.accumulate(np.maximum(self.at(t, own) - LEAST_STEP * own, last))
-            found[rows], last = part + LEAST_STEP * own, part[-1]
+        for piece in chunks(len(t)):
+            rows = np.arange(piece.start, piece.stop)
+            times = np.maximum.accumulate(np.maximum(self.at(t, rows) - LEAST_STEP * rows, last))
+            found[piece], last = times + LEAST_STEP * rows, times[-1]
         return found
 
 
-def _is_smoother(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
-    """Return True if (m, 5) values are significantly smoother at other times than at stamps."""
-    weights = _weights(sent), _weights(even)
-    gain = np.zeros(len(sent))
-    for near in columns:
-        # with noise alone, both are its variance
-        off, left = (np.einsum('mk,mk->m', near, x)**2 / (x**2).sum(axis=1) for x in weights)
-        rounding = 1e-18 * (near**2).mean() + 1e-30
-        gain += np.clip((off - left) / max(np.median(off + left), rounding), -10.0, 10.0)
+def _is_smoother(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
+    """
+    Return True if values are significantly smoother at even times than at stamps.
+
+    stamps, even : (m, 5) s, times of tested rows and their neighbours.   columns : (m, 5) values.
+    """
+    weights = _weights(stamps), _weights(even)
+    gain = np.zeros(len(stamps))
+    for values in columns:
+        # squared deviations from the cubic; with white noise alone, both have its variance
+        at_stamps, at_even = (np.einsum('mk,mk->m', values, x)**2 / (x**2).sum(axis=1)
+                              for x in weights)
+        rounding = 1e-18 * (values**2).mean() + 1e-30
+        gain += np.clip((at_stamps - at_even) / max(np.median(at_stamps + at_even), rounding),
+                        -10.0, 10.0)
     sums = np.array([group.sum() for group in np.array_split(gain, TESTED_GROUPS)])
-    return bool(sums.mean() > SURE_SIGMAS * sums.std() / np.sqrt(len(sums)))
+    return bool(sums.mean() > SMOOTHER_SIGMAS * sums.std() / np.sqrt(len(sums)))
 
 
 def _weights(times: Floats) -> Floats:
     """Return the weights for the deviation of a row from the cubic of its neighbours: (m, 5)."""
     weights = np.full(times.shape, -1.0)
-    for i, j in product(NODES, NODES):
+    for i, j in product(NEIGHBOURS, NEIGHBOURS):
         if i != j:
             difference = times[:, i] - times[:, j]
-            weights[:, i] *= (times[:, HERE] - times[:, j]) / np.where(
+            weights[:, i] *= (times[:, MIDDLE] - times[:, j]) / np.where(
                 difference == 0, LEAST_STEP, difference)
-    weights[:, HERE] = 1.0
+    weights[:, MIDDLE] = 1.0
     return weights

@@ -12,9 +12,8 @@ contain no information on the scale.
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Complexes, Floats, running_sum
+from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints, running_sum
 from odocal_ros.data.samples import FixSamples, LOCAL
-from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import ecef_from_geodetic, radii
 from odocal_ros.nav.time_series import MISSING_INTERVALS, running_integral
 from odocal_ros.reasons import Code, Reason
@@ -24,69 +23,75 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 # m, judgement. Measured on eight zoo drives with blocks of fixes of 7 m among fixes of 0.01 to
 # 1.5 m: without a limit the sigma of the scale is 1.2 to 24 times as large, as correlated errors
 # have one level; error over sigma is the same. A drive with fixes of 3 to 7 m fails with it
-USUAL_LIMIT = 3.0
+DEFAULT_SIGMA_LIMIT = 3.0
 # s, length of compared displacements: judgement, longer than delays of receivers
 DISPLACEMENT_WINDOW = 10.0
 VELOCITY_GAP = 2.0    # s, judgement: a longer one hides a change of speed
-# relative to the displacements between fixes. Judgement: errors of wheel speeds are a few per
-# cent, errors from wrong axes, units and frames are far larger
-MOST_UNLIKE = 0.1
-COMPARED_EVERY = 1.0     # s between the fixes that are compared: judgement
-MOVED_LEAST = 1.0        # m in this time, judgement: displacements then have a direction
-# judgement: smooth is a quarter of the median, or half of it where gyro and odometer add 3 cm
+# of |z - 1| in velocity_reasons. Judgement: velocities and fixes differ by a few per cent, by
+# far more with wrong axes, units and frames
+VELOCITY_RATIO_LIMIT = 0.1
+COMPARISON_INTERVAL = 1.0     # s between the fixes that are compared: judgement
+LEAST_DISPLACEMENT = 1.0      # m in this time, judgement: displacements then have a direction
+# judgement: a displacement is smooth if its deviation from odometer and gyro is below a quarter of
+# the median deviation, or below half of it and 3 cm, the noise of odometer and gyro
 SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
-# judgement: rows, s, and smooth share of them; white noise reaches it three times in 10^8 (a
-# quarter), or in 10^4 (half)
+# judgement: compared fixes of a smooth section, and smooth share of them; white noise reaches it
+# three times in 10^8 (a quarter), or in 10^4 (half)
 SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
-# medians and m: a jump. Judgement: white noise exceeds three medians once in 500 seconds, after a
-# smooth section
+# least deviation of a jump, in medians and m. Judgement: white noise exceeds three medians once in
+# 500 seconds, after a smooth section
 JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
 # s, physical: in 0.1 s a change of acceleration by 5 m/s^2 (hard braking) gives SHORTEST_JUMP
 JUMP_DELAY = 0.1
 SPANS_LISTED = 3           # judgement: number of spans in a reason
 
 
-def usable_fixes(fix: FixSamples, sent: int,
+def usable_fixes(fix: FixSamples, received: int,
                  gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
-    """Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons."""
+    """
+    Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons.
+
+    received : number of fixes in the leg, for the reasons; some have no row in ``fix``.
+    """
     no_fix = fix.status < gnss.min_status
     most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
-    lost = ~has_position(fix) | (abs(fix.height) > most_height)
-    lost = lost | _far_from_most(fix, ~(lost | no_fix))
+    invalid = ~has_position(fix) | (abs(fix.height) > most_height)
+    invalid = invalid | _far_from_most(fix, ~(invalid | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
-    limit = sigma_limit(sigma[~unknown & ~no_fix & ~lost], gnss.max_sigma)
+    limit = sigma_limit(sigma[~unknown & ~no_fix & ~invalid], gnss.max_sigma)
     poor = (sigma > limit) & ~unknown
-    use = ~(no_fix | lost | poor)
-    found: tuple[Reason, ...] = ()
+    use = ~(no_fix | invalid | poor)
+    reasons: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
         local = bool((fix.status == LOCAL).any())
         name = 'reference.default_sigma' if local else 'gnss.default_sigma'
-        found += (Reason(Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {sent} '
-                         f'fixes have no usable covariance; {gnss.default_sigma:g} m ({name}) is '
-                         'used', f'Set {name} to the real horizontal accuracy of the positions.'
-                         if local else ''),)
-    bad = [(f'{int(m.sum())} {what}', do) for m, what, do in (
+        reasons += (Reason(
+            Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {received} fixes have '
+            f'no usable covariance; {gnss.default_sigma:g} m ({name}) is used',
+            f'Set {name} to the real horizontal accuracy of the positions.' if local else ''),)
+    rejected = [(f'{int(mask.sum())} {why}', remedy) for mask, why, remedy in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
          'gnss.min_status if these fixes are good.'),
-        (lost & ~no_fix, _invalid(fix, lost & ~no_fix), 'Check the driver: latitude and longitude '
-         'in degrees (swapped?), altitude in m, no 0, 0 in place of a missing position.'),
-        (poor & ~no_fix & ~lost, f'with sigma above {limit:.3g} m', 'If these '
+        (invalid & ~no_fix, _invalid_text(fix, invalid & ~no_fix), 'Check the driver: latitude '
+         'and longitude in degrees (swapped?), altitude in m, no 0, 0 in place of a missing '
+         'position.'),
+        (poor & ~no_fix & ~invalid, f'with sigma above {limit:.3g} m', 'If these '
          'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
-         'its own uncertainty.')) if m.any()]
-    if bad:
+         'its own uncertainty.')) if mask.any()]
+    if rejected:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
-        listed, do = zip(*bad, strict=True)
-        found += (Reason(code, f'{int((~use).sum())} of {sent} fixes are not used: '
-                         f'{", ".join(listed)}', ' '.join(do)),)
-    return use, covariance, found
+        whys, remedies = zip(*rejected, strict=True)
+        reasons += (Reason(code, f'{int((~use).sum())} of {received} fixes are not used: '
+                           f'{", ".join(whys)}', ' '.join(remedies)),)
+    return use, covariance, reasons
 
 
-def _invalid(fix: FixSamples, lost: Bools) -> str:
+def _invalid_text(fix: FixSamples, invalid: Bools) -> str:
     """Return a phrase for the invalid positions of a mask, with the first one as an example."""
-    if not lost.any():
+    if not invalid.any():
         return ''
-    first = int(np.argmax(lost))
+    first = int(np.argmax(invalid))
     latitude, longitude = np.degrees([fix.latitude[first], fix.longitude[first]])
     return (f'at an invalid position (the first: latitude {latitude:.6g}, longitude '
             f'{longitude:.6g} deg, altitude {fix.height[first]:.6g} m)')
@@ -94,16 +99,17 @@ def _invalid(fix: FixSamples, lost: Bools) -> str:
 
 def sigma_limit(sigma: Floats, max_sigma: float) -> float:
     """Return the limit of the horizontal sigmas of fixes, (n,) m; inf: none."""
-    if np.isnan(max_sigma):
-        return max(USUAL_LIMIT, 2 * float(np.median(sigma))) if len(sigma) else USUAL_LIMIT
-    return max_sigma or np.inf
+    if not np.isnan(max_sigma):
+        return max_sigma or np.inf
+    return max(DEFAULT_SIGMA_LIMIT, 2 * float(np.median(sigma)) if len(sigma) else 0.0)
 
 
 def has_position(fix: FixSamples) -> Bools:
     """Return a mask of fixes on the Earth, not NaN, whose angles are not both zero: (n,) bool."""
-    nowhere = (fix.latitude == 0) & (fix.longitude == 0)
-    there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
-    return there
+    both_zero = (fix.latitude == 0) & (fix.longitude == 0)
+    inside = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi)
+    on_earth: Bools = inside & ~both_zero
+    return on_earth
 
 
 def _far_from_most(fix: FixSamples, good: Bools) -> Bools:
@@ -125,11 +131,12 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     """
     covariance = fix.covariance_n.copy()
     unknown = ~_is_covariance(covariance[:, :2, :2]) | (fix.covariance_type == 0)
-    flat = unknown | ~_is_covariance(covariance)
+    no_height = unknown | ~_is_covariance(covariance)
     covariance[unknown] = np.eye(3) * default_sigma**2
-    covariance[flat, 2, :] = covariance[flat, :, 2] = 0.0
+    covariance[no_height, 2, :] = covariance[no_height, :, 2] = 0.0
     # satellites are only above: the sigma of a height is about twice as large
-    covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
+    covariance[no_height, 2, 2] = 4 * np.maximum(covariance[no_height, 0, 0],
+                                                 covariance[no_height, 1, 1])
     return covariance, unknown
 
 
@@ -138,31 +145,18 @@ def _is_covariance(matrices: Floats) -> Bools:
     variance = np.diagonal(matrices, axis1=1, axis2=2)
     largest_sigma = 1e8    # m, larger ones are invalid: products and roots would overflow
     small = np.abs(matrices) < largest_sigma**2
-    sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
+    valid: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
     smallest_sigma = 1e-6    # m, smaller ones are invalid
-    sane &= (variance > smallest_sigma**2).all(axis=1)
+    valid &= (variance > smallest_sigma**2).all(axis=1)
     with np.errstate(all='ignore'):
         sigma = np.sqrt(variance)
-        unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
-    unit[~sane] = np.eye(matrices.shape[1])
-    asymmetry = 1e-3    # correlations above and below the diagonal
-    # an asymmetric matrix is damaged: the correct half is unknown
-    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < asymmetry).all(axis=(1, 2))
-    # least eigenvalue of the correlations: below it the matrix is singular
-    least_eigenvalue = 1e-6
-    sane &= np.linalg.eigvalsh(unit)[:, 0] > least_eigenvalue
-    return sane
-
-
-def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
-    """Return the origin of n: the median fix of those near the start, so it is not an outlier."""
-    about_start = 11    # fixes nearest to the start mark, whose median is used
-    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
-    r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
-    amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
-    latitude, longitude, height = geodetic[amid].tolist()
-    known = geodetic[~np.isnan(geodetic[:, 2]), 2] if np.isnan(height) else [height]
-    return Origin(latitude, longitude, float(np.median(known)) if len(known) else 0.0)
+        correlation = matrices / (sigma[:, :, None] * sigma[:, None, :])
+    correlation[~valid] = np.eye(matrices.shape[1])
+    asymmetry = 1e-3    # an asymmetric matrix is damaged: the correct half is unknown
+    valid &= (np.abs(correlation - np.swapaxes(correlation, 1, 2)) < asymmetry).all(axis=(1, 2))
+    least_eigenvalue = 1e-6    # of the correlations: below it the matrix is singular
+    valid &= np.linalg.eigvalsh(correlation)[:, 0] > least_eigenvalue
+    return valid
 
 
 def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
@@ -181,24 +175,26 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
     t_fix, geodetic, covariance = t_fix[inside], geodetic[inside], covariance_n[inside]
     if len(t_fix) < 2:
         return ()
-    pick = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1],
+    rows = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1],
                                                            DISPLACEMENT_WINDOW)))
     meridian, normal = radii(geodetic[0, 0])
-    D = np.diff(geodetic[pick, 1] * normal * np.cos(geodetic[0, 0])
-                + 1j * geodetic[pick, 0] * meridian)
+    D = np.diff(geodetic[rows, 1] * normal * np.cos(geodetic[0, 0])
+                + 1j * geodetic[rows, 0] * meridian)
     path = running_integral(t, velocity_n[:, :2]) @ [1, 1j]
-    V = np.diff(np.interp(t_fix[pick], t, path))
+    ends = t_fix[rows]
+    V = np.diff(np.interp(ends, t, path))
     # motion in a gap of the velocity, or of the fixes, is not measured
-    gaps, at = running_sum(np.diff(t) > VELOCITY_GAP), t_fix[pick]
-    begin, end = np.searchsorted(t, at[:-1], side='right') - 1, np.searchsorted(t, at[1:])
-    whole = (gaps[begin] == gaps[end]) & (np.diff(at) < 2 * DISPLACEMENT_WINDOW)
-    V, D = V[whole], D[whole]
+    gaps_before = running_sum(np.diff(t) > VELOCITY_GAP)
+    begin, end = np.searchsorted(t, ends[:-1], side='right') - 1, np.searchsorted(t, ends[1:])
+    complete = (gaps_before[begin] == gaps_before[end]) & (
+        np.diff(ends) < 2 * DISPLACEMENT_WINDOW)
+    V, D = V[complete], D[complete]
     power = float((abs(V)**2).sum())
     if not power:
         return ()
     z = complex((V.conj() * D).sum() / power)
     sigma = float(np.sqrt(2 * np.median(covariance[:, 0, 0]) / power))
-    limit = MOST_UNLIKE + REMARK_SIGMAS * sigma
+    limit = VELOCITY_RATIO_LIMIT + REMARK_SIGMAS * sigma
     if abs(z - 1) < limit:
         return ()
     return (Reason(Code.VELOCITY_UNUSABLE, 'GNSS velocity contradicts the fixes and is not '
@@ -216,7 +212,7 @@ def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
     t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   track : (k,)
     positions of the antenna by odometer and gyro, m, with any first heading, scale within 30 %.
     """
-    spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
+    spans = _dead_reckoned_spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
     found = np.zeros(len(t_fix), bool)
     for begin, end, _ in spans:
         found |= (t_fix >= begin) & (t_fix < end)
@@ -229,53 +225,66 @@ def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
                           f'{listed}{more}: {int(found.sum())} of {len(t_fix)} fixes not used'),)
 
 
-def _spans(t: Floats, place: Complexes, sigma: Floats,
-           track: Complexes) -> list[tuple[float, float, float]]:
+def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,
+                         track: Complexes) -> list[tuple[float, float, float]]:
     """Return for each span its first fix and the first after it, s, and the jump there, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
-    step = min(max(1, round(COMPARED_EVERY / float(np.median(np.diff(t))))), len(t) - 1)
-    t, place, sigma, track = t[::step], place[::step], sigma[::step], track[::step]
-    dt, steps, moved = np.diff(t), np.diff(track), np.diff(place)
-    whole = dt < MISSING_INTERVALS * np.median(dt)
-    moving = whole & (np.abs(steps) > MOVED_LEAST)
-    # each with the last one in motion before it, since a jump may come at a standstill
-    before = np.maximum.accumulate(np.where(moving, np.arange(len(steps)), -1))[:-1]
-    rows = np.flatnonzero(whole[1:] & (before >= 0)) + 1
-    before = before[rows - 1]
-    driven = moving[rows] & (before == rows - 1)
-    if driven.sum() <= SMOOTH_ROWS:
+    every = min(max(1, round(COMPARISON_INTERVAL / float(np.median(np.diff(t))))), len(t) - 1)
+    t, positions, sigma, track = t[::every], positions[::every], sigma[::every], track[::every]
+    rows, deviation, driven = _deviations(t, np.diff(positions), np.diff(track))
+    if not len(rows):
         return []
-    ratio, onward = moved[before] / steps[before], np.gradient(steps) / np.median(dt)
-    change = onward[rows] - onward[before] * steps[rows] / steps[before]
-    deviation = _without_delay(moved[rows] - ratio * steps[rows], ratio * change)
-    usual, at = float(np.median(deviation[driven])), rows[driven]
+    usual, driven_rows = float(np.median(deviation[driven])), rows[driven]
     smooth = deviation[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
     # jumps below the stated error are caused by changes of satellites
     least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
     for k in np.flatnonzero(deviation > least):
-        last = int(np.searchsorted(at, rows[k]))
+        last = int(np.searchsorted(driven_rows, rows[k]))
         first = _smooth_begin(smooth[:last])
         if first == last:
             continue
         # fixes since the previous compared one may be dead-reckoned too
-        begin = float(t[max(at[first] - 2, 0)])
+        begin = float(t[max(driven_rows[first] - 2, 0)])
         # the row after a jump has the same deviation
         if not spans or begin > spans[-1][1]:
             spans.append((begin, float(t[rows[k] + 1]), float(deviation[k])))
     return spans
 
 
+def _deviations(t: Floats, moved: Complexes, steps: Complexes) -> tuple[Ints, Floats, Bools]:
+    """
+    Return rows of moved, their deviations, m, and True if two adjacent rows are in motion: (n,).
+
+    t : (k,) s.   moved, steps : (k - 1,) displacements by fixes and by the track, m. The ratio of
+    the two, a scale and a rotation, should be that of the last row in motion before, which may
+    not be adjacent: a jump may come at a standstill. Empty with too few rows in motion.
+    """
+    dt = np.diff(t)
+    complete = dt < MISSING_INTERVALS * np.median(dt)
+    moving = complete & (np.abs(steps) > LEAST_DISPLACEMENT)
+    before = np.maximum.accumulate(np.where(moving, np.arange(len(steps)), -1))[:-1]
+    rows = np.flatnonzero(complete[1:] & (before >= 0)) + 1
+    before = before[rows - 1]
+    driven = moving[rows] & (before == rows - 1)
+    if driven.sum() <= SMOOTH_ROWS:
+        return rows[:0], np.empty(0), driven[:0]
+    ratio, acceleration = moved[before] / steps[before], np.gradient(steps) / np.median(dt)
+    change = acceleration[rows] - acceleration[before] * steps[rows] / steps[before]
+    deviation = _without_delay(moved[rows] - ratio * steps[rows], ratio * change)
+    return rows, deviation, driven
+
+
 def _without_delay(deviation: Complexes, by_second: Complexes) -> Floats:
-    """Return sizes of deviations (n,), m, without the part by a delay, m per s of it."""
+    """Return sizes of deviations, (n,) m, without by_second, m/s, times a common delay."""
     size = np.maximum(np.abs(by_second), 1e-9)
     delays = (deviation * by_second.conj()).real / size**2
     order = np.argsort(delays)
     weight = np.cumsum(size[order])
     delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
-    rest: Floats = np.abs(deviation - delay * by_second * (abs(delay) > JUMP_DELAY))
-    return rest
+    remaining: Floats = np.abs(deviation - delay * by_second * (abs(delay) > JUMP_DELAY))
+    return remaining
 
 
 def _smooth_begin(smooth: Bools) -> int:

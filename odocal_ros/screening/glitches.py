@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values that are not measurements: beyond any range, isolated outliers, or at the limit of it."""
+"""Detection of values that are no measurements: impossible, isolated, frozen, or saturated."""
 
 from dataclasses import replace
 from functools import reduce
@@ -29,21 +29,21 @@ from odocal_ros.settings.nominal import G
 
 # judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units are kept
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
-# judgement: least number of impossible rows in a group, each within CLUMP_REACH of the one before
-CLUMP_ROWS = 5
-CLUMP_REACH = 50          # rows: about a page or a packed block of a recording
+# judgement: least number of impossible rows in a group, each within GROUP_GAP of the one before
+GROUP_ROWS = 5
+GROUP_GAP = 50          # rows: about a page or a packed block of a recording
 # judgement: least share, or least number, of impossible rows in a damaged recording: others
 # near them may be false too
 DAMAGED_SHARE, SEVERAL_ROWS = 0.01, 4
-ROWS_BESIDE = 5          # rows without motion on each side of an isolated outlier
+NEIGHBOUR_ROWS = 5          # rows without motion on each side of an isolated outlier
 # judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and in
-# median steps; s, its longest duration; largest share of the step that remains after it
-TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
+# median steps; its longest duration, s; largest share of the step that remains after it
+TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, RETURN_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
 # judgement: of an isolated outlier: least deviation, rad/s (0.003 rad in 0.1 s) and m/s^2, and in
 # deviations of adjacent rows; largest difference of the rows before and after, in deviations
 SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
 GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
-ROLLS = 0.1               # of the top speed: least mean speed of a moving vehicle
+ROLLING_SHARE = 0.1               # of the top speed: least mean speed of a moving vehicle
 # physical: smaller than any range, larger than gravity at rest
 LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
 # statistical: coarse steps also repeat the largest value, but less often than the next smaller one
@@ -59,7 +59,7 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
     largest_value = 1e300    # of unbounded columns: sums and products with it stay finite
     most = BEYOND_SENSOR.get(name, largest_value)
 
-    def odd(x: NDArray[Any]) -> Bools:
+    def not_usable(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
         # smaller values, except 0, are damaged: judgement. Two rotations by right angles leave
         # 1e-68 of a value in axes of exact zeros
@@ -67,39 +67,39 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
         usable = (size <= most) & ((size >= least_value) | (size == 0))
         return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
-        return by_row(odd, column)
+        return by_row(not_usable, column)
 
 
 def without_invalid_orientations(samples: Oriented) -> Oriented:
-    """Return IMU or heading rows without invalid orientations; their variance is NaN."""
-    def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
-        length = lengths(np.where(wild[:, None], 0.0, q_ni))
+    """Return IMU or heading rows; an invalid orientation becomes 0, its yaw variance NaN."""
+    def is_invalid(impossible: Bools, q_ni: Floats, variance: Floats) -> Bools:
+        length = lengths(np.where(impossible[:, None], 0.0, q_ni))
         unit_length = 2.0    # largest ratio of a quaternion's length to one, and of one to it
         widest_variance = 1e12    # rad^2, drivers use smaller values for unknown
         return ((length < 1 / unit_length) | (length > unit_length)
                 | (np.abs(variance) > widest_variance))
 
-    wild = is_impossible('q_ni', samples.q_ni)
-    none = by_row(no_attitude, wild, samples.q_ni, samples.yaw_variance)
-    if not (wild | none & ~np.isnan(samples.yaw_variance)).any():
+    impossible = is_impossible('q_ni', samples.q_ni)
+    invalid = by_row(is_invalid, impossible, samples.q_ni, samples.yaw_variance)
+    if not (impossible | invalid & ~np.isnan(samples.yaw_variance)).any():
         return samples
-    return replace(samples, q_ni=np.where(none[:, None], 0.0, samples.q_ni),
-                   yaw_variance=np.where(none, np.nan, samples.yaw_variance))
+    return replace(samples, q_ni=np.where(invalid[:, None], 0.0, samples.q_ni),
+                   yaw_variance=np.where(invalid, np.nan, samples.yaw_variance))
 
 
-def near_impossible_groups(wild: Bools) -> Bools:
+def near_impossible_groups(impossible: Bools) -> Bools:
     """
     Return a mask of rows in or near a group of impossible rows: (n,) bool.
 
     In a damaged recording only some false rows are impossible values. The mask contains each
     group, and on each side twice as many rows as the largest distance of its impossible rows.
     """
-    suspect = np.zeros(len(wild), bool)
-    at = np.flatnonzero(wild)
-    for group in np.split(at, np.flatnonzero(np.diff(at) > CLUMP_REACH) + 1):
-        if len(group) >= CLUMP_ROWS:
-            wide = 2 * int(np.diff(group).max())
-            suspect[max(group[0] - wide, 0):group[-1] + wide + 1] = True
+    suspect = np.zeros(len(impossible), bool)
+    rows = np.flatnonzero(impossible)
+    for group in np.split(rows, np.flatnonzero(np.diff(rows) > GROUP_GAP) + 1):
+        if len(group) >= GROUP_ROWS:
+            margin = 2 * int(np.diff(group).max())
+            suspect[max(group[0] - margin, 0):group[-1] + margin + 1] = True
     return suspect
 
 
@@ -111,22 +111,21 @@ def find_spikes(t: Floats, x: Floats, least: float) -> Bools:
     All False if so many rows jump that it is normal for the sensor.
     """
     found = np.zeros(len(x), bool)
-    bound = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
-    far = np.flatnonzero(bound > least)
-    if not len(far):
+    steps = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
+    large = np.flatnonzero(steps > least)
+    if not len(large):
         return found
-    size = bound[far]
-    clear = size > USUAL_STEPS * median(bound)
-    done = -1
-    most_bounds = 2000    # jumps that are tested
-    for i, bound in zip(far[clear][:most_bounds], size[clear], strict=False):
-        if i < done:
+    jumps = large[steps[large] > USUAL_STEPS * median(steps)]
+    end = -1
+    most_jumps = 2000    # jumps that are tested
+    for i in jumps[:most_jumps]:
+        if i < end:
             continue
-        within = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
-        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= BACK_SHARE * bound
-        if home.any():
-            done = i + 2 + int(np.argmax(home))
-            found[i + 1:done] = True
+        stop = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
+        returned = np.abs(x[i + 2:stop] - x[i]).max(axis=1) <= RETURN_SHARE * steps[i]
+        if returned.any():
+            end = i + 2 + int(np.argmax(returned))
+            found[i + 1:end] = True
     return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
@@ -137,26 +136,26 @@ def isolated_outliers(x: Floats, least: float) -> Bools:
     x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all False if
     there are so many that it is normal for the sensor.
     """
-    edge = ROWS_BESIDE + 1
+    edge = NEIGHBOUR_ROWS + 1
 
-    def off(x: Floats) -> Bools:
+    def is_outlier(x: Floats) -> Bools:
         m = len(x) - 2 * edge
-        far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
-        if not (far > least).any():
+        deviations = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
+        if not (deviations > least).any():
             return np.zeros(m, bool)
-        # a false row changes the deviations of adjacent rows too
-        beside = reduce(np.maximum, (far[ROWS_BESIDE + k:][:m]
+        # rows next to an outlier deviate too: the largest deviation of the others
+        nearby = reduce(np.maximum, (deviations[NEIGHBOUR_ROWS + k:][:m]
                                      for d in range(2, edge) for k in (-d, d)))
-        at = far[ROWS_BESIDE:][:m]
-        difference = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
-        is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
-                         & (difference < EQUAL_NEIGHBOURS * at))
-        return reduce_columns(np.logical_or, is_off)
+        deviation = deviations[NEIGHBOUR_ROWS:][:m]
+        difference = np.abs(x[edge + 1:][:m] - x[NEIGHBOUR_ROWS:][:m])
+        of_column: Bools = ((deviation > np.maximum(least, SINGLE_TIMES * nearby))
+                            & (difference < EQUAL_NEIGHBOURS * deviation))
+        return reduce_columns(np.logical_or, of_column)
 
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
-        found[edge:-edge] = by_step(off, x, steps=2 * edge)
-    found &= found.sum() <= max(GLITCH_SHARE * len(x), CLUMP_ROWS)
+        found[edge:-edge] = by_step(is_outlier, x, steps=2 * edge)
+    found &= found.sum() <= max(GLITCH_SHARE * len(x), GROUP_ROWS)
     return found
 
 
@@ -181,7 +180,7 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     """
     Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
 
-    t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, longest allowed gap.
+    t, w : (n,) s, (n, 3) rad/s.   travel : of the odometer.   limit : s, longest allowed gap.
     Accepted are a gyro that measures zero (some drivers have a dead band) and one that often
     repeats its value (coarse steps).
     """
@@ -189,16 +188,17 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
         return ()
     same = by_step(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
                    & reduce_columns(np.logical_or, w[1:] != 0), w)
-    where = runs(same)
-    begin, end = t[where].T
+    repeats = runs(same)
+    begin, end = t[repeats].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
-    held = np.flatnonzero((end - begin > limit) & (rolled > ROLLS * np.percentile(speed, 95)))
-    elsewhere = len(same) - np.diff(where[held]).sum()
-    coarse_share = 0.2      # judgement: of the rows elsewhere; fine gyros have no repeats
-    if not len(held) or same.sum() - np.diff(where[held]).sum() > coarse_share * elsewhere:
+    frozen = np.flatnonzero((end - begin > limit)
+                            & (rolled > ROLLING_SHARE * np.percentile(speed, 95)))
+    frozen_rows = np.diff(repeats[frozen]).sum()
+    coarse_share = 0.2      # judgement: of the other rows; fine gyros have no repeats
+    if not len(frozen) or same.sum() - frozen_rows > coarse_share * (len(same) - frozen_rows):
         return ()
-    worst = held[np.argmax((end - begin)[held])]
+    worst = frozen[np.argmax((end - begin)[frozen])]
     return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
                    f'{end[worst] - begin[worst]:.2f} s at t = {begin[worst]:.2f} s while the '
                    'wheels turn: its output is frozen'),)
@@ -212,15 +212,16 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
         for axis, x in zip('xyz', columns(x_i), strict=True):
-            for peak, inside, none in ((np.max, np.less, -np.inf), (np.min, np.greater, np.inf)):
-                limit = peak(x, initial=0.0)
-                at = x == limit
-                count, size = int(np.count_nonzero(at)), abs(limit * scale)
+            for extreme, inside, none in ((np.max, np.less, -np.inf),
+                                          (np.min, np.greater, np.inf)):
+                limit = extreme(x, initial=0.0)
+                at_limit = x == limit
+                count, size = int(np.count_nonzero(at_limit)), abs(limit * scale)
                 if size < least or count < FEWEST_AT_LIMIT:
                     continue
-                following = peak(x, where=inside(x, limit), initial=none)
+                following = extreme(x, where=inside(x, limit), initial=none)
                 if count > TIMES_NEXT * np.count_nonzero(x == following):
-                    found.append((count, float(t_imu[at.argmax()]),
+                    found.append((count, float(t_imu[at_limit.argmax()]),
                                   f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
     if not found:
         return ()

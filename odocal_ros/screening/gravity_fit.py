@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Fit of the direction of gravity to the gyro, one coefficient for each axis of the gyro.
+Detection of mirrored or swapped gyro axes by gravity: a coefficient for each axis of the gyro.
 
 Hills, bumps and braking tilt a vehicle: gravity turns in the frame of the accelerometer, and the
-gyro must measure this turn. In level axes stabilised by the yaw psi of the gyro, the specific
-force, as a complex number e1 + i e2, is
+gyro must measure this turn. With level axes e1, e2, yaw psi by the gyro, turn rates w1, w2, w3
+about e1, e2 and up, speed v and gravity g, the specific force, as a complex number e1 + i e2, is
 
     F = F0 + i g int (w1 + i w2) exp(i psi) dt + d/dt (v exp(i psi)).
 
 Each gyro axis has a coefficient of its own, so the second term is
 ``i g int (c1 w1 + c2 w2 + c3 w3) exp(i psi) dt`` with c = (1, i, 0) for a correct gyro. A mirrored
-axis has the opposite coefficient, swapped axes have swapped coefficients.
+axis has the opposite coefficient, swapped axes have swapped coefficients. The drive is cut into
+segments, each with its own constant F0 and gyro bias.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,8 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import G
 
 ROW_S, ROWS_A_SECOND = 0.25, 4       # s, judgement: the yaw between rows stays small
-# tuned by benchmarks/zoo.py, 90 drives of 150 to 600 s: shorter or longer segments detect less
+# number of segments, and limits of their length, s. Tuned by benchmarks/zoo.py, 90 drives of 150
+# to 600 s: shorter or longer segments detect less
 SEGMENTS, SHORTEST_S, LONGEST_S = 12, 10, 30
 MOVING_SPEED = 0.5      # m/s, judgement: mean of a segment in which a vehicle drives
 WEIGHTING_PASSES = 4    # judgement: the weights of segments have converged
@@ -80,10 +82,13 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
 
 def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, Complexes]:
     """
-    Return observables, (k, m, p), and forces, (k, m), of k segments of m seconds.
+    Return regressors, (k, m, 9), and forces, (k, m), m/s^2, of k segments of m seconds.
 
-    w, f : (n, 3) in rows of ROW_S, in e1, e2, up.   s : (n + 1,) m, at their edges.   full : (n,)
-    True if the IMU has samples there.
+    Regressors are the tilts by the three gyro axes, then accelerations. Constant and gyro bias of
+    each segment are removed from both.
+
+    w, f : (n, 3) rad/s, m/s^2, in rows of ROW_S, along e1, e2, up.   s : (n + 1,) m, travel at
+    their edges.   full : (n,) True if the IMU has samples there.
     """
     half = ROWS_A_SECOND // 2
     speed = np.zeros(len(s))
@@ -96,31 +101,36 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
         k = len(x) // length
         return x[:k * length].reshape(k, length, *x.shape[1:])
     psi = running_sum(w[:, 2]) * ROW_S
-    turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
-    tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in w.T]
-    drift = _seconds(_integral(turned))         # of a bias of the gyro
-    force = _seconds((f[:, 0] + 1j * f[:, 1]) * turned)
-    course = np.exp(1j * psi[::ROWS_A_SECOND])
-    onward = np.diff(speed) * (course[1:] + course[:-1]) / 2
-    inward = np.diff(course) * (speed[1:] + speed[:-1]) / 2
-    turn_rate, heading = _seconds(w[:, 2]), _seconds(turned)
+    rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
+    tilts = [_means_of_seconds(_integral(1j * G * rate * rotation)) for rate in w.T]
+    bias_tilt = _means_of_seconds(_integral(rotation))
+    force = _means_of_seconds((f[:, 0] + 1j * f[:, 1]) * rotation)
+    direction = np.exp(1j * psi[::ROWS_A_SECOND])
+    onward = np.diff(speed) * (direction[1:] + direction[:-1]) / 2
+    inward = np.diff(direction) * (speed[1:] + speed[:-1]) / 2
+    turn_rate, heading = _means_of_seconds(w[:, 2]), _means_of_seconds(rotation)
     # the derivatives model delays, the last two a lever arm of the IMU
-    pushes = [onward, inward, np.gradient(onward), np.gradient(inward),
-              np.gradient(turn_rate) * heading, turn_rate**2 * heading]
-    observables = cut(np.stack([*tilts, *pushes], -1))
-    constant = np.stack([np.ones_like(drift), drift], -1)
-    basis, _ = np.linalg.qr(cut(constant) - [0.0, 1.0] * cut(constant).mean(1, keepdims=True))
-    use = cut(_seconds(full) == 1).all(axis=1) & (
+    accelerations = [onward, inward, np.gradient(onward), np.gradient(inward),
+                     np.gradient(turn_rate) * heading, turn_rate**2 * heading]
+    regressors = cut(np.stack([*tilts, *accelerations], -1))
+    offsets = cut(np.stack([np.ones_like(bias_tilt), bias_tilt], -1))
+    basis, _ = np.linalg.qr(offsets - [0.0, 1.0] * offsets.mean(1, keepdims=True))
+    use = cut(_means_of_seconds(full) == 1).all(axis=1) & (
         np.abs(cut((speed[1:] + speed[:-1]) / 2)).mean(axis=1) > MOVING_SPEED)
 
-    def without_offsets(x: Complexes) -> NDArray[Any]:
-        rest: NDArray[Any] = (x - basis @ (basis.conj().swapaxes(1, 2) @ x))[use]
-        return rest
-    return without_offsets(observables), without_offsets(cut(force)[..., None])[..., 0]
+    def without_offsets(x: Complexes) -> Complexes:
+        residual: Complexes = (x - basis @ (basis.conj().swapaxes(1, 2) @ x))[use]
+        return residual
+    return without_offsets(regressors), without_offsets(cut(force)[..., None])[..., 0]
 
 
 def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
-    """Return the least-squares coefficients; segments are weighted by their residuals."""
+    """
+    Return the least-squares coefficients of the gyro axes; None with too few segments.
+
+    X, force : (k, m, p), (k, m) regressors, gyro axes first, and forces. A segment has the inverse
+    of its residual variance as weight; sigmas are by the sandwich formula, robust to this.
+    """
     n, _, p = X.shape
     if n <= p:
         return None
@@ -130,15 +140,15 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
     scale[scale == 0] = 1.0             # an acceleration that is always zero
     normal, right = normal / (scale[:, None] * scale), right / scale
     weight = np.ones(n)
-    tiny = 1e-9 * np.eye(p)    # of the unit diagonal, rounding: keeps undetermined ones invertible
+    rounding = 1e-9 * np.eye(p)    # of the unit diagonal: the matrix stays invertible
     for _ in range(WEIGHTING_PASSES):
         used = weight / weight.mean()
-        inverse = np.linalg.inv(np.einsum('k,kij->ij', used, normal) + tiny)
+        inverse = np.linalg.inv(np.einsum('k,kij->ij', used, normal) + rounding)
         found = inverse @ (used @ right)
-        rest = force - X @ (found / scale)
-        variance = (np.abs(rest)**2).mean(axis=1)
+        residual = force - X @ (found / scale)
+        variance = (np.abs(residual)**2).mean(axis=1)
         weight = 1 / np.maximum(variance + np.median(variance), 1e-12)
-    score = used[:, None] * (adjoint @ rest[..., None])[..., 0] / scale
+    score = used[:, None] * (adjoint @ residual[..., None])[..., 0] / scale
     influence = np.abs(score @ inverse.T)[:, :3] / scale[:3]
     sigma = np.sqrt((influence**2).sum(axis=0) * n / (n - p))
     share = np.einsum('ij,kjl,li->ki', inverse, used[:, None, None] * normal, inverse).real[:, :3]
@@ -151,6 +161,6 @@ def _integral(rate: Complexes) -> Complexes:
     return (np.cumsum(rate) - rate / 2) * ROW_S
 
 
-def _seconds(x: NDArray[Any]) -> Complexes:
+def _means_of_seconds(x: NDArray[Any]) -> Complexes:
     mean: Complexes = x.reshape(-1, ROWS_A_SECOND).mean(axis=1)
     return mean

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An IMU that changes during the leg: gravity or forward turns, or its unit or range changes."""
+"""
+Detection of an IMU topic that is not one IMU, fixed in the vehicle, with one unit.
+
+During a leg gravity or the forward direction turns in its frame, the unit changes, or the messages
+of two IMUs alternate.
+"""
 
 from collections import Counter
 
@@ -16,36 +21,38 @@ from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.nominal import G
 
-# judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter on one side
-LEAST_TURN, SIDE = 45.0, 20.0
-SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; 1.4 in a bend at 45 deg
+# judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter before or
+# after the turn
+LEAST_IMU_TURN, GRAVITY_SCATTER = 45.0, 20.0
+# judgement: largest ratio of gravity after a turn and before; 1.4 in a bend at 45 deg
+GRAVITY_RATIO = 1.15
 # judgement, deg: a larger turn is by reversing with an unsigned counter (180 deg)
-MOST_YAW = 135.0
-YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
-DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
-TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+LARGEST_YAW_TURN = 135.0
+YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_IMU_TURN
+REMEDY = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
+TENTHS, LEAST_TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
 # judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
 # at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
 LEAST_RATIO, MOST_RATIO = 0.6, 1.6
 MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
-# judgement, of rows that may alternate: rows of a mean; least number of means, and largest, at the
-# end of the leg; ratio of an outlier to the median; share of rows that repeat
-MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLYING, REPEATED = 50, 40, 2000, 10.0, 0.2
+# judgement, for the test of alternating rows: rows of a block; least and largest number of blocks,
+# from the end of the leg; ratio of an outlier to the median; largest share of repeated rows
+MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
 # statistical: F of a constant and the signals in the differences of odd and even rows. For one IMU
 # it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
-SURE_F = 30.0
+LEAST_F = 30.0
 # judgement: least explained variance, in variances of a mean of white noise; 8/3 is that of a mean
 # over that of a row. Smooth signals without noise are below it
 LEAST_POWER = 0.1 * 8 / 3
-# judgement: a vibration near half the rate changes its size and phase. Correlation of adjacent
-# residuals, and the slow part of them over the explained part; two IMUs are below one of them
-MOST_CORRELATED, MOST_SLOW = 0.5, 0.05
+# judgement: a vibration near half the rate changes its size and phase. Largest correlation of
+# adjacent residuals, and largest size of it over the explained part; two IMUs exceed at most one
+CORRELATION_LIMIT, SLOW_SHARE_LIMIT = 0.5, 0.05
 
 
 def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
     """Return the edges of the tenths of the rows, (11,), their median force, (10, 3), or none."""
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
-    if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
+    if not inputs.has_accelerometer or edges[1] < LEAST_TENTH_ROWS:
         return edges[:0], np.empty((0, 3))
     return edges, np.array([medians(inputs.f_b[a:b])
                             for a, b in zip(edges[:-1], edges[1:], strict=True)])
@@ -73,12 +80,12 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
         before, after = (side.mean(axis=0) for side in sides)
         # a bend, or another unit, also changes the size
         size = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
-        if (_angle_between(before, after) > LEAST_TURN and 1 / SAME_SIZE < size < SAME_SIZE
-                and all(_angle_between(one, mean) < SIDE for side, mean in zip(
+        turn_deg = _angle_between(before, after)
+        if (turn_deg > LEAST_IMU_TURN and 1 / GRAVITY_RATIO < size < GRAVITY_RATIO
+                and all(_angle_between(one, mean) < GRAVITY_SCATTER for side, mean in zip(
                     sides, (before, after), strict=True) for one in side)):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
-            turn_deg = _angle_between(before, after)
-            return (_moved_reason(f'gravity turns by {turn_deg:.0f} deg', float(begin),
+            return (_imu_moved_reason(f'gravity turns by {turn_deg:.0f} deg', float(begin),
                                   float(end)),)
     return ()
 
@@ -95,18 +102,18 @@ def forward_turn_reasons(found: Accelerations | None) -> tuple[Reason, ...]:
             continue
         turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
         sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
-        if LEAST_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < MOST_YAW:
+        if LEAST_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
             seen.append((sigma, -turn_deg, float(found.t[a]), float(found.t[b])))
     if not seen:
         return ()
     sigma, turn_deg, begin, end = min(seen)
-    return (_moved_reason(f'the forward direction turns by {turn_deg:+z.0f} '
+    return (_imu_moved_reason(f'the forward direction turns by {turn_deg:+z.0f} '
                           f'± {max(sigma, 1.0):.0f} deg', begin, end),)
 
 
-def _moved_reason(what: str, begin: float, end: float) -> Reason:
+def _imu_moved_reason(what: str, begin: float, end: float) -> Reason:
     return Reason(Code.IMU_AXES, f'{what} in the IMU frame at about t = {begin:.0f} to '
-                  f'{end:.0f} s: the IMU was moved in the vehicle', DO)
+                  f'{end:.0f} s: the IMU was moved in the vehicle', REMEDY)
 
 
 def _angle_between(one: Floats, other: Floats) -> float:
@@ -138,7 +145,7 @@ def other_frame_reasons(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
 
 def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
     """Return SEVERAL_IMUS if every second row is from another IMU; (n, 3) in any unit."""
-    share = max(_share_of_two(w_i), _share_of_two(f_i))
+    share = max(_share_of_second_imu(w_i), _share_of_second_imu(f_i))
     if not share:
         return ()
     return (Reason(Code.SEVERAL_IMUS, 'the IMU topic carries two IMUs: every second message has '
@@ -147,34 +154,39 @@ def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
                    'Stop the second publisher, or publish each IMU on its own topic.'),)
 
 
-def _share_of_two(x: Floats) -> float:
-    """Return the share of odd minus even rows that a second IMU explains, 0: none; x (n, 3)."""
+def _share_of_second_imu(x: Floats) -> float:
+    """
+    Return the share of odd minus even rows, x (n, 3), that a second IMU explains; 0: none.
+
+    In the means of blocks, a constant (other bias) and factors of the signals (other axes) are
+    fitted to the differences; the F test decides.
+    """
     x = x[-MOST_MEANS * MEAN_ROWS - 2:]
     count = (len(x) - 2) // MEAN_ROWS
-    if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED:
+    if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED_SHARE:
         return 0.0
-    rows = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
+    odd_minus_even = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
         * (x[1:-1] - (x[:-2] + x[2:]) / 2)
-    parts = rows[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
-    off = parts.mean(axis=1)
-    size = np.abs(off).max(axis=1)
-    good = size <= OUTLYING * np.median(size)
-    mean = x[1:count * MEAN_ROWS + 1].reshape(parts.shape).mean(axis=1)[good]
-    # a section that tilts and vibrates more would explain its own noise: equal noise of all means
-    parts, A = parts[good], np.column_stack([np.ones(len(mean)), mean])
-    noise = np.sqrt((parts**2).mean(axis=(1, 2)))
+    blocks = odd_minus_even[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
+    difference = blocks.mean(axis=1)
+    size = np.abs(difference).max(axis=1)
+    good = size <= OUTLIER_RATIO * np.median(size)
+    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[good]
+    # blocks of equal noise: one that tilts and vibrates more would dominate the fit
+    blocks, A = blocks[good], np.column_stack([np.ones(len(mean)), mean])
+    noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
     noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
-    off, A, parts = off[good] / noise, A / noise, parts / noise[:, None]
-    free = len(off) - A.shape[1]
-    if free < FEWEST_MEANS // 2:
+    difference, A, blocks = difference[good] / noise, A / noise, blocks / noise[:, None]
+    freedom = len(difference) - A.shape[1]
+    if freedom < FEWEST_MEANS // 2:
         return 0.0
-    rest = off - A @ np.linalg.lstsq(A, off, rcond=None)[0]
-    left, total = (rest**2).sum(axis=0), (off**2).sum(axis=0)
-    slow = (rest[1:] * rest[:-1]).sum(axis=0)
-    explained, power = total - left, (parts**2).mean(axis=(0, 1))
-    sure = (explained * free > SURE_F * A.shape[1] * left) & (
-        explained / len(off) > LEAST_POWER * power / MEAN_ROWS)
-    vibrating = slow > np.maximum(MOST_CORRELATED * left, MOST_SLOW * explained)
+    residual = difference - A @ np.linalg.lstsq(A, difference, rcond=None)[0]
+    unexplained, total = (residual**2).sum(axis=0), (difference**2).sum(axis=0)
+    lagged = (residual[1:] * residual[:-1]).sum(axis=0)
+    explained, power = total - unexplained, (blocks**2).mean(axis=(0, 1))
+    significant = (explained * freedom > LEAST_F * A.shape[1] * unexplained) & (
+        explained / len(difference) > LEAST_POWER * power / MEAN_ROWS)
+    vibrating = lagged > np.maximum(CORRELATION_LIMIT * unexplained, SLOW_SHARE_LIMIT * explained)
     if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:
         return 0.0
-    return float((explained[sure] / total[sure]).max(initial=0.0))
+    return float((explained[significant] / total[significant]).max(initial=0.0))

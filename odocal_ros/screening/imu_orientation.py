@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Orientation and units of an IMU in the vehicle.
+Orientation of an IMU in the vehicle by its accelerations, and checks of its units and axes.
 
 The body frame must be forward-left-up within some degrees. If it is rotated by 90 or 180 deg, the
 odometer disagrees with the IMU at each start, as if wheels spun. Forward is the direction of the
@@ -24,7 +24,7 @@ from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import G
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
-FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain has an error of 1/6
+ORIENTATION_BINS = 20              # judgement: fewest bins; the sigma then has an error of 1/6
 DIRECTIONS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 AXES = 'xyz'
 # no result from such an IMU; further reasons would repeat the cause
@@ -50,9 +50,9 @@ class Accelerations:
 
     def changes(self) -> 'Accelerations':
         """Return the changes from bin to adjacent bin: slopes, which change slowly, cancel."""
-        near = np.diff(self.t) < 1.5 * BIN_S
-        return Accelerations(self.e1, self.e2, self.t[1:][near], np.diff(self.force)[near],
-                             np.diff(self.onward)[near], np.diff(self.inward)[near])
+        adjacent = np.diff(self.t) < 1.5 * BIN_S
+        return Accelerations(self.e1, self.e2, self.t[1:][adjacent], np.diff(self.force)[adjacent],
+                             np.diff(self.onward)[adjacent], np.diff(self.inward)[adjacent])
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class ImuOrientation:
 
     yaw: float
     sigma: float
-    # gain of the centripetal acceleration (force over that by gyro and odometer) relative to that
-    # of the forward one: 1; -1 if gyro or accelerometer has a mirrored axis, nan if unknown
+    # ratio of the force to the centripetal acceleration by gyro and odometer, relative to this
+    # ratio of the forward acceleration: 1; -1 if gyro or accelerometer has a mirrored axis
     inward: float = np.nan
     inward_sigma: float = np.nan
 
@@ -77,7 +77,7 @@ def bin_accelerations(t: Floats, w: Floats, f: Floats, up: Floats, travel: Trave
     forward.   metres_per_unit : its approximate scale.
     """
     t0, t1 = max(t[0], travel.t[0]) + BIN_S, min(t[-1], travel.t[-1]) - BIN_S
-    if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
+    if t1 - t0 < ORIENTATION_BINS * BIN_S:
         return None
     edges = np.arange(t0, t1, BIN_S)
     count, (f, w) = bin_means(t, edges, f, w)
@@ -113,22 +113,23 @@ def orientation_of(found: Accelerations) -> ImuOrientation | None:
     """
     Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
 
-    The centripetal acceleration has its own factor, so that the sign of the gyro has no effect.
+    force = (gain[0] onward + gain[1] i inward), complex; the argument of gain[0] is the forward
+    direction. With its own gain, the sign of the gyro has no effect.
     """
     force = found.force
     A = np.stack([found.onward, 1j * found.inward], -1)
     normal = A.conj().T @ A
-    if len(A) < FEWEST_BINS_FACING or np.linalg.cond(normal) > 1e9:
+    if len(A) < ORIENTATION_BINS or np.linalg.cond(normal) > 1e9:
         return None
     inverse = np.linalg.inv(normal)
     gain = inverse @ (A.conj().T @ force)
-    rest = force - A @ gain
+    residual = force - A @ gain
     # half of the residual is across, and every other change is independent (they share bins)
-    variances = np.vdot(rest, rest).real / len(A) * np.diag(inverse).real
+    variances = np.vdot(residual, residual).real / len(A) * np.diag(inverse).real
     sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
-    facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
-    push_gain = 0.5, 2.0    # of the acceleration over that of the wheels: limits of a valid fit
-    if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
+    largest_sigma = np.deg2rad(10.0)    # of the direction
+    least_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1
+    if sigma > largest_sigma or not least_gain < abs(gain[0]) < largest_gain:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
     return ImuOrientation(float(-np.arctan2(forward[1], forward[0])), float(sigma),
@@ -136,10 +137,11 @@ def orientation_of(found: Accelerations) -> ImuOrientation | None:
 
 
 def corrected_forward_axis(found: ImuOrientation | None, f: Floats) -> Floats:
-    """Return scale times forward axis, (3,), turned to the IMU orientation if that is far off."""
+    """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
     yaw, pitch = mounting_from_forward(f)
-    near_facing = np.deg2rad(10.0)    # from the forward axis of a method: no effect on slips
-    if found is None or abs(float(wrap(found.yaw - yaw))) < max(near_facing, 3 * found.sigma):
+    least_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
+    if found is None or abs(float(wrap(found.yaw - yaw))) < max(least_difference,
+                                                                3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
@@ -149,38 +151,37 @@ def orientation_reasons(found: ImuOrientation | None, nominal_yaw: float) -> tup
     if found is None:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
-    off = abs(float(wrap(found.yaw - nominal)))
+    difference = abs(float(wrap(found.yaw - nominal)))
     direction = DIRECTIONS[round(found.yaw / (np.pi / 2)) % 4]
-    seen = f'{np.rad2deg(found.yaw):+z.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
+    yaw_text = f'{np.rad2deg(found.yaw):+z.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
-        seen += f', nominal {np.rad2deg(nominal):+z.0f}'
-    reversed_orientation = np.deg2rad(150.0)    # a reversed odometer looks the same
-    if off > reversed_orientation:
-        return (Reason(Code.ODOMETER_REVERSED, f'accelerations point {direction} in the IMU frame '
-                       f'(yaw mounting {seen}): positive counts mean backwards, the IMU x axis '
-                       'points backwards, or the whole leg was driven in reverse with an unsigned '
-                       'counter'),)
-    far_facing = np.deg2rad(75.0)    # off the nominal: beyond any intended mounting
-    if off < far_facing + 3 * found.sigma:
+        yaw_text += f', nominal {np.rad2deg(nominal):+z.0f}'
+    observed = f'accelerations point {direction} in the IMU frame (yaw mounting {yaw_text})'
+    reversed_limit = np.deg2rad(150.0)    # a reversed odometer looks the same
+    if difference > reversed_limit:
+        return (Reason(Code.ODOMETER_REVERSED, f'{observed}: positive counts mean backwards, the '
+                       'IMU x axis points backwards, or the whole leg was driven in reverse with '
+                       'an unsigned counter'),)
+    axes_limit = np.deg2rad(75.0)    # beyond any intended mounting
+    if difference < axes_limit + 3 * found.sigma:
         return ()
-    return (Reason(Code.IMU_AXES, f'accelerations point {direction} in the IMU frame '
-                   f'(yaw mounting {seen}): the body frame is not forward-left-up'),)
+    return (Reason(Code.IMU_AXES, f'{observed}: the body frame is not forward-left-up'),)
 
 
-def unit_and_axis_reasons(mean: Floats, w_b: Floats, C_bi: Floats,
+def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
                           imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
     """
     Return reasons about units and axes of an IMU, and True if it must be turned over (z down).
 
-    mean : (3,) median specific force, m/s^2, in the configured body frame.   w_b : (n, 3) turn
-    rate in it, rad/s.   C_bi : (3, 3) configured nominal rotation.   imu : settings, whose scales
-    are already applied. With a reason of UNUSABLE no result is possible.
+    median_f_b : (3,) median specific force, m/s^2, in the configured body frame.   w_b : (n, 3)
+    turn rate in it, rad/s.   C_bi : (3, 3) configured nominal rotation.   imu : settings, whose
+    scales are already applied. With a reason of UNUSABLE no result is possible.
     """
-    rest, size = medians(w_b), float(np.linalg.norm(mean))
-    fast = float(np.percentile(by_row(lambda w: lengths(w - rest), w_b), 99.9,
-                               overwrite_input=True))
+    bias, size = medians(w_b), float(np.linalg.norm(median_f_b))
+    top_rate = float(np.percentile(by_row(lambda w: lengths(w - bias), w_b), 99.9,
+                                   overwrite_input=True))
     reasons = []
-    if not any(w_b[some].any() for some in chunks(len(w_b))):   # as of messages without any
+    if not any(w_b[some].any() for some in chunks(len(w_b))):
         reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
                               'imu.gyro_scale is 0'))
     no_gravity = 0.01    # m/s^2, far below gravity in any unit
@@ -190,19 +191,20 @@ def unit_and_axis_reasons(mean: Floats, w_b: Floats, C_bi: Floats,
         return tuple(reasons), False
     if not 0.85 * G < size < 1.15 * G:
         if 0.85 < size < 1.15:
-            what = f'gravity is {size:.3f} instead of 9.8 m/s^2: the unit is probably g'
-            do = (f'Set imu.accel_scale to {9.80665 * imu.accel_scale:.10g}, or publish m/s^2 '
-                  '(REP-145).')
+            text = f'gravity is {size:.3f} instead of 9.8 m/s^2: the unit is probably g'
+            remedy = (f'Set imu.accel_scale to {9.80665 * imu.accel_scale:.10g}, or publish m/s^2 '
+                      '(REP-145).')
         else:
-            what, do = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2', ''
-        reasons.append(Reason(Code.IMU_UNITS, what, do))
-    if fast > MAX_RATE:
+            text = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2'
+            remedy = ''
+        reasons.append(Reason(Code.IMU_UNITS, text, remedy))
+    if top_rate > MAX_RATE:
         reasons.append(Reason(
-            Code.IMU_UNITS, f'the gyro measures {fast:.3g} rad/s; the limit for a vehicle is '
+            Code.IMU_UNITS, f'the gyro measures {top_rate:.3g} rad/s; the limit for a vehicle is '
             f'{MAX_RATE:g} rad/s: the unit is probably deg/s',
             f'Set imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
             '(REP-145).'))
-    up = mean / size
+    up = median_f_b / size
     upright = int(np.argmax(np.abs(up @ C_bi)))
     if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()
                                for some in chunks(len(w_b))):
@@ -213,9 +215,9 @@ def unit_and_axis_reasons(mean: Floats, w_b: Floats, C_bi: Floats,
     if up[2] > np.cos(most_tilt):
         return tuple(reasons), False
     axis = int(np.argmax(np.abs(up)))
-    seen = f'gravity is on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
+    text = f'gravity is on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
     if up[2] < -np.cos(most_tilt) and np.allclose(C_bi, np.eye(3)):
-        reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{seen}: forward-right-down is assumed'))
+        reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{text}: forward-right-down is assumed'))
         return tuple(reasons), True
-    reasons.append(Reason(Code.IMU_AXES, f'{seen}: the body frame is not forward-left-up'))
+    reasons.append(Reason(Code.IMU_AXES, f'{text}: the body frame is not forward-left-up'))
     return tuple(reasons), False

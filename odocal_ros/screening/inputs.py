@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, medians
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
-from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north
+from odocal_ros.nav.geodesy import ecef_from_geodetic, GNSS_MOVES, LOCAL_MOVES, rate_without_north
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.fix_screen import median_origin
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
@@ -112,3 +111,18 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
                         inputs.least_motion) or nominal
     return LocatedFixes(origin, fixes_n, sigma, nominal, rough)
+
+
+def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
+    """
+    Return the origin of n: the median fix of those near the start, so it is not an outlier.
+
+    t_fix : (k,) s since the start mark.   geodetic : (k, 3) latitude, longitude, rad, height, m.
+    """
+    fixes_at_start = 11    # judgement: nearest to the start mark
+    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:fixes_at_start])
+    r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
+    central = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
+    latitude, longitude, height = geodetic[central].tolist()
+    heights = geodetic[~np.isnan(geodetic[:, 2]), 2] if np.isnan(height) else [height]
+    return Origin(latitude, longitude, float(np.median(heights)) if len(heights) else 0.0)

@@ -77,10 +77,12 @@ def with_assumed_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...
 
 
 def settings_by_frame(fix: samples.FixSamples, config: Config) -> Config:
+    """Return the settings for positions in a local frame if the fixes are such, else unchanged."""
     return config.in_local_frame() if is_local(fix) else config
 
 
 def is_local(fix: samples.FixSamples) -> bool:
+    """Return True if the fixes are positions in a local frame."""
     return bool((fix.status == samples.LOCAL).any())
 
 

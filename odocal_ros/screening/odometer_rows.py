@@ -21,14 +21,14 @@ from odocal_ros.nav.time_series import MISSING_INTERVALS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import is_impossible, speed_glitches
 
-STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
+ADJACENT_STEPS = 5    # judgement: steps next to a jump or gap that give the speed there
 # counts, rad, m: smaller travel is not reported
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
                        found: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
-    """Return rows without false or held counts, or with false increments interpolated."""
+    """Return rows and times, s, without false or held counts; false increments interpolated."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
@@ -70,18 +70,18 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     if len(jumps) > most_jumps:
         return false
     done = -1
-    # s, longest interval between a jump and its reverse
-    excursion_time = 30.0
+    longest_excursion = 30.0    # s between a jump and the jump back
     for j in jumps:
         if j <= done:
             continue
         stall = _stall_begin(step, j)
-        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= excursion_time]
-        for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
+        returns = [k for k in jumps if k > j and t[k + 1] - t[j] <= longest_excursion]
+        # candidates, first and last step: frozen before the jump, or the jump and back
+        for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in returns]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
-            reach = 1.2 * top * (t[b + 1] - t[a]) + 3      # of motion between jump and reverse
+            possible = 1.2 * top * (t[b + 1] - t[a]) + 3      # travel in this time
             if _continues(t, net, rate, a, b) or a == j and (
-                    abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach):
+                    abs(net) <= possible and min(abs(step[a]), abs(step[b])) > 2 * possible):
                 false[a + 1:b + 1] = True
                 done = b
                 break
@@ -106,21 +106,26 @@ def held_counts(value: Values, modulus: int) -> Bools:
         return np.zeros(len(value), bool)
     moving = interval_rows < 2 * np.median(interval_rows)
     row = np.arange(len(value))
-    k = np.searchsorted(update, row)
-    interval = np.floor((np.append(update, row[-1])[k] - row) / np.mean(interval_rows[moving]))
-    interval[np.r_[False, moving, False][k]] = 0.0
-    out: Bools = np.append(False, size == 0) & np.append(interval[1:] == interval[:-1], False)
-    return out
+    k = np.searchsorted(update, row)      # the next update
+    # number of mean intervals to the next update: one row of each is kept
+    number = np.floor((np.append(update, row[-1])[k] - row) / np.mean(interval_rows[moving]))
+    number[np.r_[False, moving, False][k]] = 0.0
+    held: Bools = np.append(False, size == 0) & np.append(number[1:] == number[:-1], False)
+    return held
 
 
 def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
-    """Return True if the counter continues from step a to after step b at adjacent speeds."""
-    length = t[b + 1] - t[a]
-    travels = [_median_or_zero(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
-                                                     rate[b + 1:b + 1 + STEPS_BESIDE])]
-    continuation_share = 0.5    # of the expected travel: limit for a counter that continues
-    slack = continuation_share * max(abs(w) for w in travels) + 3
-    return bool(min(travels) - slack <= net <= max(travels) + slack)
+    """Return True if net, the travel from step a to after step b, agrees with adjacent speeds."""
+    duration = t[b + 1] - t[a]
+    expected = [_median_or_zero(x) * duration for x in _adjacent(rate, a, b)]
+    largest_share = 0.5    # judgement: largest difference, of the expected travel
+    tolerance = largest_share * max(abs(travel) for travel in expected) + 3
+    return bool(min(expected) - tolerance <= net <= max(expected) + tolerance)
+
+
+def _adjacent(rate: Floats, a: int, b: int) -> tuple[Floats, Floats]:
+    """Return the rates of the steps next to the steps a to b: before, and after."""
+    return rate[max(0, a - ADJACENT_STEPS):a], rate[b + 1:b + 1 + ADJACENT_STEPS]
 
 
 def with_gap_uncertainty(travel: Travel, value: Values,
@@ -133,51 +138,57 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     usual = np.median(dt)
     rate = step / np.maximum(dt, usual)
     if form.quantity == 'cumulative':
-        sent = counter_steps(value, form.modulus)
-        odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
-        # a reset: only the adjacent speeds bound the travel since the last count
-        stall = [_stall_begin(step, k) for k in odd.tolist()]
-        most = [max(abs(_median_or_zero(rate[max(0, a - STEPS_BESIDE):a])),
-                    abs(_median_or_zero(rate[k + 1:][:STEPS_BESIDE])))
-                * (travel.t[k + 1] - travel.t[a]) for a, k in zip(stall, odd, strict=True)]
-        return travel, travel.t[odd], np.array(most) / np.sqrt(3)
-    odd = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
-    before = np.array([_median_or_zero(rate[max(0, k - STEPS_BESIDE):k]) for k in odd])
-    after = np.array([_median_or_zero(rate[k + 1:k + 1 + STEPS_BESIDE]) for k in odd])
-    missing = dt[odd] - (usual if form.quantity == 'increment' else 0.0)
-    if form.quantity == 'increment' and len(odd):
+        counts = counter_steps(value, form.modulus)
+        resets = np.flatnonzero(
+            np.abs(np.abs(step) - np.abs(counts)) > 1e-6 * np.abs(counts) + 1e-9)
+        # only the adjacent speeds bound the travel since the last count before a reset
+        largest = []
+        for k in resets.tolist():
+            a = _stall_begin(step, k)
+            speed = max(abs(_median_or_zero(x)) for x in _adjacent(rate, a, k))
+            largest.append(speed * (travel.t[k + 1] - travel.t[a]))
+        return travel, travel.t[resets], np.array(largest) / np.sqrt(3)
+    gaps = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
+    before, after = np.array([[_median_or_zero(x) for x in _adjacent(rate, k, k)]
+                              for k in gaps.tolist()]).reshape(-1, 2).T
+    missing = dt[gaps] - (usual if form.quantity == 'increment' else 0.0)
+    if form.quantity == 'increment' and len(gaps):
         step = step.copy()
-        step[odd] += (before + after) / 2 * missing
+        step[gaps] += (before + after) / 2 * missing
         travel = Travel(travel.t, running_sum(step), travel.quantum)
     # speeds within a gap: uniform between adjacent ones, plus a part that grows with its length
-    spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
-        np.abs(before), np.abs(after)) / np.sqrt(3)
-    lost, sigma = travel.t[odd], spread * missing
+    speed_sigma = np.abs(after - before) / np.sqrt(12) + np.minimum(
+        missing / 50, 0.3) * np.maximum(np.abs(before), np.abs(after)) / np.sqrt(3)
+    times, sigma = travel.t[gaps], speed_sigma * missing
     if form.quantity == 'rate':
         hidden = np.copysign(_travel_below_threshold(travel, value), step)
-        at = np.flatnonzero(hidden)
+        rows = np.flatnonzero(hidden)
         travel = replace(travel, s=travel.s + running_sum(hidden))
-        lost, sigma = np.r_[lost, travel.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
-    return travel, lost, sigma
+        times, sigma = np.r_[times, travel.t[rows]], np.r_[sigma, np.abs(hidden[rows]) / 2]
+    return travel, times, sigma
 
 
 def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
-    """Return the travel at speeds published as zero, v^2 / 2a at stops and starts: (n - 1,)."""
+    """
+    Return the travel at speeds published as zero, at stops and starts: (n - 1,).
+
+    It is v^2 / 2a with the smallest published speed v and the acceleration a of adjacent rows.
+    """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     least = 2 * travel.coarse.step if travel.coarse else 0.0
     # least ratio to the counted travel in a dead band
     dead_band_ratio = 1.5
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
-        rows = np.arange(edge, edge - STEPS_BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
-                                                                                + STEPS_BESIDE)
+        first, direction = (edge, -1) if stops else (edge + 1, 1)
+        rows = first + direction * np.arange(ADJACENT_STEPS)
         rows = rows[(rows >= 0) & (rows < len(size))]
         v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
-        took = abs(travel.t[rows[-1]] - travel.t[rows[0]])
-        if v > least and change > 0 and took > 0:
+        duration = abs(travel.t[rows[-1]] - travel.t[rows[0]])
+        if v > least and change > 0 and duration > 0:
             counted = v * (travel.t[edge + 1] - travel.t[edge]) / 2
-            whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
-            hidden[edge] = whole - counted if whole > dead_band_ratio * counted else 0.0
+            total = min(v**2 * duration / (2 * change), v)      # no longer than 2 s
+            hidden[edge] = total - counted if total > dead_band_ratio * counted else 0.0
     return hidden
 
 

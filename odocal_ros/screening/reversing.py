@@ -21,9 +21,9 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import G
 
-REVERSING_STEP = 0.1          # s, judgement: grid
-PUSH_TIME = 0.6            # s, judgement: each side, of accelerations
-STOP_BEFORE = 1.0             # s, judgement: of the stop before a start
+REVERSING_STEP = 0.1        # s, judgement: of the time grid
+ACCELERATION_TIME = 0.6     # s, judgement: half the length of the second differences of travel
+STOP_TIME = 1.0             # s, judgement: used before a start, at standstill
 BY_IMU = 'the acceleration has the opposite sign of the other starts'
 BY_FIT = 'IMU and fixes move backwards'
 
@@ -34,38 +34,38 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     Return begin and end of reversing in which the counter counts up: (m, 2) s.
 
     travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate with
-    bias, rad/s, specific force, m/s^2.   between : (2,) the marks, s; earlier travel is used for
-    the usual ratio. The result is empty if travel counts down in reverse, or if the IMU's x axis
-    points across the vehicle.
+    bias, rad/s, specific force, m/s^2.   between : (2,) the marks, s; only the usual ratio also
+    uses earlier starts. The result is empty if travel counts down in reverse, or if the IMU's x
+    axis points across the vehicle.
     """
     none = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:
         return none
-    t = np.arange(max(travel.t[0], t_imu[0]) + PUSH_TIME,
-                  min(travel.t[-1], t_imu[-1]) - PUSH_TIME, REVERSING_STEP)
-    if len(t) < 2 * (STOP_BEFORE + PUSH_TIME) / REVERSING_STEP:
+    t = np.arange(max(travel.t[0], t_imu[0]) + ACCELERATION_TIME,
+                  min(travel.t[-1], t_imu[-1]) - ACCELERATION_TIME, REVERSING_STEP)
+    if len(t) < 2 * (STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP:
         return none
     begins, ends = _sections_between_stops(t, travel)
     if len(begins) < 2:
         return none
     force = _Forces(t, t_imu, w_b, f_b)
-    before, here, after = (travel.at(t + d) for d in (-PUSH_TIME, 0.0, PUSH_TIME))
-    push = (before - 2 * here + after) / PUSH_TIME**2
-    ratio, sigma = np.array([_ratio(t, push, force, a, b)
+    before, here, after = (travel.at(t + d) for d in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
+    acceleration = (before - 2 * here + after) / ACCELERATION_TIME**2
+    ratio, sigma = np.array([_ratio(t, acceleration, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
     driven = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
-    clear = np.abs(ratio) > FAULT_SIGMAS * sigma
-    onward = np.sign((driven * np.sign(ratio))[clear].sum())
-    usual = clear & (np.sign(ratio) == onward)
-    if not onward or not usual.any():
+    significant = np.abs(ratio) > FAULT_SIGMAS * sigma
+    forward_sign = np.sign((driven * np.sign(ratio))[significant].sum())
+    usual = significant & (np.sign(ratio) == forward_sign)
+    if not forward_sign or not usual.any():
         return none
-    level = np.median(np.abs(ratio[usual]))
-    usual_ratio = (0.5, 2.0)    # limits of the ratio of a start over the usual one
-    back = clear & ~usual & (np.abs(ratio) > usual_ratio[0] * level) & (
-        np.abs(ratio) < usual_ratio[1] * level)
+    usual_ratio = np.median(np.abs(ratio[usual]))
+    low, high = 0.5, 2.0    # limits of the ratio of a reversed start over the usual one
+    back = significant & ~usual & (np.abs(ratio) > low * usual_ratio) & (
+        np.abs(ratio) < high * usual_ratio)
     back &= (t[ends] > between[0]) & (t[begins] < between[1])
     # at the last step of the grid the vehicle still moves
-    return np.stack([t[begins[back]] - PUSH_TIME, t[ends[back]] + PUSH_TIME], -1)
+    return np.stack([t[begins[back]] - ACCELERATION_TIME, t[ends[back]] + ACCELERATION_TIME], -1)
 
 
 def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
@@ -76,9 +76,10 @@ def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
     slips : of the smoother, dicts of t and duration, s, and metres, wheel travel minus vehicle
     travel.   A wheel that spins on the spot slips by once its travel.
     """
-    t = np.arange(travel.t[0] + PUSH_TIME, travel.t[-1] - PUSH_TIME, REVERSING_STEP)
+    t = np.arange(travel.t[0] + ACCELERATION_TIME, travel.t[-1] - ACCELERATION_TIME,
+                  REVERSING_STEP)
     begins, ends = _sections_between_stops(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
-    spans = np.stack([t[begins] - PUSH_TIME, t[ends] + PUSH_TIME], -1)
+    spans = np.stack([t[begins] - ACCELERATION_TIME, t[ends] + ACCELERATION_TIME], -1)
     driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
@@ -108,17 +109,17 @@ def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | No
 
 def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     """Return the first and the last step of each section of motion that begins with a stop."""
-    speed = np.abs(travel.at(t + PUSH_TIME / 2) - travel.at(t - PUSH_TIME / 2)) / PUSH_TIME
+    half = ACCELERATION_TIME / 2
+    speed = np.abs(travel.at(t + half) - travel.at(t - half)) / ACCELERATION_TIME
     top = np.percentile(speed, 95)
-    # counts a second at top speed, below which a counter shows no acceleration
-    counts_at_top = 20.0
-    if top == 0.0 or top < counts_at_top * travel.quantum:
+    least_count_rate = 20.0    # counts/s at top speed: below it a counter shows no acceleration
+    if top == 0.0 or top < least_count_rate * travel.quantum:
         return np.empty(0, int), np.empty(0, int)
-    stands_of_top = 0.02    # of the top speed: below it is a stop
-    stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, stands_of_top * top)
-    moving = runs(~stands) - [0, 1]
+    stop_share = 0.02    # of the top speed: below it is a stop
+    stops = speed <= max(1.01 * travel.quantum / ACCELERATION_TIME, stop_share * top)
+    moving = runs(~stops) - [0, 1]
     begins, ends = moving[moving[:, 0] > 0].T
-    long = (ends - begins) * REVERSING_STEP > 2 * PUSH_TIME
+    long = (ends - begins) * REVERSING_STEP > 2 * ACCELERATION_TIME
     return begins[long], ends[long]
 
 
@@ -126,33 +127,34 @@ class _Forces:
     """
     Integrals of the IMU's rows at the steps of a grid t: (m,).
 
-    turned, speed : (m, 3) of w and f.   speed_before : (m, 3), PUSH_TIME before.
-    push : (m,) second difference of the travel from f_x.
+    angle, speed : (m, 3) integrals of w, rad, and of f, m/s.   speed_before : (m, 3), the same
+    ACCELERATION_TIME earlier.   along : (m,) mean of f_x, m/s^2, weighted as the second
+    difference of travel weights the acceleration.
     """
 
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
-        self.turned = integral_at(t, t_imu, w_b)
-        times = [t + d for d in (-PUSH_TIME, 0.0, PUSH_TIME)]
+        self.angle = integral_at(t, t_imu, w_b)
+        times = [t + d for d in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
         self.speed_before, self.speed = integrals_at(times[:2], t_imu, f_b)
         before, here, after = twice_integrals_at(times, t_imu, f_b[:, 0])
-        self.push = (before - 2 * here + after) / PUSH_TIME**2
+        self.along = (before - 2 * here + after) / ACCELERATION_TIME**2
 
 
-def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
-    """Return the ratio of specific force to the odometer's acceleration, and its sigma."""
-    low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
+def _ratio(t: Floats, acceleration: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
+    """Return the ratio of force to odometer acceleration, from step a to b, and its sigma."""
+    low = max(0, a - round((STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP))
     longest_start = 12.0    # s after a stop that are used: later the tilt drifts
     high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))
-    span = t[low:high]
-    # the up direction at rest: as the vehicle pitches, gravity enters x
-    rest = force.speed_before[low], force.speed[max(a - round(PUSH_TIME / REVERSING_STEP), 0)]
-    up = (rest[1] - rest[0]) / max(np.linalg.norm(rest[1] - rest[0]), 1e-9)
-    turn = force.turned[low:high] - force.turned[low]
+    # the integral of the force at rest points up: as the vehicle pitches, gravity enters x
+    stop_end = max(a - round(ACCELERATION_TIME / REVERSING_STEP), 0)
+    up = force.speed[stop_end] - force.speed_before[low]
+    up /= max(np.linalg.norm(up), 1e-9)
+    turn = force.angle[low:high] - force.angle[low]
     tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
-    y = force.push[low:high] - G * tilt
-    A = np.stack([push[low:high], np.ones(len(span)), span - span.mean()], -1)
+    y, times = force.along[low:high] - G * tilt, t[low:high]
+    A = np.stack([acceleration[low:high], np.ones(len(times)), times - times.mean()], -1)
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
-    spread = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
-    left = float(np.sqrt(np.mean((y - A @ x)**2)))
-    rows_per_sample = 2 * PUSH_TIME / REVERSING_STEP          # neighbours share their samples
-    return float(x[0]), left * float(np.sqrt(rows_per_sample * spread)) + 1e-12
+    cofactor = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
+    residual = float(np.sqrt(np.mean((y - A @ x)**2)))
+    rows_per_sample = 2 * ACCELERATION_TIME / REVERSING_STEP    # adjacent rows share IMU samples
+    return float(x[0]), residual * float(np.sqrt(rows_per_sample * cofactor)) + 1e-12

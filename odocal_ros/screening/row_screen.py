@@ -61,7 +61,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     sent = leg.rows(slot)
     if slot in WHEELS:
         sent = _zero_faded_speeds(sent)
-    good, wild = _finite(sent, slot, leg, found)
+    good, impossible = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
     clean = _separate_equal_stamps(clean) if slot in WHEELS else clean
     clean = _spread_packets(clean, found) if slot == 'imu' else clean
@@ -79,11 +79,11 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
                             f'{t[np.argmax(spikes)]:.2f} s; dropped'))
-        # else adjacent rows are already dropped
-        if not glitches.near_impossible_groups(wild).any():
-            at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
-            wild[at[spikes]] = True
-            spikes |= _damaged(wild, good, slot, found)[at]
+        # outliers and impossible values together may be a damaged group, unless one was found
+        if not glitches.near_impossible_groups(impossible).any():
+            rows = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
+            impossible[rows[spikes]] = True
+            spikes |= _damaged(impossible, good, slot, found)[rows]
         clean, t = take(clean, ~spikes), t[~spikes]
     if len(sent.stamp_ns) and not len(t) and slot in NO_ROW_CODES:
         zero = int((sent.stamp_ns <= 0).sum())
@@ -95,24 +95,24 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     return clean, t
 
 
-def _where(samples: Samples, index: int, leg: Leg) -> str:
+def _time_text(samples: Samples, index: int, leg: Leg) -> str:
     """Return the time of a row in seconds from the start mark (arrival time without a stamp)."""
     stamp = samples.stamp_ns[index] if samples.stamp_ns[index] > 0 else samples.received_ns[index]
     return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
 
 
 def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
-    """Return masks of rows with a stamp and all required values, and of impossible rows."""
+    """Return masks of rows with a stamp and all required values, and of finite impossible rows."""
     stamped = samples.stamp_ns > 0
-    finite, wild = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
+    finite, impossible = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
     possible = INPUTS[slot].possible
     for name in INPUTS[slot].needed:
         column = getattr(samples, name)
-        odd = glitches.is_impossible(name, column)
+        invalid = glitches.is_impossible(name, column)
         if possible is not None:
-            odd |= ~((column >= possible[0]) & (column <= possible[1]))
-        finite &= ~odd
-        wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
+            invalid |= ~((column >= possible[0]) & (column <= possible[1]))
+        finite &= ~invalid
+        impossible[invalid] |= np.isfinite(column[invalid]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix publishes NaN: not a fault
     bad_value = 'hold NaN, Inf or an impossible value'
@@ -125,22 +125,23 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
             first = int(np.argmax(bad))
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
                                 f'{LABEL[slot]} messages {what}, first at '
-                                f'{_where(samples, first, leg)}; dropped'))
+                                f'{_time_text(samples, first, leg)}; dropped'))
     good = stamped & finite
-    suspect = _damaged(wild, good, slot, found,
-                       min(glitches.DAMAGED_SHARE * len(wild), glitches.SEVERAL_ROWS))
-    return good & ~suspect, wild
+    suspect = _damaged(impossible, good, slot, found,
+                       min(glitches.DAMAGED_SHARE * len(impossible), glitches.SEVERAL_ROWS))
+    return good & ~suspect, impossible
 
 
-def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
-             most: float = np.inf) -> Bools:
-    """Return a mask of rows near groups of invalid rows, and the reason if there are many."""
-    suspect = glitches.near_impossible_groups(wild)
-    if suspect.any() or wild.sum() > most:
-        found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
+def _damaged(impossible: Bools, good: Bools, slot: str, found: list[Reason],
+             limit: float = np.inf) -> Bools:
+    """Return rows near groups of impossible rows; add ROWS_DAMAGED, or for more than ``limit``."""
+    suspect = glitches.near_impossible_groups(impossible)
+    count = int(impossible.sum())
+    if suspect.any() or count > limit:
+        found.append(Reason(Code.ROWS_DAMAGED, f'{count} of {len(impossible)} {LABEL[slot]} '
                             'messages hold impossible values or are outliers; '
-                            f'{int((suspect & good & ~wild).sum())} messages next to them were '
-                            'dropped too'))
+                            f'{int((suspect & good & ~impossible).sum())} messages next to them '
+                            'were dropped too'))
     return suspect
 
 
@@ -153,39 +154,40 @@ def _zero_faded_speeds(samples: Any) -> Any:
 
 def _separate_equal_stamps(samples: Any) -> Any:
     """Return samples stamped at arrival, equal stamps 1 ns apart; repeated samples unchanged."""
-    stamp, twice_share = samples.stamp_ns, 1 / 3    # of all; with each sample twice it is a half
+    stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():
         return samples
-    again = np.diff(samples.value)[step == 0] == 0
-    if again.all() and len(again) > twice_share * len(stamp):
+    repeated = np.diff(samples.value)[step == 0] == 0
+    repeated_share = 1 / 3    # of all; if each sample is sent twice, it is a half
+    if repeated.all() and len(repeated) > repeated_share * len(stamp):
         return samples
     order = np.arange(len(stamp))
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
 
 
 def _spread_packets(imu: Any, found: list[Reason]) -> Any:
-    """Return IMU samples; those with one stamp are distributed over the time since the last."""
+    """Return IMU samples; packets of one stamp are distributed over the time since the last."""
     stamp, packed_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
     step = np.diff(stamp)
     same = step == 0
     if same.sum() <= packed_share * len(stamp) or (step < 0).any():
         return imu
-    again = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in (imu.w_i, imu.f_i)], axis=0)
-    if (same & ~again).sum() <= packed_share * len(stamp):
+    repeated = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in (imu.w_i, imu.f_i)], axis=0)
+    if (same & ~repeated).sum() <= packed_share * len(stamp):
         return imu
     first = np.flatnonzero(np.append(True, ~same))
     count = np.diff(np.append(first, len(stamp)))
-    # a packet after a gap has the usual length
+    # a packet after a gap has the usual duration
     usual = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
-    took = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
-    left = np.repeat(first + count - 1, count) - np.arange(len(stamp))      # to the last
+    duration = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
+    rows_to_last = np.repeat(first + count - 1, count) - np.arange(len(stamp))
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
                         f'{LABEL["imu"]} messages repeat the previous stamp: all messages of '
                         'a packet have one stamp; they were spread evenly over the time since '
                         'the previous packet',
                         'Stamp each message with the time of its measurement.'))
-    return replace(imu, stamp_ns=stamp - left * np.repeat(took // count, count))
+    return replace(imu, stamp_ns=stamp - rows_to_last * np.repeat(duration // count, count))
 
 
 def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:
@@ -197,29 +199,25 @@ def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints 
     keep = _longest_rising(stamp)
     same, back = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
-    what = [f'{same} repeat the previous stamp'] * (same > 0)
-    what += [f'{back} backward step{"s" * (back > 1)} (up to {-step.min() * 1e-9:.3g} '
-             's)'] * (back > 0)
+    faults = [f'{same} repeat the previous stamp'] * (same > 0)
+    faults += [f'{back} backward step{"s" * (back > 1)} (up to {-step.min() * 1e-9:.3g} '
+               's)'] * (back > 0)
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not increase: '
-                        f'{" and ".join(what)}, first at {_where(samples, first, leg)}; '
+                        f'{" and ".join(faults)}, first at {_time_text(samples, first, leg)}; '
                         f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
     return keep
 
 
 def _longest_rising(stamp: Ints) -> Ints:
     """Return the indices of a longest strictly rising subsequence (patience sorting)."""
-    tails: list[int] = []
-    ends: list[int] = []
-    before = np.full(len(stamp), -1)
+    tails: list[int] = []     # smallest last value of a rising subsequence of each length
+    ends: list[int] = []      # its row
+    before = np.full(len(stamp), -1)      # row before a row in its subsequence
     for i, value in enumerate(stamp.tolist()):
         k = bisect_left(tails, value)
         if k:
             before[i] = ends[k - 1]
-        if k == len(tails):
-            tails.append(value)
-            ends.append(i)
-        else:
-            tails[k], ends[k] = value, i
+        tails[k:k + 1], ends[k:k + 1] = [value], [i]
     keep, i = [], ends[-1]
     while i >= 0:
         keep.append(i)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Screening: usable arrays of a raw leg on one time axis, with a reason for each fault.
+Screening: from the raw samples of a leg to usable arrays on one time axis, and reasons for faults.
 
-Times are s since the start mark, an IMU stamp: offsets of others are relative to that of the IMU.
+Times are s since the start mark. Marks are IMU stamps, so time offsets are relative to the IMU's.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,8 @@ from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.wheel_travel import travel_of_wheels, Wheels
 from odocal_ros.settings.config import Config, SIDES
 
-# judgement: of a rough track, an hour at 146 Hz; more only take memory. 2 h at 1 kHz: 0.16 m off
+# judgement: of an approximate track, an hour at 146 Hz; more only take memory. 2 h at 1 kHz are
+# 0.16 m wrong with it
 TRACK_ROWS = 2**19
 
 
@@ -60,8 +61,8 @@ def screen(leg: Leg, config: Config,
     found: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
     found += _missing(leg, found)
     if check_faults:
-        leg, sets = without_clock_steps(leg)
-        found += [*sets, *clock_reasons(leg, config)]
+        leg, clock_steps = without_clock_steps(leg)
+        found += [*clock_steps, *clock_reasons(leg, config)]
     rows = _usable(leg, config, check_faults, found)
     inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
@@ -74,9 +75,9 @@ def screen(leg: Leg, config: Config,
         found += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
-            wheels, why = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
-                                       (0.0, inputs.t_stop))
-            found += why
+            wheels, reasons = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
+                                           (0.0, inputs.t_stop))
+            found += reasons
         inputs = replace(inputs, **_travel(leg, wheels))
     release_mapped_memory()
     if check_faults and not local:
@@ -85,7 +86,7 @@ def screen(leg: Leg, config: Config,
 
 
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
-    """Return a leg with all stamps on the clock of the IMU, its inputs, and reasons of both."""
+    """Return a leg with all stamps on the clock of the IMU, its inputs, and all reasons."""
     inputs, reasons = screen(leg, config)
     found, late_by = [], dict(late_clocks(inputs, locate_fixes(inputs, config)))
     for clock, late in late_by.items():
@@ -106,14 +107,14 @@ def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason,
 
 def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
     codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
-    known = {reason.code for reason in found}      # a missing frame_id
+    known = {reason.code for reason in found}      # NO_IMU if imu.frame_id is missing
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
             for slot, code in codes.items()
             if not len(leg.rows(slot).stamp_ns) and code not in known]
 
 
 @dataclass(frozen=True, eq=False)
-class Usable:
+class UsableTopics:
     """Usable rows of each topic, unchanged, and their times from the start mark, s."""
 
     imu: ImuSamples
@@ -124,7 +125,7 @@ class Usable:
     external: dict[str, UsableRows]
 
 
-def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> Usable:
+def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> UsableTopics:
     offset = stamp_offsets(config)
 
     def rows(slot: str) -> UsableRows:
@@ -137,26 +138,26 @@ def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -
     t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
     external = {slot: rows(slot) for slot in EXTERNAL_SLOTS}
     release_mapped_memory()
-    travelled = travel_of_wheels(leg, config, rows, found)
+    wheels = travel_of_wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]
-    return Usable(imu, t_imu, travelled, *rows('fix'), external)
+    return UsableTopics(imu, t_imu, wheels, *rows('fix'), external)
 
 
-def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[str, Any]:
-    """Return fixes and other sensors as fields of Inputs; add the reasons for unused ones."""
+def _fixes(leg: Leg, config: Config, rows: UsableTopics, found: list[Reason]) -> dict[str, Any]:
+    """Return fixes and external sensors as fields of Inputs; add the reasons for unused ones."""
     fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
-    use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
-    found += why
+    use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
+    found += fix_reasons
     found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]
-    # heights that are all exactly 0 are not sent
+    # receivers without a height publish 0
     height = fix.height if fix.height.any() or (fix.status == LOCAL).any() else np.full(
         len(fix.height), np.nan)
     geodetic = np.stack([fix.latitude, fix.longitude, height], -1)[use]
-    rounding, rounded = rounding_variance(geodetic, covariance[use])
+    rounding, rounding_reasons = rounding_variance(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
-    found += rounded
+    found += rounding_reasons
     contradiction = velocity_reasons(
         velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance
     ) if config.gnss.use_velocity else ()
@@ -168,7 +169,7 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
 
 
-def _inputs_of(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
+def _inputs_of(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, Any]) -> Inputs:
     imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
@@ -196,6 +197,7 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
 
 
 def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+    """Return inputs without fixes that the receiver has dead-reckoned; add the reason."""
     located = locate_fixes(inputs, config)
     if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
@@ -208,12 +210,15 @@ def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) 
     steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
-                                    np.interp(inputs.t_fix, t, track))
-    found += why
-    return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
-                   covariance_n=inputs.covariance_n[~lost], rounding_n=inputs.rounding_n[~lost],
-                   fixes_rejected=inputs.fixes_rejected + int(lost.sum())) if why else inputs
+    dropped, reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
+                                           np.interp(inputs.t_fix, t, track))
+    if not reasons:
+        return inputs
+    found += reasons
+    kept = ~dropped
+    return replace(inputs, t_fix=inputs.t_fix[kept], geodetic=inputs.geodetic[kept],
+                   covariance_n=inputs.covariance_n[kept], rounding_n=inputs.rounding_n[kept],
+                   fixes_rejected=inputs.fixes_rejected + int(dropped.sum()))
 
 
 def _rotated(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:

@@ -30,12 +30,13 @@ from odocal_ros.screening.odometer_rows import (
 )
 from odocal_ros.settings.config import Config
 
+# known spans of whole counts, and of angles in rad or deg
 SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
 NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
+class RolloverSpan:
     """Rollovers of a counter: its span in counts, its sigma, and the rows before them."""
 
     size: float
@@ -44,7 +45,7 @@ class Span:
     turns: NDArray[np.int64]     # (k,) +1 rolled over upwards, -1 downwards
 
 
-def hidden_span(value: Values, step: Floats) -> Span | None:
+def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
     """Return the span of a counter's uncorrected rollovers, by rows (n,) and steps (n - 1,)."""
     if len(step) < FEWEST_STEPS or not step.any():
         return None
@@ -53,40 +54,42 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1),
                       axis=-1)
     whole = np.issubdtype(value.dtype, np.integer)
-    off = step - usual
+    jump = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
     least_jump = 8.0    # counts, smallest jump against the travel
-    far = np.abs(off) > np.maximum(2 * np.abs(usual) + least_jump * whole, 1.5 * top)
-    rows = np.flatnonzero(far & (off * usual <= 0))      # a frozen counter catches up forwards
+    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + least_jump * whole, 1.5 * top)
+    rows = np.flatnonzero(large & (jump * usual <= 0))      # a frozen counter catches up forwards
     if not len(rows):
         return None
-    size = np.abs(off[rows])
-    slack = np.abs(usual[rows]) / 2 + (3.0 if whole else 1e-3 * size)
-    spans = SPANS['whole' if whole else 'angle']
-    middle = float(np.median(size))
-    known = float(spans[np.argmin(np.abs(spans - middle))])
-    typical = float(np.median(slack))
-    sigma = 0.0
-    fewest_jumps = 3    # least number of jumps for a span that is no power of two
-    # judgement, of the span: largest deviation from a power of two of a single jump
-    most_off = np.inf if len(rows) > 1 else 0.01 * known
-    if abs(known - middle) <= min(typical, most_off):
-        span = known
-    elif len(rows) >= fewest_jumps:
-        span, sigma = _measured_span(value, rows, middle, typical) if whole else (
-            middle, typical / np.sqrt(3 * len(rows)))
-    else:
-        return None
-    if whole and span > spans[-1]:       # damaged values: wider than any counter
-        return None
-    agree = np.abs(size - span) <= 2 * slack
-    same_span_share = 0.8    # share of the jumps that must agree
-    if agree.mean() < same_span_share:
+    size = np.abs(jump[rows])
+    tolerance = np.abs(usual[rows]) / 2 + (3.0 if whole else 1e-3 * size)
+    span, sigma = _span_of(value, rows, float(np.median(size)), float(np.median(tolerance)))
+    agree = np.abs(size - span) <= 2 * tolerance
+    agreeing_share = 0.8    # share of the jumps that must agree
+    if agree.mean() < agreeing_share:      # also if no span was found, NaN
         return None
     rows = rows[agree]
-    if _value_range(value, rows) > span + typical:     # rows out of order, two counters
+    if _value_range(value, rows) > span + np.median(tolerance):   # rows out of order, two counters
         return None
-    return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
+    return RolloverSpan(span, sigma, rows, -np.sign(jump[rows]).astype(np.int64))
+
+
+def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[float, float]:
+    """Return the span of jumps after rows with this median size, and its sigma; NaN: none."""
+    whole = np.issubdtype(value.dtype, np.integer)
+    spans = SPANS['whole' if whole else 'angle']
+    known = float(spans[np.argmin(np.abs(spans - size))])
+    # judgement, of the span: largest deviation of a single jump from a known span
+    single_limit = np.inf if len(rows) > 1 else 0.01 * known
+    if abs(known - size) <= min(tolerance, single_limit):
+        return known, 0.0
+    fewest_jumps = 3    # for a span that is not a known one
+    if len(rows) < fewest_jumps:
+        return np.nan, 0.0
+    if not whole:
+        return size, tolerance / np.sqrt(3 * len(rows))
+    span, sigma = _measured_span(value, rows, size, tolerance)
+    return (span, sigma) if span <= spans[-1] else (np.nan, 0.0)    # wider: values are damaged
 
 
 def _value_range(value: Values, rows: Ints) -> float:
@@ -94,10 +97,11 @@ def _value_range(value: Values, rows: Ints) -> float:
     return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
 
 
-def _measured_span(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
+def _measured_span(value: Values, rows: Ints, size: float,
+                   tolerance: float) -> tuple[float, float]:
     """Return a span that is no power of two, and its sigma: the roundest number that fits."""
     low = _value_range(value, rows) + 1
-    high = max(low, middle + 2 * slack / np.sqrt(len(rows)))
+    high = max(low, size + 2 * tolerance / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
         span = np.ceil(low / unit) * unit
         if span <= high:
@@ -112,8 +116,8 @@ def correct_rollovers(
     Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its steps, rollovers
-    of the type's span corrected.   name : of the counter, in reasons.   only_counter : there is no
-    other one. Times are (k,) s, sigmas (k,) counts.
+    of the message type's range corrected.   name : of the counter, in reasons.   only_counter :
+    the vehicle has no other one. Times are (k,) s, sigmas (k,) counts.
     """
     span = hidden_span(samples.value, step)
     none = np.empty(0)
@@ -129,12 +133,13 @@ def correct_rollovers(
     angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
     do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
-    twice = times > 0.1 * len(step)     # judgement: few counters do so; the steps of two alternate
+    # judgement: few counters roll over so often; values of two counters alternate
+    two_publishers = times > 0.1 * len(step)
     found = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '
                    f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
                    f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
                    + '. Check for two publishers on the topic if the counter cannot roll over so '
-                   'often' * twice, do)
+                   'often' * two_publishers, do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),
@@ -146,7 +151,7 @@ class Wheels:
     """Travel of the wheels, and its uncertain parts."""
 
     wheels: tuple[Travel, ...]
-    # of each: times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
+    # for each wheel: times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
     uncertain_travel: tuple[tuple[Floats, Floats], ...]
 
     @cached_property
@@ -171,7 +176,7 @@ class Wheels:
         return [k for k, one in enumerate(self.wheels) if not one.ahead]
 
     def only(self, kept: Sequence[Travel]) -> 'Wheels':
-        """Return the travel of the kept ones of the wheels, and their uncertain parts."""
+        """Return wheels with the travel in ``kept``, and the uncertain parts by name."""
         by_name = {wheel.name: uncertain for wheel, uncertain in zip(
             self.wheels, self.uncertain_travel, strict=True)}
         return Wheels(tuple(kept), tuple(by_name[wheel.name] for wheel in kept))
@@ -179,7 +184,11 @@ class Wheels:
 
 def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
                      found: list[Reason]) -> Wheels:
-    """Return the travel of the wheels of a leg; rows: of a slot the usable rows and times, s."""
+    """
+    Return the travel of the wheels of a leg.
+
+    rows : returns the usable rows of a slot and their times, s.   found : reasons are added.
+    """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
     samples, t = rows(slots[0])
@@ -209,23 +218,24 @@ def _joined(wheels: list[tuple[Travel, Floats, Floats]]) -> Wheels:
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
-                      found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
+                      found: list[Reason], side: str) -> tuple[Travel, Floats, Floats]:
+    """Return the travel of a wheel, times, s, and sigmas of its uncertain travel."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     uncertain_t = uncertain_sigma = np.empty(0)
     if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, why, uncertain_t, uncertain_sigma = correct_rollovers(
+        samples, reasons, uncertain_t, uncertain_sigma = correct_rollovers(
             t, samples, step, name, only_counter=not side)
-        found.extend(why)
+        found.extend(reasons)
     samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
     t = sampling_times(samples, t, form, found, f'{side} odometer'.strip())
-    counts, reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
+    travel, reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
-    counts, more_t, more = with_gap_uncertainty(counts, samples.value, form)
-    return (replace(counts, name=side), np.append(uncertain_t, more_t),
-            np.append(uncertain_sigma, more))
+    travel, gap_t, gap_sigma = with_gap_uncertainty(travel, samples.value, form)
+    return (replace(travel, name=side), np.append(uncertain_t, gap_t),
+            np.append(uncertain_sigma, gap_sigma))
 
 
 def _form_text(form: OdometerForm) -> str:
-    what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
-    return f'{what[form.quantity]} ({form.scale_unit})'
+    texts = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
+    return f'{texts[form.quantity]} ({form.scale_unit})'
