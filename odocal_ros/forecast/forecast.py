@@ -11,14 +11,13 @@ import numpy as np
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
-PERCENT_FROM = 0.01       # judgement: relative sigma from which it is printed in per cent
-FARTHEST_LIMIT_M = 2e4          # judgement: limit of a useful forecast of the remaining distance
-# definition: shown if more driving does not help
+PERCENT_FROM = 0.01       # judgement: larger relative sigmas are printed in per cent, not ppm
+FARTHEST_LIMIT_M = 2e4    # judgement: longest remaining distance of a useful forecast
 UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
 PREDICTED_REST_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
-# estimate: unit at the end of its key
+# estimates in ~/status, and the unit at the end of their keys
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
 
@@ -49,23 +48,23 @@ class ParameterForecast:
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor, limit = '%', 100.0, limit_with_unit
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
-        known = name if sigma is None else f'{name} {sigma} {unit}'
+        estimate = name if sigma is None else f'{name} {sigma} {unit}'
         if self.value_text and sigma is not None:
-            known = f'{name} {self.value_text} ± {sigma} {unit}'
+            estimate = f'{name} {self.value_text} ± {sigma} {unit}'
         if self.manoeuvre:
-            return f'{known} so far (limit {limit})' if self.value_text else (
+            return f'{estimate} so far (limit {limit})' if self.value_text else (
                 f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
         if self.remaining_m is None:
-            return f'{known}: {self.why}'
+            return f'{estimate}: {self.why}'
         if self.remaining_m == 0.0:
-            return f'OK: {known} (limit {limit})'
-        left = self.remaining_m - since
-        more = (f'drive {_rounded_up(left)} m more' if left > 0 else 'drive on') + (
-            f' to reach the limit of {limit_with_unit}')
+            return f'OK: {estimate} (limit {limit})'
+        remaining_m = self.remaining_m - since
+        action = (f'drive {_rounded_up(remaining_m)} m more' if remaining_m > 0 else 'drive on') \
+            + f' to reach the limit of {limit_with_unit}'
         if sigma is None:
-            return f'{name} is not determined yet; {more}'
-        return f'{known} so far; {more}' if self.value_text else (
-            f'{name} uncertainty so far: {sigma} {unit}; {more}')
+            return f'{name} is not determined yet; {action}'
+        return f'{estimate} so far; {action}' if self.value_text else (
+            f'{name} uncertainty so far: {sigma} {unit}; {action}')
 
 
 @dataclass(frozen=True)
@@ -84,23 +83,23 @@ class Forecast:
     yaw: ParameterForecast
     pitch: float | None = None                # rad, sigma
     wheels: WheelsForecast | None = None      # None with one counter, and before the first one
-    methods: dict[str, MethodResult] = field(default_factory=dict)    # those without end points
+    methods: dict[str, MethodResult] = field(default_factory=dict)    # smoother, or planar
     estimates: dict[str, Estimate] = field(default_factory=dict)      # so far, as in a result
     until_ns: int = 0                         # stamp of the newest sample used
-    distance_m: float = 0.0                   # path length of the leg there
+    distance_m: float = 0.0                   # path length of the leg at this stamp
     faults: tuple[Reason, ...] = ()           # for which the leg is rejected at any length
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
-        of_wheels = self.wheels or WheelsForecast(None, None)
+        wheels = self.wheels or WheelsForecast(None, None)
         return {'scale': self.scale.sigma, 'yaw': self.yaw.sigma, 'pitch': self.pitch,
-                'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
+                'left_right': wheels.left_right, 'track_width': wheels.track_width}[quantity]
 
     def as_text(self, distance_m: float = 0.0) -> str:
         """
-        Return it as a sentence: reached limits, remaining distances, unreachable limits.
+        Return the forecast as a sentence: reached and unreachable limits, remaining distances.
 
-        distance_m : path length of the leg by now, m.
+        distance_m : current path length of the leg, m.
         """
         since = max(0.0, distance_m - self.distance_m)
         return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, since),
@@ -141,6 +140,7 @@ def combine_sections(earlier: Forecast | None, newest: Forecast | None) -> Forec
 
 
 def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) -> ParameterForecast:
+    """Return the forecast with the smaller sigma; what remains to drive is that of the newest."""
     if earlier.sigma is None or (newest.sigma is not None and newest.sigma <= earlier.sigma):
         return newest
     if earlier.remaining_m == 0.0 and not earlier.manoeuvre:
@@ -153,26 +153,28 @@ def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str,
     """Return the keys of ``~/status``; age_s : of the newest sample of the forecast."""
     keys = _running_keys(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
-        of = ParameterForecast(None, 0.0, None) if forecast is None else getattr(forecast, name)
+        one = ParameterForecast(None, 0.0, None) if forecast is None else getattr(forecast, name)
         keys |= {
-            f'predicted_{name}_sigma_{unit}': '' if of.sigma is None else of.sigma * factor,
-            f'metres_to_go_{name}': '' if of.remaining_m is None else of.remaining_m,
-            f'largest_error_source_{name}': of.sources[0][0] if of.sources else '',
+            f'predicted_{name}_sigma_{unit}': '' if one.sigma is None else one.sigma * factor,
+            f'metres_to_go_{name}': '' if one.remaining_m is None else one.remaining_m,
+            f'largest_error_source_{name}': one.sources[0][0] if one.sources else '',
             f'predicted_{name}_sources_{unit}': ', '.join(
-                f'{source} {three_digits(sigma * factor)}' for source, sigma in of.sources)}
+                f'{source} {three_digits(sigma * factor)}' for source, sigma in one.sources)}
     return keys
 
 
 def _running_keys(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
     """Return the keys of the running estimate, NaN if it is not determined."""
-    found = {} if forecast is None else forecast.estimates
-    estimates = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
+    estimates = {} if forecast is None else forecast.estimates
     keys: dict[str, str | float] = {}
-    for (name, unit), e in zip(RUNNING.items(), estimates.values(), strict=True):
-        for end, value in (('', e.value), ('_sigma', e.sigma if e.value is not None else None)):
+    methods = []
+    for name, unit in RUNNING.items():
+        estimate = estimates.get(name, Estimate(None, None, ''))
+        known = estimate.value is not None
+        methods += [estimate.method] * known
+        for end, value in (('', estimate.value), ('_sigma', estimate.sigma if known else None)):
             keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
-    giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
-    return keys | {'estimate_method': ', '.join(giving),
+    return keys | {'estimate_method': ', '.join(dict.fromkeys(methods)),
                    'estimate_age_s': math.nan if forecast is None else age_s}
 
 

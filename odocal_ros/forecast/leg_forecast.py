@@ -34,8 +34,8 @@ from odocal_ros.forecast.quantities import stated_variance, with_heading
 from odocal_ros.screening.leg_kind import missing_force_cause
 from odocal_ros.settings.config import Config
 
-DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
-# judgement: the accuracy is from so many orientations, up to this time after the start mark
+DRIVE_ROWS = 1000         # judgement: rows of a drive for a prediction
+# judgement: the accuracy is that of the last rows up to this time after the start mark
 ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
@@ -44,17 +44,16 @@ DRIVE_ON = 'drive on with stops, starts and turns'
 class RecordedDrive(PlannedDrive):
     """The recorded drive and its predicted rest; added manoeuvres continue from here."""
 
-    is_needed: Callable[[], bool] = field(default=lambda: True)
+    is_needed: Callable[[], bool] = field(default=lambda: True)    # False: raise Abandoned
 
     def lengthen(self, metres: float) -> 'RecordedDrive':
         """Return the drive extended straight ahead by ``metres``, at its median speed."""
         if not self.is_needed():
             raise Abandoned
         moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
-        point = int(moving[-1])
-        usual = float(np.median(np.abs(self.speed[moving])))
-        on = np.linspace(0.0, metres / usual, 50)[1:]
-        return insert_section(self, point, on, np.full_like(on, usual), np.zeros_like(on))
+        speed = float(np.median(np.abs(self.speed[moving])))
+        t = np.linspace(0.0, metres / speed, 50)[1:]
+        return insert_section(self, int(moving[-1]), t, np.full_like(t, speed), np.zeros_like(t))
 
 
 def forecast_leg(leg: Leg, fix_rate: float, config: Config,
@@ -63,8 +62,8 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     """
     Return the forecast of a leg that ends here, with the faults of its methods so far.
 
-    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : in
-    force at the leg's start.   is_needed : called repeatedly; if False, Abandoned is raised.
+    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config :
+    settings at the leg's start.   is_needed : called repeatedly; if False, Abandoned is raised.
     smoother : of this leg; each update starts from the previous one.
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
@@ -72,7 +71,7 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     unusable = missing_force_cause(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.update_running(leg, config, smoother, is_needed)
     only_smoother = deciding_methods(config.method) == smoother_forecast.ONLY_SMOOTHER
-    if only_smoother or smoother_forecast.has_all_values(running):     # the end points add nothing
+    if only_smoother or smoother_forecast.has_all_values(running):     # two_point gives no value
         forecast = Forecast(ParameterForecast(None, config.verdict.max_scale_sigma, None),
                             ParameterForecast(None, config.verdict.max_yaw_sigma, None))
     else:
@@ -99,32 +98,34 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
     sigmas = Sigmas(config=_with_expected_heading(leg, config),
                     **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})
     drive = _with_final_rest(_thin(driven), is_needed)
-    now = predict(drive, sigmas)
+    prediction = predict(drive, sigmas)
 
-    def prospect(parameter: str, limit: float, why: str = '') -> ParameterForecast:
-        sigma = now.sigma(parameter)
+    def forecast(parameter: str, limit: float, why: str = '') -> ParameterForecast:
+        sigma = prediction.sigma(parameter)
         metres = 0.0 if sigma is not None and sigma <= limit else None
         if metres is None and not why:
             metres = find_remaining_distance(drive, sigmas, parameter, limit, FARTHEST_LIMIT_M)
             why = UNREACHABLE
-        return ParameterForecast(sigma, limit, metres, main_sources(now.method, parameter), why)
+        return ParameterForecast(sigma, limit, metres,
+                                 main_sources(prediction.method, parameter), why)
 
     limits = config.verdict
     return Forecast(
-        prospect(smoother_forecast.SCALE, limits.max_scale_sigma),
-        prospect(smoother_forecast.YAW, limits.max_yaw_sigma,
-                 _yaw_limit_reason(now, limits.max_yaw_sigma)),
-        now.method.estimates[smoother_forecast.PITCH].sigma)
+        forecast(smoother_forecast.SCALE, limits.max_scale_sigma),
+        forecast(smoother_forecast.YAW, limits.max_yaw_sigma,
+                 _yaw_limit_reason(prediction, limits.max_yaw_sigma)),
+        prediction.method.estimates[smoother_forecast.PITCH].sigma)
 
 
-def _without_refusal(by_ends: ParameterForecast) -> ParameterForecast:
-    """Return the two_point forecast without its refusals, which the smoother may still resolve."""
-    return by_ends if by_ends.remaining_m is not None else replace(by_ends, manoeuvre=DRIVE_ON)
+def _without_refusal(two_point: ParameterForecast) -> ParameterForecast:
+    """Return the forecast of two_point; if it cannot reach the limit, the smoother still may."""
+    return two_point if two_point.remaining_m is not None else replace(two_point,
+                                                                       manoeuvre=DRIVE_ON)
 
 
-def _yaw_limit_reason(now: Prediction, limit: float) -> str:
+def _yaw_limit_reason(prediction: Prediction, limit: float) -> str:
     """Return the explanation why no drive reaches the yaw limit, empty if one can."""
-    alignment = now.alignment
+    alignment = prediction.alignment
     if not alignment.heading_separable:
         return ('not separable from the course over ground, the only heading; set '
                 'alignment.heading_source')
@@ -135,14 +136,14 @@ def _yaw_limit_reason(now: Prediction, limit: float) -> str:
 
 
 def _with_expected_heading(leg: Leg, config: Config) -> Config:
-    """Return config with the heading source, and its sigma, that the alignment will find."""
-    def before(stamp_ns: Ints) -> Ints:
+    """Return config with the heading source, and its sigma, that the alignment will use."""
+    def near_start(stamp_ns: Ints) -> Ints:
         return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
 
     heading = leg.rows('heading')
     return with_heading(config, {
-        'heading_topic': stated_variance(take(heading, before(heading.stamp_ns))),
-        'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
+        'heading_topic': stated_variance(take(heading, near_start(heading.stamp_ns))),
+        'imu_orientation': stated_variance(take(leg.imu, near_start(leg.imu.stamp_ns)))})
 
 
 def _thin(drive: PlannedDrive) -> PlannedDrive:

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The recorded leg: its faults, by the functions that check a finished leg, and its profile.
+A leg while it is recorded: its faults, its profile of speed and yaw, and its running estimate.
 
-Most faults are found in cell means, every few seconds in the worker (``calibrate.faults``). IMU
-gaps are found in the stamps at once, and are kept. Sigmas are predicted from the profile.
+Faults are found by the functions that check a finished leg, in cell means, every few seconds in
+the worker process of the node. IMU gaps are found in the stamps at once, and are kept. Sigmas are
+predicted from the profile.
 """
 
 from collections.abc import Callable, Iterable
@@ -51,29 +52,28 @@ class ImuGaps:
     def __init__(self, start_ns: int, limit_s: float) -> None:
         self._start_ns, self._limit_s = start_ns, limit_s
         self._newest_ns = start_ns
-        self._edges_ns: list[int] = []      # on both sides of a gap
+        self._edges_ns: list[int] = []      # stamps before and after each gap
 
     def feed(self, block: ImuSamples) -> int:
         """Take IMU rows; return the stamp after a gap, 0 without a gap."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):
             return 0
-        known = np.append(self._newest_ns, np.sort(stamps))
-        gaps = np.flatnonzero(np.diff(known) > self._limit_s * 1e9)
+        stamps = np.append(self._newest_ns, np.sort(stamps))
+        gaps = np.flatnonzero(np.diff(stamps) > self._limit_s * 1e9)
         for k in gaps:
-            self._edges_ns += known[k:k + 2].tolist()
-        self._newest_ns = int(known[-1])
+            self._edges_ns += stamps[k:k + 2].tolist()
+        self._newest_ns = int(stamps[-1])
         return self._edges_ns[-1] if len(gaps) else 0
 
     def reasons(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """Return IMU_GAP if there was one; ``silent_s``: time without IMU messages."""
-        # rows closer than the limit fill the sections between the gaps
         t = (np.array([*self._edges_ns, self._newest_ns]) - self._start_ns) * 1e-9
         t = np.concatenate([[0.0], t])
-        sound = np.concatenate([np.arange(a, b, self._limit_s / 2)
-                                for a, b in t.reshape(-1, 2)] or [t])
+        # the sections between gaps are filled with times closer than the limit
+        filled = np.concatenate([np.arange(a, b, self._limit_s / 2) for a, b in t.reshape(-1, 2)])
         end = t[-1] + (silent_s if silent_s > SILENT_TIME else 0.0)
-        return imu_gap(np.union1d(sound, t), 0.0, float(end), self._limit_s)
+        return imu_gap(np.union1d(filled, t), 0.0, float(end), self._limit_s)
 
 
 @lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
@@ -113,8 +113,8 @@ def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
     spans = inputs.standstills(scale, config)
     resting = _within(t, spans)
     profile_window = 0.5    # s on each side, of the mean speed
-    path_length = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
-    speed = np.where(resting, 0.0, path_length * scale / (2 * profile_window))
+    travel = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
+    speed = np.where(resting, 0.0, travel * scale / (2 * profile_window))
     speed[~resting & (np.abs(speed) <= REST_SPEED)] = 2 * REST_SPEED   # too short to count as rest
     yaw = _yaw(inputs, spans, t)
     first_course = _first_course(t, speed, yaw, inputs.t_fix, located.fixes_n)
@@ -151,9 +151,11 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
     inside = (t_fix >= t[0]) & (t_fix <= t[-1])
     if inside.sum() < 2:
         return 0.0
-    at = np.interp(t_fix[inside], t, track.real) + 1j * np.interp(t_fix[inside], t, track.imag)
-    fixed = fixes_n[inside, 0] + 1j * fixes_n[inside, 1]
-    return float(np.angle(np.sum((fixed - fixed.mean()) * np.conj(at - at.mean()))))
+    times = t_fix[inside]
+    reckoned = np.interp(times, t, track.real) + 1j * np.interp(times, t, track.imag)
+    measured = fixes_n[inside, 0] + 1j * fixes_n[inside, 1]
+    return float(np.angle(np.sum((measured - measured.mean())
+                                 * np.conj(reckoned - reckoned.mean()))))
 
 
 def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:
@@ -161,9 +163,9 @@ def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:
     inside = (inputs.t_fix >= 0) & (inputs.t_fix <= inputs.t_stop)
     if inside.sum() < 2:
         raise BadData('fewer than two usable fixes between the marks')
-    middle = np.median(np.diagonal(inputs.covariance_n[inside], axis1=1, axis2=2), axis=0)
-    return {'fix': float(np.sqrt((middle[0] + middle[1]) / 2)),
-            'fix_up': float(np.sqrt(middle[2])),
+    variance = np.median(np.diagonal(inputs.covariance_n[inside], axis1=1, axis2=2), axis=0)
+    return {'fix': float(np.sqrt((variance[0] + variance[1]) / 2)),
+            'fix_up': float(np.sqrt(variance[2])),
             'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside]))),
             'quantum': inputs.travel.quantum * _locate_or_raise(inputs, config).rough}
 
@@ -185,8 +187,8 @@ class SmootherSoFar:
         """
         Return the running estimate.
 
-        leg : the data so far, including those of the last call.   config : at the leg's start.
-        is_needed : called between passes; Abandoned is raised if it returns False.
+        leg : the data so far, including those of the last call.   config : settings at the leg's
+        start.   is_needed : called between passes; Abandoned is raised if it returns False.
 
         Raises OdocalError: too few data, or no fit; the next update is a cold start.
         """
@@ -195,41 +197,42 @@ class SmootherSoFar:
                 raise Abandoned
 
         try:
-            view = self._view(leg, config)
+            smoother_leg = self._smoother_leg(leg, config)
         except BaseException:
             self._growing.forget()
             raise
-        return self._growing.fit(view, config, trace)
+        return self._growing.fit(smoother_leg, config, trace)
 
-    def _view(self, leg: Leg, config: Config) -> SmootherLeg:
-        seen = screened_in_cells(leg, config)
-        inputs = seen.inputs
+    def _smoother_leg(self, leg: Leg, config: Config) -> SmootherLeg:
+        """Return the inputs of the smoother; raise BadData if they are not sufficient yet."""
+        screened = screened_in_cells(leg, config)
+        inputs = screened.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs IMU and odometer samples')
         few = too_few_samples_reason(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
-        _refuse_unusable(seen.reasons)
+        _raise_if_unusable(screened.reasons)
         located = locate_fixes(inputs, config)
         if not located.rough:
             raise BadData('the scale is not known yet')
-        _refuse_unusable(orientation_reasons(estimate_orientation(inputs, located.rough),
-                                             config.imu.nominal_yaw))
+        _raise_if_unusable(orientation_reasons(estimate_orientation(inputs, located.rough),
+                                               config.imu.nominal_yaw))
         if vars(located.origin) != (self._origin and vars(self._origin)):
             self._origin = located.origin
             self._growing.forget()
         spans = inputs.standstills(located.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        view = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
-                                 located.rough, t_stop)
-        few = missing_samples_reason(view)
+        smoother_leg = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
+                                         located.rough, t_stop)
+        few = missing_samples_reason(smoother_leg)
         if few:
             raise BadData(few.text)
-        return view
+        return smoother_leg
 
 
-def _refuse_unusable(found: Iterable[Reason]) -> None:
-    why = [r.text for r in found if r.code in UNUSABLE]
-    if why:
-        raise BadData(why[0])
+def _raise_if_unusable(reasons: Iterable[Reason]) -> None:
+    for reason in reasons:
+        if reason.code in UNUSABLE:
+            raise BadData(reason.text)

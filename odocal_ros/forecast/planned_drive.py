@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A drive that is planned or recorded: speed, direction, slope by time; manoeuvres to add."""
+"""A planned or recorded drive as speed, yaw and slope by time, and manoeuvres added to it."""
 
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -15,16 +15,14 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import running_integral
 
 REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive is at rest
-SPOT_TURN = 0.05       # rad/s, judgement: a robot that turns on the spot is not at rest
+SPOT_TURN = 0.05      # rad/s, judgement: a robot that turns on the spot is not at rest
 DRIVE_STEP = 0.1      # s, judgement: time step of generated drives
-BRAKING = 1.5    # m/s^2, judgement: as in a town
-QUARTER = np.pi / 2    # definition: rad
-# judgement: a minute of town: rest, acceleration, cruise with a turn, braking, rest
+BRAKING = 1.5         # m/s^2, judgement: as in a town
+QUARTER = np.pi / 2   # definition: rad
+# judgement: a minute of town, s and m/s: rest, acceleration, cruise with a turn, braking, rest
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
-TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
-
-
+TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # turns of four minutes: left, left, right, right
 Drive = TypeVar('Drive', bound='PlannedDrive')
 
 
@@ -95,6 +93,7 @@ class PlannedDrive:
                                                                                 at_rest=True)
 
     def turn_around(self) -> 'PlannedDrive':
+        """Return the drive in the opposite direction."""
         return replace(self, yaw=self.yaw + np.pi)
 
     def cut_at(self, t_stop: float, rest: float) -> 'PlannedDrive':
@@ -155,13 +154,13 @@ def add_left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
     k = _middle_row(drive)
     v = drive.speed[k]
-    turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2, limit to the side
-    turn = max(turn_time, QUARTER * abs(v) / sideways_force)
+    shortest_turn, sideways_limit = 8.0, 2.0    # s; m/s^2
+    turn = max(shortest_turn, QUARTER * abs(v) / sideways_limit)
     between_turns = 5.0    # s straight between the two turns
-    whole = 2 * turn + between_turns
-    t = _time_grid(whole, turn, turn + between_turns)
+    end = 2 * turn + between_turns
+    t = _time_grid(end, turn, turn + between_turns)
     return insert_section(drive, k, t, np.full_like(t, v), np.interp(
-        t, [0.0, turn, turn + between_turns, whole], [0.0, QUARTER, QUARTER, 0.0]))
+        t, [0.0, turn, turn + between_turns, end], [0.0, QUARTER, QUARTER, 0.0]))
 
 
 def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
@@ -171,16 +170,16 @@ def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     v, yaw = drive.speed[k], 0.0
     t, speed, turned = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     brake = abs(v) / BRAKING
-    if brake > DRIVE_STEP:          # it ends in motion
-        own = _time_grid(brake)
-        t, speed, turned = [own], [v * (1 - own / brake)], [np.zeros_like(own)]
+    if brake > DRIVE_STEP:          # the drive ends in motion
+        times = _time_grid(brake)
+        t, speed, turned = [times], [v * (1 - times / brake)], [np.zeros_like(times)]
     town_turn = 22.0, 30.0    # s, begin and end in the minute
     for minute in range(minutes):
-        own = _time_grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
+        times = _time_grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
         angle = QUARTER * TOWN_SIDES[minute % len(TOWN_SIDES)]
-        t.append(own + brake + minute * TOWN_T[-1])
-        speed.append(np.interp(own, TOWN_T, TOWN_SPEED))
-        turned.append(yaw + np.interp(own, town_turn, [0.0, angle]))
+        t.append(times + brake + minute * TOWN_T[-1])
+        speed.append(np.interp(times, TOWN_T, TOWN_SPEED))
+        turned.append(yaw + np.interp(times, town_turn, [0.0, angle]))
         yaw += angle
     return insert_section(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
 
@@ -203,8 +202,8 @@ def insert_section(drive: Drive, k: int, t: Floats, speed: Floats, turned: Float
 def _middle_row(drive: PlannedDrive) -> int:
     """Return the row nearest to the middle of the path among those near the top speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
-    near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
-    fast = np.flatnonzero(speed >= near_top * speed.max())
+    fast_share = 0.9    # of the top speed: there is room for a manoeuvre
+    fast = np.flatnonzero(speed >= fast_share * speed.max())
     path_length = running_sum(np.abs(np.diff(drive.travel)))
     return int(fast[np.argmin(np.abs(path_length[fast] - path_length[-1] / 2))])
 

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Forecast of a run of a small robot: its motion, and the information of its estimator at the truth.
+Predicted sigmas of a planned run of a small robot.
 
-The motion is a pattern with rests on a level floor. The estimator is the planar one, or the
-smoother for two wheels with an IMU. Scale 1, angles 0: sigmas do not depend on them.
+The motion is a pattern with rests on a level floor. Its estimator is evaluated once, at the true
+states of samples without errors: the planar estimator, or the smoother for two wheels with an IMU.
+Scale factors are 1, angles 0: sigmas do not depend on them.
 """
 
 from dataclasses import dataclass, replace
@@ -29,13 +30,14 @@ from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.planar_run import known_values
 from odocal_ros.settings import config as settings
 
-MOTION_STEP = 0.1                     # s, definition: time step of a motion
+MOTION_STEP = 0.1              # s, definition: time step of a motion
 FULL_TURN = 2 * math.pi        # definition, rad
-# judgement: of a small robot: m/s^2, rad/s, rad/s^2; s at rest after a move, and at either end
+# judgement: of a small robot: m/s^2, rad/s, rad/s^2; s at rest after a move, and at the start and
+# the end
 ACCELERATION, TURN_RATE, TURN_ACCELERATION = 0.5, 0.8, 2.0
 REST, END_REST = 3.0, 5.0
 PATTERNS = 'straight', 'square', 'figure_eight', 'spot'
-Move = tuple[float, float, float]      # m forward, m to the left, rad to the left, at once
+Move = tuple[float, float, float]      # simultaneously m forward, m to the left, rad to the left
 # m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
 FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estimator uses
@@ -59,7 +61,7 @@ class RobotMotion:
 
     @property
     def moving(self) -> Bools:
-        """Return True where it moves: (n + 1,)."""
+        """Return True where the robot moves: (n + 1,)."""
         moving: Bools = (self.speed != 0) | (self.side != 0) | (self.rate != 0)
         return moving
 
@@ -90,22 +92,23 @@ def pattern_motion(name: str, size: float, rounds: int, drive: str,
         if drive in settings.HOLONOMIC and not move[2]:
             moves.append((0.0, side * size / 2, 0.0))
             side = -side
-    most = 36_000.0 / len(moves)      # s, judgement: ten hours in all, as of other planned drives
-    if size / speed > most:
+    longest_move = 36_000.0 / len(moves)      # s, judgement: ten hours, as of other planned drives
+    if size / speed > longest_move:
         raise BadUsage(f'--size {size:g} at --speed {speed:g}: more than ten hours')
     return _drive_moves(moves, speed)
 
 
 def _drive_moves(moves: list[Move], speed: float) -> RobotMotion:
-    first, still = round(END_REST / MOTION_STEP), np.zeros((round(REST / MOTION_STEP), 3))
-    velocity, rests = [np.zeros((first, 3))], [(first - len(still), first)]
+    """Return the motion of moves one after another, with rests; speed: largest, m/s."""
+    first, rest = round(END_REST / MOTION_STEP), np.zeros((round(REST / MOTION_STEP), 3))
+    velocity, rests = [np.zeros((first, 3))], [(first - len(rest), first)]
     for forward, left, turn in moves:
         length = math.hypot(forward, left)
-        shape = _speed_profile(length, speed, ACCELERATION) if length else _speed_profile(
+        profile = _speed_profile(length, speed, ACCELERATION) if length else _speed_profile(
             abs(turn), TURN_RATE, TURN_ACCELERATION)
-        begin = sum(map(len, velocity)) + len(shape)
-        velocity += [shape[:, None] * [forward, left, turn], still]
-        rests.append((begin, begin + len(still)))
+        begin = sum(map(len, velocity)) + len(profile)
+        velocity += [profile[:, None] * [forward, left, turn], rest]
+        rests.append((begin, begin + len(rest)))
     velocity.append(np.zeros((round((END_REST - REST) / MOTION_STEP) + 1, 3)))
     rows = np.concatenate(velocity)
     t: Floats = MOTION_STEP * np.arange(len(rows), dtype=float)
@@ -113,13 +116,13 @@ def _drive_moves(moves: list[Move], speed: float) -> RobotMotion:
 
 
 def _speed_profile(length: float, top: float, acceleration: float) -> Floats:
-    """Return the speed profile of a move as share of its length, 1/s: (n,)."""
+    """Return the trapezoidal speed of a move as share of its length, 1/s: (n,)."""
     top = min(top, math.sqrt(length * acceleration))
-    ramp, whole = top / acceleration, length / top + top / acceleration
-    t = MOTION_STEP * np.arange(1, max(2, math.ceil(whole / MOTION_STEP)) + 1)
-    shape = np.clip(np.minimum(t / ramp, (t[-1] + MOTION_STEP - t) / ramp), 0, 1)
-    out: Floats = shape / (shape.sum() * MOTION_STEP)
-    return out
+    ramp, duration = top / acceleration, length / top + top / acceleration
+    t = MOTION_STEP * np.arange(1, max(2, math.ceil(duration / MOTION_STEP)) + 1)
+    share_of_top = np.clip(np.minimum(t / ramp, (t[-1] + MOTION_STEP - t) / ramp), 0, 1)
+    profile: Floats = share_of_top / (share_of_top.sum() * MOTION_STEP)
+    return profile
 
 
 def _pattern_moves(name: str, size: float) -> list[Move]:
@@ -139,9 +142,10 @@ class Robot:
     """Robot and reference of a run."""
 
     drive: str                      # as odometer.drive
-    imu: bool                       # it has one
-    width: float                    # m, of skid steering on the spot; of HOLONOMIC twice the lever
-    straight_width: float = 0.0     # m, of skid steering straight on
+    imu: bool                       # it has an IMU
+    width: float                    # m, track width, of skid steering in turns on the spot; of
+                                    # HOLONOMIC twice the rotation lever
+    straight_width: float = 0.0     # m, track width of skid steering on a straight
     wheels: int = 2
     slip: float = 1e-3              # m/sqrt(s) of each wheel while it moves
     white: float = 0.02             # m, white error of the positions
@@ -152,38 +156,46 @@ class Robot:
 
 
 def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
-    """Return the run of a motion without errors, true states (n + 1, 5) and constants (w,)."""
-    d = motion.increments
-    wheels, more = _wheels(d, robot)
-    own = [*np.ones(wheels.count.shape[1]), 1 / robot.width, *more]
-    heading = running_sum(d[:, 2])
-    chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
+    """
+    Return the run of a motion without errors, true states (n + 1, 5) and constants (w,).
+
+    States are position, m, heading, rad, position drift; constants those of the wheels, then 0 for
+    the lever arm and errors of the gyro.
+    """
+    increments = motion.increments
+    wheels, drive_constants = _wheels(increments, robot)
+    constants = [*np.ones(wheels.count.shape[1]), 1 / robot.width, *drive_constants,
+                 *[0.0] * (3 + 2 * robot.imu)]
+    turn = increments[:, 2]
+    heading = running_sum(turn)
+    chord = (increments[:, 0] + 1j * increments[:, 1]) * np.sinc(turn / (2 * np.pi))
     z = running_sum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2))
     state = np.column_stack([z.real, z.imag, heading, 0 * heading, 0 * heading])
     node = _position_nodes(motion, robot)
-    gyro = d[:, 2] if robot.imu else np.empty(0)
+    gyro = turn if robot.imu else np.empty(0)
     run = Run(motion.t, wheels, node, state[node, :2], np.full(len(node), robot.white), gyro)
-    return run, state, np.array([*own, *[0.0] * (3 + 2 * robot.imu)])
+    return run, state, np.array(constants)
 
 
-def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
+def _wheels(increments: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
     """Return the wheels of body increments, (n, 3), and the constants after the inverse width."""
     if robot.drive in settings.HOLONOMIC:
         rows = wheel_rows(robot.drive, robot.wheels)
-        count = (d * [1.0, 1.0, robot.width / 2]) @ rows.T
+        count = (increments * [1.0, 1.0, robot.width / 2]) @ rows.T
         return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == settings.MECANUM)
-    half = d[:, 2] * robot.width / 2      # of the difference of the wheel paths
+    forward, turn = increments[:, 0], increments[:, 2]
+    half_difference = turn * robot.width / 2      # of the wheel paths
     arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
 
-    def wheels_of(half: Floats) -> Wheels:
-        return make_side_wheels(d[:, 0] - half, d[:, 0] + half, robot.drive)
+    def side_wheels() -> Wheels:
+        return make_side_wheels(forward - half_difference, forward + half_difference, robot.drive)
     for _ in range(50 * (robot.drive == settings.SKID)):      # the width depends on the paths
-        half = d[:, 2] / (1 / robot.width + arc * wheels_of(half).straightness) / 2
-    return wheels_of(half), [arc] * (robot.drive == settings.SKID)
+        half_difference = turn / (1 / robot.width + arc * side_wheels().straightness) / 2
+    return side_wheels(), [arc] * (robot.drive == settings.SKID)
 
 
 def _position_nodes(motion: RobotMotion, robot: Robot) -> Ints:
-    """Return the nodes with a position."""
+    """Return the indices of the times with a position; at rests, within 0.5 s of their middle."""
     every = max(1, round(1 / (min(robot.rate, FASTEST_NODES) * MOTION_STEP)))
     node = np.arange(0, len(motion.t), every)
     if robot.at_rests:
@@ -205,14 +217,15 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -
 def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
     """Return the noise levels that a fit would estimate, at the mean path of a wheel."""
     d = motion.increments
-    path = np.hypot(d[:, 0], d[:, 1]) + np.abs(d[:, 2]) * robot.width / 2
+    straight, turning = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2]) * robot.width / 2
+    path = straight + turning
     moving = path > 0
-    spins = moving & (np.hypot(d[:, 0], d[:, 1]) < np.abs(d[:, 2]) * robot.width / 2)
+    spins = moving & (straight < turning)
 
-    def level(of: Bools) -> float:
+    def level(rows: Bools) -> float:
         """Return the variance of the slip of one wheel per metre of its path."""
-        metres = (path[of] + 0.1 * MOTION_STEP).sum() if of.any() else 1.0
-        return float(robot.slip**2 * max(of.sum(), 1) * MOTION_STEP / metres)
+        metres = (path[rows] + 0.1 * MOTION_STEP).sum() if rows.any() else 1.0
+        return float(robot.slip**2 * max(rows.sum(), 1) * MOTION_STEP / metres)
     table = (run.wheels.body_by_wheel**2).sum(1) * len(run.wheels.rows) / robot.wheels
     side = level(moving) * table[1] if robot.drive in settings.HOLONOMIC else NO_SIDE_SLIP
     found = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
@@ -225,30 +238,30 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     """Return the prediction of the smoother for two wheels: covariance of its fit at the truth."""
     speed = motion.distance / float(motion.t[-1])
     drifts = robot.drift > 0 and not robot.at_rests
-    correlated = robot.drift_length / max(speed, 1e-3) if drifts else 0.0
-    config = settings.with_settings(config.in_local_frame(), {'gnss.correlation_time': correlated})
+    tau = robot.drift_length / max(speed, 1e-3) if drifts else 0.0
+    config = settings.with_settings(config.in_local_frame(), {'gnss.correlation_time': tau})
     sigmas = Sigmas(config=config, fix=robot.white, fix_up=robot.white, fix_rate=robot.rate,
                     sway=float(robot.slip * np.sqrt(planned_methods.SWAY_RATE)),
                     slip=float(robot.slip / np.sqrt(robot.wheels)))
     drive = drive_from_rates(motion.t, motion.speed, motion.rate)
-    made = planned_methods.ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
-    leg = made.leg
-    turned = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
+    ideal = planned_methods.ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
+    leg = ideal.leg
+    half_difference = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
     used = _fixes_at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)
     leg = replace(
         leg, t_fix=leg.t_fix[used], fixes_n=leg.fixes_n[used],
         covariance_n=leg.covariance_n[used],
-        wheels=tuple(replace(leg.travel, s=leg.travel.s + side * turned, name=name)
-                     for side, name in zip((-1, 1), settings.SIDES, strict=True)),
+        wheels=tuple(replace(leg.travel, s=leg.travel.s + sign * half_difference, name=side)
+                     for sign, side in zip((-1, 1), settings.SIDES, strict=True)),
         origin=replace(leg.origin, local=rate_without_north(leg.origin.latitude)))
-    # the positions of a mark share one error
-    made = replace(made, leg=leg, fixes_in_one=1.0 if robot.at_rests else made.fixes_in_one)
-    problem = make_problem(leg, config, made.imu)
-    white = 1 / made.fixes_in_one
-    slow = 2 / max(correlated, 1.0) * robot.drift**2 * drifts
-    levels = planned_methods.planned_noise_levels(problem, sigmas, made.fixes_in_one).replaced(
+    # the positions of a rest share one error
+    ideal = replace(ideal, leg=leg, fixes_in_one=1.0 if robot.at_rests else ideal.fixes_in_one)
+    problem = make_problem(leg, config, ideal.imu)
+    white = 1 / ideal.fixes_in_one
+    slow = 2 / max(tau, 1.0) * robot.drift**2 * drifts      # driving noise of the drift
+    levels = planned_methods.planned_noise_levels(problem, sigmas, ideal.fixes_in_one).replaced(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
-    fit = planned_methods.fit_at_truth(problem, made, levels)
+    fit = planned_methods.fit_at_truth(problem, ideal, levels)
     return _with_slip(make_result(leg, problem, fit, config), motion, robot)
 
 
@@ -263,20 +276,20 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
     covariance = np.linalg.pinv(d.T @ d) * 2 * robot.slip**2 * MOTION_STEP
     ratio, width = np.sqrt(np.diag(covariance))
     estimates = dict(method.estimates)
-    for name, more in (('scale_factor_left', ratio / 2), ('scale_factor_right', ratio / 2),
-                       ('track_width', width)):
+    for name, slip_sigma in (('scale_factor_left', ratio / 2), ('scale_factor_right', ratio / 2),
+                             ('track_width', width)):
         one = estimates[name]
         if one.sigma is not None:
-            estimates[name] = replace(one, sigma=float(np.hypot(one.sigma, more)))
+            estimates[name] = replace(one, sigma=float(np.hypot(one.sigma, slip_sigma)))
     return replace(method, estimates=estimates, details=method.details | {
         'ratio_sigma': float(ratio)})
 
 
 def _fixes_at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
-    """Return the fix nearest to the middle of each rest, one for each mark."""
+    """Return the indices of the fixes nearest to the middle of each rest; t_fix from the start."""
     middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
-    out: Ints = np.abs(t_fix[:, None] - middle).argmin(axis=0)
-    return out
+    nearest: Ints = np.abs(t_fix[:, None] - middle).argmin(axis=0)
+    return nearest
 
 
 def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Predictions of the methods for a planned drive.
+Predicted results of the methods for a planned drive: sigmas, reasons, verdict.
 
-That of the smoother is its covariance at the truth, with ideal samples of the drive: IMU, odometer
-and fixes without any error.
+The prediction of the smoother is its covariance at the true states, with ideal samples of the
+drive: IMU, odometer and fixes without errors.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway
 class IdealSamples:
     """A planned drive as input of the smoother, free of errors."""
 
-    leg: SmootherLeg        # fixes and headings are thinned to one for each keyframe or so
+    leg: SmootherLeg        # at most one fix and one heading for each keyframe
     imu: ImuSteps           # with keyframes
     state: State            # true state at the keyframes
     fixes_in_one: float     # number of planned fixes that each fix of the leg replaces
@@ -60,33 +60,34 @@ class IdealSamples:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Motion of the IMU at t (m,) s: attitude (m, 3, 3), place, velocity, force, rate (m, 3)."""
+    """Motion of the IMU, and travel of the odometer."""
 
-    t: Floats
-    C_nb: Floats
-    p_n: Floats
-    v_n: Floats
-    f_b: Floats
-    w_b: Floats
-    travel: Floats
+    t: Floats         # (m,) s
+    C_nb: Floats      # (m, 3, 3) attitude
+    p_n: Floats       # (m, 3) m, position
+    v_n: Floats       # (m, 3) m/s
+    f_b: Floats       # (m, 3) m/s^2, specific force
+    w_b: Floats       # (m, 3) rad/s, with the Earth's rate
+    travel: Floats    # (m,) m
 
 
 def ideal_samples(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> IdealSamples:
     """
     Return the samples of a drive without any error.
 
-    drive : as planned. Mounting angles are zero, the scale is 1: sigmas do not depend on them.
+    Mounting angles are zero, the scale is 1: sigmas do not depend on them.
+
     sigmas : lever arms, fix rate and sigma, size of a count, external heading.   spacing : s
     between keyframes.
     """
     config = sigmas.config
     spans = np.array(drive.standstills(config.leg.standstill)).reshape(-1, 2)
-    before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
-    t_begin = max(min(0.0, float(before[-1][0])), -config.leg.preroll) if before else 0.0
+    at_start = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
+    t_begin = max(min(0.0, float(at_start[-1][0])), -config.leg.preroll) if at_start else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
-    sample_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
-    samples_enough = 50    # samples between keyframes that lie far apart
-    rate = min(sample_rate, samples_enough / spacing)
+    highest_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
+    samples_per_interval = 50    # enough between keyframes that lie far apart
+    rate = min(highest_rate, samples_per_interval / spacing)
     t = np.linspace(t_begin, drive.duration, max(2, round((drive.duration - t_begin) * rate) + 1))
     motion = _imu_motion(drive, t, origin, config)
     t_fix = _sample_times(t_begin, drive.duration, sigmas.fix_rate, spacing)
@@ -110,8 +111,8 @@ def _imu_motion(drive: PlannedDrive, t: Floats, origin: Origin, config: Config) 
     """Return the motion of the IMU in the frame n."""
     speed, yaw, slope = (np.interp(t, drive.t, x) for x in (drive.speed, drive.yaw, drive.slope))
     C_nb = matrix_from_rpy(np.stack([np.zeros_like(yaw), -slope, yaw], -1))
-    turn, climb = np.gradient(yaw, t), np.gradient(slope, t)
-    w_nb = np.stack([turn * np.sin(slope), -climb, turn * np.cos(slope)], -1)
+    yaw_rate, slope_rate = np.gradient(yaw, t), np.gradient(slope, t)
+    w_nb = np.stack([yaw_rate * np.sin(slope), -slope_rate, yaw_rate * np.cos(slope)], -1)
     arm = np.subtract(config.imu.lever_arm, config.odometer.lever_arm)
     wheel_n = C_nb[:, :, 0] * speed[:, None]
     p_n = running_integral(t, wheel_n) + (C_nb - C_nb[0]) @ arm
@@ -154,10 +155,9 @@ def _true_state(motion: _Motion, key: Ints) -> State:
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
                      spacing: float | None = None) -> MethodResult:
     """
-    Return the prediction of the smoother for a drive, covariance only.
+    Return the prediction of the smoother: its result at the true states of ideal samples.
 
-    The equations are those of ``smooth`` at the true states of ideal samples; reasons are from the
-    same code as for a fit. Scale is 1, angles are 0; sigmas and budget are the predicted ones.
+    The scale is 1, angles are 0; sigmas, budget and reasons are computed as after a fit.
     spacing : s between keyframes; default: ``keyframe_spacing``.
     """
     few = too_few_samples_reason(int(drive.duration * sigmas.fix_rate), drive.duration)
@@ -176,9 +176,12 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
 
 
 def keyframe_spacing(drive: PlannedDrive) -> float:
-    """Return the time between keyframes for the prediction of a drive, s."""
-    # keyframes lie farther apart in longer drives: sigmas are 5 to 10 % too large at
-    # WIDEST_SPACING, more beyond two hours, longer than a live leg may last; never too small
+    """
+    Return the time between keyframes for the prediction of a drive, s.
+
+    It grows with the duration. Sigmas are 5 to 10 % too large at WIDEST_SPACING, more beyond two
+    hours, longer than a live leg may last; never too small.
+    """
     enough_intervals, most_intervals = 600, 1440
     usual = np.clip(drive.duration / enough_intervals, SPACING, WIDEST_SPACING)
     return float(max(usual, drive.duration / most_intervals))
@@ -205,24 +208,24 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
     # the bound is for one fix, not for the fixes that it replaces
     least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
     return problem.initial_levels.replaced(
-        correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
+        correlation_time=tau, **{name: max(value, least[name]) for name, value in values.items()})
 
 
 def fit_at_truth(problem: Problem, ideal: IdealSamples, levels: Levels) -> Fit:
-    """Return the fit at the true state, without any step."""
+    """Return the fit at the true state, without any iteration; no level is estimated."""
     state, priors = ideal.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, VARIANCE_FACTOR_COUNT)),
-               True, False, 0,
-               np.nan, weighted, weighted.solved(), np.zeros((M, 0)))     # none estimated
+               converged=True, slowly_converging=False, iterations=0, likelihood=np.nan,
+               weighted=weighted, solved=weighted.solved(), by_levels=np.zeros((M, 0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The prediction of a drive."""
+    """The prediction of a drive with all configured methods."""
 
-    two_point: Prediction               # between the operator's marks, with alignment and drive
-    methods: dict[str, MethodResult]    # name -> predicted result
+    two_point: Prediction               # with alignment, path length and reasons of the drive
+    methods: dict[str, MethodResult]    # predicted result by name of the method
     estimates: dict[str, Estimate]      # each from the method that will provide it, as in a result
     deciding: tuple[str, ...]           # the methods that may give a parameter
 
@@ -243,16 +246,16 @@ class Plan:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the predicted verdict: of the drive and the best method."""
+        """Return the predicted verdict: the worse one of the drive and of the best method."""
         order = list(Verdict)
         best = min((verdict_of(self.reasons_of(name)) for name in self.deciding), key=order.index)
-        return Verdict.worst([verdict_of(self.two_point.of_drive), best])
+        return Verdict.worst([verdict_of(self.two_point.drive_reasons), best])
 
     def reasons_of(self, name: str) -> tuple[Reason, ...]:
         """Return the predicted reasons of a method; for two_point also those of its alignment."""
         if name != 'two_point':
             return self.methods[name].reasons
-        return tuple(r for r in self.two_point.reasons if r not in self.two_point.of_drive)
+        return tuple(r for r in self.two_point.reasons if r not in self.two_point.drive_reasons)
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
@@ -262,24 +265,24 @@ class Plan:
         Those of the drive, of the smoother, and of methods that give a parameter; of the other
         methods the refusals only.
         """
-        reasons = list(self.two_point.of_drive)
+        reasons = list(self.two_point.drive_reasons)
         for name in self.methods:
-            own = relevant_reasons(self.reasons_of(name), name, self.estimates)
+            relevant = relevant_reasons(self.reasons_of(name), name, self.estimates)
             if name == 'smoother':
-                own = tuple(r for r in self.reasons_of(name) if r in own
-                            or r.code.name.endswith('_NOT_DETERMINED'))
+                relevant = tuple(r for r in self.reasons_of(name) if r in relevant
+                                 or r.code.name.endswith('_NOT_DETERMINED'))
             elif name not in self.methods_used:
-                own = tuple(r for r in own if r.code.severity is Verdict.REJECTED)
-            reasons += [r for r in own if r not in reasons]
+                relevant = tuple(r for r in relevant if r.code.severity is Verdict.REJECTED)
+            reasons += [r for r in relevant if r not in reasons]
         return tuple(reasons)
 
 
 def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = None) -> Plan:
     """Return the predictions of the configured methods; arguments as ``predict_smoother``."""
-    may_give = deciding_methods(sigmas.config.method)
+    deciding = deciding_methods(sigmas.config.method)
     two_point = predict(drive, sigmas)
     methods = {'two_point': two_point.method}
-    if 'smoother' in may_give:
+    if 'smoother' in deciding:
         methods = {'smoother': predict_smoother(drive, sigmas, spacing)} | methods
-    estimates, _ = choose({name: methods[name] for name in may_give}, may_give)
-    return Plan(two_point, methods, estimates, may_give)
+    estimates, _ = choose({name: methods[name] for name in deciding}, deciding)
+    return Plan(two_point, methods, estimates, deciding)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Prediction of the sigmas of a leg, before or during the drive.
+Prediction of the sigmas of the two-point method for a leg, before or during the drive.
 
 The planned drive is converted to a track, two marks and an alignment, as a recorded one, and
 processed by ``two_point.fit``: predictions and results have the same error budget.
@@ -49,7 +49,7 @@ from odocal_ros.settings.levels import SWAY
 from odocal_ros.settings.nominal import Grade, grade_with_turn_on_bias
 
 SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
-OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
+EXTERNAL_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,22 +67,22 @@ class Sigmas:
     fix_up: float | None = None      # m, up; None: twice that
     fix_rate: float = 5.0            # Hz
     quantum: float = 0.0             # m, size of an odometer count, 0 for speeds
-    # while driving, for the smoother only: m/s, white at 10 Hz, of the odometer's point to the
-    # side and up; m/sqrt(s) of the wheels
+    # for the smoother only: motion of the odometer's point to the side and up, m/s, white at 10
+    # Hz; slip of the wheels, m/sqrt(s)
     sway: float = SWAY
     slip: float = SLIP
 
     def __post_init__(self) -> None:
         up = 2 * self.fix if self.fix_up is None else self.fix_up
-        for what, value in (('fix sigma', self.fix), ('height sigma of the fixes', up),
-                            ('fix rate', self.fix_rate),
-                            ('heading sigma', self.config.alignment.heading_sigma)):
+        for label, value in (('fix sigma', self.fix), ('height sigma of the fixes', up),
+                             ('fix rate', self.fix_rate),
+                             ('heading sigma', self.config.alignment.heading_sigma)):
             if not (np.isfinite(value) and value > 0):
-                raise BadConfig(f'{what} {value:g}: required: a number above 0')
-        for what, value in (('size of a count', self.quantum), ('sway', self.sway),
-                            ('slip', self.slip)):
+                raise BadConfig(f'{label} {value:g}: required: a number above 0')
+        for label, value in (('size of a count', self.quantum), ('sway', self.sway),
+                             ('slip', self.slip)):
             if not (np.isfinite(value) and value >= 0):
-                raise BadConfig(f'{what} {value:g}: required: 0 or more')
+                raise BadConfig(f'{label} {value:g}: required: 0 or more')
 
     @property
     def covariance_n(self) -> Floats:
@@ -93,24 +93,23 @@ class Sigmas:
     @property
     def correlation_time(self) -> float:
         """Return the correlation time of fix errors, s; 0: white."""
-        limit = self.config.gnss.correlation_time
-        # s, default correlation time of fixes of one receiver
-        correlation_time = 60.0
-        return correlation_time if np.isnan(limit) else limit
+        configured = self.config.gnss.correlation_time
+        single_receiver = 60.0    # s, of fixes without corrections
+        return single_receiver if np.isnan(configured) else configured
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The prediction of a drive by one method."""
+    """The prediction of a drive by the two-point method."""
 
     method: MethodResult                  # as in a result; scale factor 1, angles 0
     reasons: tuple[Reason, ...]           # of drive and method
     alignment: Alignment
-    distance: float                       # m
-    chord: float                          # m
+    distance: float                       # m, path length between the marks
+    chord: float                          # m, distance between the marks
     duration: float                       # s
-    standing: tuple[float, float]         # s of rest for each mark, 0 in motion
-    of_drive: tuple[Reason, ...] = ()     # those of the drive, for all methods
+    standing: tuple[float, float]         # s of rest at each mark, 0 in motion
+    drive_reasons: tuple[Reason, ...]     # the reasons that concern all methods
 
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma of a parameter, relative or rad; None: it will not be determined."""
@@ -124,7 +123,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
         raise BadUsage(f'the leg lasts {drive.duration:.3g} s, less than one fix interval '
                        f'({1 / sigmas.fix_rate:.3g} s); drive longer or raise the fix rate')
     spans = drive.standstills(config.leg.standstill)
-    alignment, found = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
+    alignment, alignment_reasons = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
     track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
                         Travel(drive.t, drive.travel, sigmas.quantum))
     distance, drive_reasons = check_drive(track, drive.duration, 1.0, config.leg)
@@ -134,7 +133,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
     chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
                   np.zeros(3), _velocity_change(track, (start, end)), alignment)
-    reasons = (*found, *drive_reasons)
+    reasons = (*alignment_reasons, *drive_reasons)
     refused = refusal_reasons(chord, 1.0)
     if refused:
         method = refused_result(refused, '1')
@@ -151,27 +150,27 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
 def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, limit: float,
                             farthest: float = 1e5) -> float | None:
     """
-    Return the straight distance, m, that brings a sigma down to its limit.
+    Return the additional straight distance, m, that brings a sigma down to its limit.
 
     None if no distance up to ``farthest`` m is enough: a two-point yaw is never better than its
     heading.
     """
-    def enough(metres: float) -> bool:
+    def is_enough(metres: float) -> bool:
         longer = drive.lengthen(metres) if metres else drive
         sigma = predict(longer, sigmas).sigma(parameter)
         return sigma is not None and sigma <= limit
 
-    if enough(0.0):
+    if is_enough(0.0):
         return 0.0
     # gyro drift may cancel the gain of a longer chord: try several lengths, then bisect
-    tried = [farthest / 2**k for k in range(14, -1, -1)]
-    high: float | None = next((m for m in tried if enough(m)), None)
+    lengths = [farthest / 2**k for k in range(14, -1, -1)]
+    high: float | None = next((m for m in lengths if is_enough(m)), None)
     if high is None:
         return None
-    low = 0.0 if high == tried[0] else high / 2
+    low = 0.0 if high == lengths[0] else high / 2
     while high - low > max(1.0, 0.01 * high):
         middle = (low + high) / 2
-        low, high = (low, middle) if enough(middle) else (middle, high)
+        low, high = (low, middle) if is_enough(middle) else (middle, high)
     return high
 
 
@@ -216,23 +215,25 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     """
     Return the alignment of a planned drive, and its reasons.
 
-    drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
-    m, for a course.   spans : list of (begin, end) standstills, s.
+    config : grade, heading source and its sigma.   fix_sigma : of one fix, m, for a course.
+    spans : list of (begin, end) standstills, s.
     """
     grade = grade_with_turn_on_bias(config.imu)
     span = choose_standstill(spans)
-    found: tuple[Reason, ...] = ()
+    level_reasons: tuple[Reason, ...] = ()
     if span is not None:
         level = _level_at_rest(drive, span, grade)
     else:
         level = _level_in_motion(drive, grade)
-        found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '
-                        'bias are estimated from the drive'),)
-    yaw, sigma, source, why = _heading(drive, config.alignment, fix_sigma, level, grade)
+        level_reasons = (Reason(
+            Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro bias are '
+            'estimated from the drive'),)
+    yaw, sigma, source, heading_reasons = _heading(drive, config.alignment, fix_sigma, level,
+                                                   grade)
     alignment = make_alignment(level, yaw, sigma, source, source != 'gyrocompass',
                                Origin(drive.latitude, drive.longitude, drive.height), grade,
                                grade.gyro_noise)
-    return alignment, found + why
+    return alignment, level_reasons + heading_reasons
 
 
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
@@ -247,36 +248,35 @@ def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade)
 
 def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
     """Return the level from the first half minute of driving."""
-    pick = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
-    if pick.sum() < 2:
-        pick = np.arange(len(drive.t)) < 2
-    t, C_nb = drive.t[pick], drive.C_nb[pick]
-    velocity_n = C_nb[:, :, 0] * drive.speed[pick][:, None]
+    rows = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
+    if rows.sum() < 2:
+        rows = np.arange(len(drive.t)) < 2
+    t, C_nb = drive.t[rows], drive.C_nb[rows]
+    velocity_n = C_nb[:, :, 0] * drive.speed[rows][:, None]
     f_n = np.gradient(velocity_n, t, axis=0) + [0.0, 0.0, gravity(drive.latitude, drive.height)]
     q_nb = quat_from_matrix(C_nb)
     return level_in_motion(t, rotate_back(C_nb, f_n),
                            quat_multiply(quat_conjugate(q_nb[0]), q_nb),
-                           drive.speed[pick][[0, -1]], drive.latitude, grade)
+                           drive.speed[rows][[0, -1]], drive.latitude, grade)
 
 
 def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: Level,
              grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
-    """Return yaw, sigma and source of the heading, and its reasons."""
+    """Return yaw, rad, its sigma and the source of the heading, and reasons."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))
     source = config.source
-    why: tuple[Reason, ...] = ()
+    if source in EXTERNAL_SOURCES:
+        return yaw, config.heading_sigma, source, ()
+    reasons: tuple[Reason, ...] = ()
     if source in ('auto', 'gyrocompass'):
-        unable = 'needs a standstill'
+        problem = 'needs a standstill'
         if level.standstill is not None:
             _, sigma = gyrocompass(level, drive.latitude, grade)
             if sigma <= COMPASS_LIMIT:
                 return yaw, sigma, 'gyrocompass', ()
-            unable = ('the gyro bias causes a heading uncertainty of '
-                      f'{np.rad2deg(min(sigma, np.pi)):.1f} deg')
+            problem = ('the gyro bias causes a heading uncertainty of '
+                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg')
         if source == 'gyrocompass':
-            why = (Reason(Code.GYROCOMPASS_REFUSED, f'heading from gyrocompass: {unable}'),)
-        source = 'course'
-    if source in OWN_SOURCES:
-        return yaw, config.heading_sigma, source, ()
+            reasons = (Reason(Code.GYROCOMPASS_REFUSED, f'heading from gyrocompass: {problem}'),)
     path_length = max(COURSE_DISTANCE, 8 * fix_sigma)
-    return yaw, float(np.sqrt(2) * fix_sigma / path_length), 'course', why
+    return yaw, float(np.sqrt(2) * fix_sigma / path_length), 'course', reasons

@@ -22,7 +22,7 @@ from odocal_ros.settings.nominal import nominal_scale
 IMU_BLOCKS = 40       # judgement: newest IMU blocks to compare other topics with: some seconds
 CLOCK_ROWS = 10       # judgement: newest rows of a topic that determine its clock
 SPEED_SPAN_NS = 10**9       # judgement: minimum time over which a speed is computed
-STANDING_S = 0.5            # judgement: after it without a count, the vehicle is at rest
+STANDING_S = 0.5            # judgement: without a count for this time, the vehicle is at rest
 SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
 
 
@@ -35,19 +35,22 @@ class Clocks:
 
     def __init__(self, simulated: bool = False) -> None:
         self._simulated = simulated
+        # arrivals and stamps of IMU blocks; arrival and stamp of the newest row of other topics,
+        # until a later IMU block arrives
         self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
-        self._waiting: dict[str, tuple[int, int]] = {}      # newest rows, until the IMU's
+        self._waiting: dict[str, tuple[int, int]] = {}
         self._ahead_s: dict[str, deque[float]] = {}
 
     def feed(self, slot: str, block: Samples) -> None:
+        """Take a block of a topic."""
         if slot != 'imu':
             self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
             return
         self._imu.append((block.received_ns, block.stamp_ns))
         if not self._waiting:
             return
-        # differences first: float64 seconds since 1970 have a resolution of 238 ns
         received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        # relative to the first: float64 seconds since 1970 have a resolution of 238 ns
         first_received, first_stamp = int(received[0]), int(stamps[0])
         received, stamps = received - first_received, stamps - first_stamp
         # messages that queue for a node in simulated time arrive late, those of the IMU more than
@@ -67,20 +70,20 @@ class Clocks:
         result = []
         for slot, ahead in self._ahead_s.items():
             offset = stamp_offsets(config)[slot]
-            # latency makes a row look older: a clock is only behind if its newest row is; latency
+            # latency makes a row look older: a clock is behind only if all its rows are; latency
             # of IMU rows makes others look newer: a clock is ahead if most of its rows are
-            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
-            if abs(value) > CLOCK_DIFFERENCE_LIMIT:
-                result.append((slot, value))
+            difference = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
+            if abs(difference) > CLOCK_DIFFERENCE_LIMIT:
+                result.append((slot, difference))
         return result
 
 
 def clock_difference_text(clocks: list[tuple[str, float]]) -> str:
     """Return the sentence about clocks that differ from the IMU's."""
-    seen = ', '.join(
+    differences = ', '.join(
         f'{slot} stamps are {_format_difference(abs(s))} {"ahead of" if s > 0 else "behind"} '
         'the IMU stamps' for slot, s in clocks)
-    return f'CLOCKS_DIFFER: {seen}. {clock_remedy(max((s for _, s in clocks), key=abs))}'
+    return f'CLOCKS_DIFFER: {differences}. {clock_remedy(max((s for _, s in clocks), key=abs))}'
 
 
 def _format_difference(seconds: float) -> str:
@@ -97,19 +100,19 @@ def scale_so_far(config: Config, form: OdometerForm | None, found: float = np.na
     return nominal_scale(config, form.scale_unit)
 
 
-class Travel:
+class OdometerProgress:
     """Distance, speed and standstill from odometer blocks, in odometer units."""
 
     def __init__(self, form: OdometerForm) -> None:
         self.form = form
-        self.total = 0.0
+        self.total = 0.0         # path length
         self.moved_ns = 0        # stamp of the last motion
         self.newest_ns = 0
-        self._rows = StepReader(form)
-        self._anchor = 0.0
-        self._rest = 0.0, 0      # length, s, and end of the last standstill
         self.top = 0.0           # highest speed, units/s
-        self._since = 0.0, 0     # total and stamp at the start of a speed
+        self._rows = StepReader(form)
+        self._moved_total = 0.0  # path length at the last motion
+        self._rest = 0.0, 0      # length, s, and end of the last standstill
+        self._since = 0.0, 0     # path length and stamp from which a speed is computed
 
     def feed(self, block: OdometerSamples, scale: float) -> None:
         """Take a block; scale: m per unit, 0 unknown."""
@@ -120,11 +123,11 @@ class Travel:
             steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
         path = self.total + np.cumsum(np.abs(steps))
         for total, stamp in zip(path, stamps, strict=True):
-            if total - self._anchor > self._rows.still:
+            if total - self._moved_total > self._rows.still:
                 rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
                 if rest_ns > SHORTEST_REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
-                self._anchor, self.moved_ns = total, int(stamp)
+                self._moved_total, self.moved_ns = total, int(stamp)
         self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
         self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
         before, since_ns = self._since
@@ -134,13 +137,14 @@ class Travel:
             self._since = self.total, self.newest_ns
 
     def still_s(self) -> float:
+        """Return the time since the last motion, s; 0 before the first row."""
         return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
 
     def rested_s(self, since_s: float) -> float:
-        """Return the duration of the current or the last standstill, if that is recent enough."""
-        length, end_ns = self._rest
-        recent = self.newest_ns - end_ns < since_s * 1e9
-        return max(self.still_s(), length if recent else 0.0)
+        """Return the longer of the current standstill and one that ended within since_s, s."""
+        last_s, end_ns = self._rest
+        is_recent = self.newest_ns - end_ns < since_s * 1e9
+        return max(self.still_s(), last_s if is_recent else 0.0)
 
 
 class FixPath:
@@ -156,7 +160,7 @@ class FixPath:
                 block.latitude, block.longitude, block.stamp_ns,
                 block.covariance_n[:, 0, 0], block.status, strict=True):
             if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
-                continue        # NaN among them
+                continue        # also NaN
             if self._anchor is None or not moving:
                 self._anchor = (lat, lon, stamp)
                 continue
@@ -176,36 +180,37 @@ class Progress:
 
     def __init__(self, simulated: bool = False) -> None:
         self.clocks = Clocks(simulated)
-        self._travel: Travel | None = None
+        self._travel: OdometerProgress | None = None
         self._path = FixPath()
-        self._zero = 0.0
-        self._scale = 0.0
+        self._start_total = 0.0                # odometer path at the start of the leg
+        self._scale = 0.0                      # m per unit of the odometer, 0: unknown
         self._last: dict[str, Any] = {}        # slot -> newest block
 
     def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
              found_scale: float) -> None:
+        """Take a block; found_scale: m per odometer unit by an earlier result, or NaN."""
         if not len(block.stamp_ns):
             return
         self.clocks.feed(slot, block)
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
             self._scale = scale_so_far(config, form, found_scale)
-            self._travel = self._travel or Travel(form)
+            self._travel = self._travel or OdometerProgress(form)
             self._travel.feed(block, self._scale)
         elif slot == 'fix':
             moving = bool(self._travel and self._travel.moved_ns) and self.still_s() < STANDING_S
             self._path.feed(block, config.gnss.min_status, moving)
 
     def received_before(self, preroll_s: float) -> Received:
-        """Return the samples so far that determine what a leg can estimate."""
+        """Return the contents of the samples so far that determine what a leg can estimate."""
         fix, imu = self._last.get('fix'), self._last.get('imu')
-        place: dict[str, Any] = {}
+        position: dict[str, Any] = {}
         if fix is not None and np.isfinite(fix.latitude[-1]):
-            place = {'latitude': float(fix.latitude[-1]),
-                     'height': bool(np.isfinite(fix.height[-1]))}
+            position = {'latitude': float(fix.latitude[-1]),
+                        'height': bool(np.isfinite(fix.height[-1]))}
         variances = {name: stated_variance(self._last[slot]) if slot in self._last else np.inf
                      for slot, name in (('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
-        return Received(variances, **place,
+        return Received(variances, **position,
                         has_accelerometer=imu is None or has_accelerometer(imu.f_i),
                         rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
@@ -213,12 +218,12 @@ class Progress:
         """Restart distance and highest speed."""
         self._path = FixPath()
         if self._travel is not None:
-            self._zero, self._travel.top = self._travel.total, 0.0
+            self._start_total, self._travel.top = self._travel.total, 0.0
 
     def distance_m(self) -> float:
         """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
         if self._travel is not None and self._scale > 0:
-            return (self._travel.total - self._zero) * self._scale
+            return (self._travel.total - self._start_total) * self._scale
         return self._path.total
 
     def max_speed(self) -> float:
@@ -228,4 +233,5 @@ class Progress:
         return self._path.top
 
     def still_s(self) -> float:
+        """Return the time since the last motion of the odometer, s."""
         return self._travel.still_s() if self._travel else 0.0

@@ -4,8 +4,9 @@
 """
 Quantities of a leg: which are observable with the settings, and which are within their limits.
 
-Before a leg, the functions that process recorded drives decide which are observable. While it is
-recorded and after it, each quantity has yes, no or unknown: whether its sigma is within the limit.
+Before a leg, ``find_observable`` decides with the functions that process recorded drives. While a
+leg is recorded, and of its result, the sigma of each quantity is compared with its limit: yes, no
+or unknown.
 """
 
 from collections.abc import Sequence, Set
@@ -48,7 +49,7 @@ class Received:
     """What the samples before the start mark contain."""
 
     variances: dict[str, float]     # stated for the yaw, by source, rad^2; inf if none is sent
-    rested_s: float = 0.0           # length of the current or last standstill
+    rested_s: float = 0.0           # duration of the current or last standstill
     latitude: float = 0.7           # rad
     height: bool = True             # the fixes have a height
     two_wheels: bool = False
@@ -58,13 +59,14 @@ class Received:
 
 @dataclass(frozen=True)
 class Observability:
-    """Texts of the quantities that a leg determines or not, and a limitation of all of them."""
+    """Quantities of a leg, as texts."""
 
     observable: tuple[str, ...]
     not_observable: tuple[str, ...]     # with the cause
-    limitation: str = ''                # a sentence, '' for none
+    limitation: str = ''                # of the accuracy of all quantities
 
     def as_text(self) -> str:
+        """Return the answer to the operator."""
         *first, last = self.observable
         values = f'{", ".join(first)} and {last}' if first else last
         text = f'observable: {values}'
@@ -130,9 +132,9 @@ def _expected_alignment(config: Config, received: Received) -> Alignment:
                           drive.standstills(config.leg.standstill))[0]
 
 
-def stated_variance(sent: Oriented) -> float:
+def stated_variance(samples: Oriented) -> float:
     """Return the median yaw variance in orientation messages, rad^2; inf if none is sent."""
-    variance = without_invalid_orientations(sent).yaw_variance
+    variance = without_invalid_orientations(samples).yaw_variance
     stated = variance[~np.isnan(variance)]
     return float(np.median(stated)) if len(stated) else math.inf
 
@@ -187,29 +189,30 @@ QUANTITIES = {
 
 
 def all_unknown() -> dict[str, str]:
+    """Return unknown for each quantity."""
     return dict.fromkeys(QUANTITIES, UNKNOWN)
 
 
 def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
-                   lost: bool = False) -> dict[str, str]:
+                   rejected: bool = False) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity, as if the leg ended now.
 
     forecast : None before its first update: unknown.   two_wheels : the odometer has two wheels.
-    lost : the leg would be rejected: no value is within its limit. A configured track width that
-    is not determined is unknown, not no.
+    rejected : the leg would be rejected: no value is within its limit. A configured track width
+    that is not determined is unknown, not no.
     """
     if forecast is None:
-        return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else \
-            all_unknown()
-    known = {name: forecast.sigma(name) for name, quantity in QUANTITIES.items()
-             if not (quantity.of_two_wheels and (not two_wheels or forecast.wheels is None)
-                     or quantity.of_imu and PLANAR in forecast.methods)}
-    return _check_sigmas({name: None if lost else sigma for name, sigma in known.items()}, config)
+        return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch') if rejected else (), NO)
+    sigmas = {name: None if rejected else forecast.sigma(name)
+              for name, quantity in QUANTITIES.items()
+              if not (quantity.of_two_wheels and (not two_wheels or forecast.wheels is None)
+                      or quantity.of_imu and PLANAR in forecast.methods)}
+    return _check_sigmas(sigmas, config)
 
 
-def check_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str,
-                                                                                          str]:
+def check_calibration(calibration: Calibration, config: Config,
+                      two_wheels: bool) -> dict[str, str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
     names_with_reason = {REASON_ESTIMATES[r.code] for r in calibration.reasons
                          if r.code in REASON_ESTIMATES and r.code.severity is not Verdict.ACCEPTED}
@@ -226,19 +229,19 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
     use.
     """
     planar = any(e.method == PLANAR for e in estimates.values())
-    known: dict[str, float | None] = {}
+    sigmas: dict[str, float | None] = {}
     unusable = set()
     for name, quantity in QUANTITIES.items():
-        found = [estimates.get(part) for part in quantity.estimates]
+        parts = [estimates.get(part) for part in quantity.estimates]
         if quantity.of_imu and planar:
             continue
         if quantity.of_two_wheels and not two_wheels and not any(
-                e is not None and e.value is not None for e in found):
+                e is not None and e.value is not None for e in parts):
             continue
-        known[name] = max(_sigma_or_infinity(e, quantity.relative) for e in found)
+        sigmas[name] = max(_sigma_or_infinity(e, quantity.relative) for e in parts)
         if not valid or names_with_reason & set(quantity.estimates):
             unusable.add(name)
-    return _check_sigmas(known, config) | dict.fromkeys(unusable, NO)
+    return _check_sigmas(sigmas, config) | dict.fromkeys(unusable, NO)
 
 
 def status_keys(ok: dict[str, str]) -> dict[str, str]:

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Forecast from the running estimate: sigmas, remaining distance and manoeuvres."""
+"""
+Forecast from the running estimate of the smoother, or from the planar estimator.
+
+It contains sigmas, and the distance and manoeuvres that remain until the limits are reached.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,8 +40,8 @@ ONLY_SMOOTHER = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
 # physical: m/s^2 of an ordinary stop and start, and the minimum speed for it, m/s
 STOP_ACCELERATION, STOP_SPEED = 1.5, 5.0
-# physical: path length is proportional to sigma to the power of minus this, for white and for
-# time-correlated errors of the fixes
+# physical: path length is proportional to sigma^-power, for white and for time-correlated errors
+# of the fixes
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
 TEMPORARY_CODES = NOT_YET | {Code.ODOMETER_STILL}     # codes that disappear with more driving
@@ -76,19 +80,20 @@ def add_running_estimate(forecast: Forecast, running: RunningEstimate, config: C
     method = running.method
     faults = [r for r in method.reasons
               if r.code.severity is Verdict.REJECTED and r.code not in REASON_ESTIMATES]
-    if faults:      # its values are of no use then
+    if faults:      # its values are useless then
         return replace(forecast, faults=tuple(faults))
     if method.verdict is not Verdict.REJECTED:
         forecast = replace(forecast, methods=forecast.methods | {'smoother': method})
-    given, _ = choose(forecast.methods, config.method)
-    by = {name: e.method for name, e in given.items() if e.value is not None}
+    estimates, _ = choose(forecast.methods, config.method)
+    by_smoother = {name for name, e in estimates.items()
+                   if e.value is not None and e.method == 'smoother'}
     scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
-    if by.get(SCALE) == 'smoother' or scale.sigma is None:
+    if SCALE in by_smoother or scale.sigma is None:
         scale = _forecast_scale(running, scale.limit)
-    known = np.isfinite(running.sigmas)      # no angle without an accelerometer
-    if known[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
+    _, has_yaw, has_pitch = np.isfinite(running.sigmas)      # False without an accelerometer
+    if has_yaw and (YAW in by_smoother or yaw.sigma is None):
         yaw = _forecast_yaw(running, yaw.limit)
-    if known[2] and (by.get(PITCH) == 'smoother' or pitch is None):
+    if has_pitch and (PITCH in by_smoother or pitch is None):
         pitch = float(running.sigmas[2])
     return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=forecast_wheels(method))
 
@@ -103,40 +108,45 @@ def forecast_wheels(method: MethodResult) -> WheelsForecast | None:
 
 
 def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast:
+    """Return the forecast of the scale, whose sigma falls with the path length."""
     e = running.method.estimates[SCALE]
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
     power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
     metres = _remaining_distance(running, sigma / limit, power)
-    now = '' if e.value is None or e.sigma is None else format_value(e.value, e.sigma)
-    if now and e.unit != '1':
-        now += f' {e.unit}'
+    value = '' if e.value is None or e.sigma is None else format_value(e.value, e.sigma)
+    if value and e.unit != '1':
+        value += f' {e.unit}'
     return ParameterForecast(sigma, limit, metres, main_sources(running.method, SCALE),
-                             UNREACHABLE, now)
+                             UNREACHABLE, value)
 
 
 def _slow_share(running: RunningEstimate) -> float:
     """Return the share of slow errors in the contribution of fixes to the scale's variance."""
-    by = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
-          if s.name in ('fixes', 'slow_fix_errors')}
-    total = sum(by.values())
-    return by.get('slow_fix_errors', 0.0) / total if total else 0.0
+    variances = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
+                 if s.name in ('fixes', 'slow_fix_errors')}
+    total = sum(variances.values())
+    return variances.get('slow_fix_errors', 0.0) / total if total else 0.0
 
 
 def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
-    """Return the forecast of the yaw, which accelerations along or across determine."""
+    """
+    Return the forecast of the yaw, which accelerations along or across determine.
+
+    Its information is proportional to ``running.agility``, the integral of squared accelerations.
+    """
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
-    ratio, lack = sigma / limit, ''
+    ratio, manoeuvre = sigma / limit, ''
     if ratio > 1:
-        one = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
-        stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
-        often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
-        lack = f'for the yaw: stop and start {often}, or make as many turns'
-    now = '' if e.value is None or e.sigma is None else format_value(
+        of_one_stop = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
+        stops = math.ceil(max(running.agility, of_one_stop / 2) * (ratio**2 - 1) / of_one_stop)
+        times = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
+        manoeuvre = f'for the yaw: stop and start {times}, or make as many turns'
+    value = '' if e.value is None or e.sigma is None else format_value(
         math.degrees(e.value), math.degrees(e.sigma))
     return ParameterForecast(sigma, limit, _remaining_distance(running, ratio, 2.0),
-                             main_sources(running.method, YAW), '', now, lack)
+                             main_sources(running.method, YAW), '', value, manoeuvre)
 
 
 def _remaining_distance(running: RunningEstimate, ratio: float, power: float) -> float | None:
@@ -153,13 +163,16 @@ def format_value(value: float, sigma: float) -> str:
 
 
 def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> Forecast:
-    """Return the forecast of a leg of the planar estimator that ends here, as ``forecast_leg``."""
-    def passed(_: Stage) -> None:
+    """
+    Return the forecast by the planar estimator of a leg that ends here, as ``forecast_leg``.
+
+    Raises Abandoned if is_needed returns False, BadData if no fit is possible yet.
+    """
+    def check_needed(_: Stage | None = None) -> None:
         if not is_needed():
             raise Abandoned
-    result = planar_leg(leg, settings_by_frame(leg.fix, config), (), passed)
-    if not is_needed():
-        raise Abandoned
+    result = planar_leg(leg, settings_by_frame(leg.fix, config), (), check_needed)
+    check_needed()
     method = result.methods[PLANAR]
     if result.track_n is None:
         raise BadData(method.reasons[0].text)

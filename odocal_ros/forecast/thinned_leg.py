@@ -4,9 +4,10 @@
 """
 A leg in few rows, kept while it is recorded: for forecasts, never for a result.
 
-Rows are gathered into cells of time. Turn rates are averaged, since every tenth row alone would
-turn vibration into rotation; counts are those at the end of a cell. When there are too many cells
-their width is doubled, so that memory and work do not grow with the leg.
+Rows are collected into cells of time, one row each. IMU values and speeds are averaged, since
+every tenth row alone would change vibration into rotation; counts and other values are the last
+ones in a cell. If there are too many cells their width is doubled, so that memory and work do not
+grow with the leg.
 """
 
 from dataclasses import replace
@@ -21,12 +22,12 @@ from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.nav.odometer import without_rollover
 from odocal_ros.screening.late_rows import ON_TIME_WINDOW, sampling_times
 
-# judgement: a tenth of the time between keyframes; per topic 26 minutes of them with pre-roll, so
+# judgement: a tenth of the time between keyframes; cells of a topic, 26 minutes of this width, so
 # that the time of an update is bounded
 FIRST_CELL_NS = 100_000_000
 MOST_CELLS = 16_000
-SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: after it later rows have no effect
-RHYTHM_NS = 3 * SETTLED_NS       # judgement: earlier rows, which determine the rhythm
+SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: rows that much later have no effect
+RHYTHM_NS = 3 * SETTLED_NS       # judgement: rows that much earlier determine the rhythm
 UNROLLED = data.OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
 
 
@@ -35,15 +36,17 @@ class ThinnedLeg:
 
     def __init__(self, form: data.OdometerForm | None = None) -> None:
         self.form = form or COUNTER
-        self._cells: dict[str, Any] = {}       # slot -> rows, one a cell
-        self._open: dict[str, Any] = {}        # slot -> rows of the unfinished cell
+        # by slot: rows of finished cells; samples of the unfinished cell; width of cells; newest
+        # counts; last count as received, (1,), and as unrolled
+        self._cells: dict[str, Any] = {}
+        self._open: dict[str, Any] = {}
         self._width_ns: dict[str, int] = {}
-        self._late: dict[str, LateSoFar] = {}        # slot -> the newest counts
-        # slot -> last count as received, (1,), and as unrolled
+        self._recent: dict[str, RecentCounts] = {}
         self._last: dict[str, tuple[Values, int | float]] = {}
-        self._fix_steps: list[Ints] = []
+        self._fix_steps: list[Ints] = []       # ns between fixes
 
     def feed(self, slot: str, samples: data.Samples) -> None:
+        """Take a block of a topic."""
         samples = _usable(samples)
         if not len(samples.stamp_ns):
             return
@@ -51,26 +54,30 @@ class ThinnedLeg:
             before = self._open.get('fix', data.take(samples, slice(0, 0))).stamp_ns[-1:]
             self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
         if isinstance(samples, data.OdometerSamples) and self.form.quantity != 'rate':
-            samples = self._late.setdefault(slot, LateSoFar()).feed(self._unrolled(slot, samples))
+            recent = self._recent.setdefault(slot, RecentCounts())
+            samples = recent.feed(self._unrolled(slot, samples))
             if not len(samples.stamp_ns):
                 return
         rows = data.join([self._open[slot], samples]) if slot in self._open else samples
         width_ns = self._width_ns.setdefault(slot, FIRST_CELL_NS)
         cell = rows.stamp_ns // width_ns
-        over = int(np.flatnonzero(np.diff(cell))[-1]) + 1 if (np.diff(cell) != 0).any() else 0
-        self._open[slot] = data.take(rows, slice(over, None))
-        if not over:
+        changes = np.flatnonzero(np.diff(cell)) + 1
+        first_open = int(changes[-1]) if len(changes) else 0
+        self._open[slot] = data.take(rows, slice(first_open, None))
+        if not first_open:
             return
-        done = _gathered(data.take(rows, slice(None, over)), cell[:over], self._averaged(slot))
-        cells = data.join([self._cells[slot], done]) if slot in self._cells else done
+        averaged = self._averaged(slot)
+        cells = _cell_rows(data.take(rows, slice(None, first_open)), cell[:first_open], averaged)
+        if slot in self._cells:
+            cells = data.join([self._cells[slot], cells])
         while len(cells.stamp_ns) > MOST_CELLS:
             width_ns *= 2
-            cells = _gathered(cells, cells.stamp_ns // width_ns, self._averaged(slot))
+            cells = _cell_rows(cells, cells.stamp_ns // width_ns, averaged)
         self._cells[slot], self._width_ns[slot] = cells, width_ns
 
     def leg(self, start_ns: int) -> Leg:
         """Return the samples so far as a leg, up to the last cell of IMU, or else odometer."""
-        form, cells = self.form, self._cells | {slot: self._newest(slot) for slot in self._late}
+        form, cells = self.form, self._cells | {slot: self._counts(slot) for slot in self._recent}
         if form.quantity != 'rate':
             whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in cells else True
@@ -80,15 +87,15 @@ class ThinnedLeg:
         stop_ns = start_ns if leading is None else int(leading.stamp_ns[-1])
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form).with_rows(**cells)
 
-    def _newest(self, slot: str) -> data.OdometerSamples:
-        """Return the cells of a counter with rows whose times are not final."""
-        rows = self._late[slot].rest()
+    def _counts(self, slot: str) -> data.OdometerSamples:
+        """Return the cells of a counter, also of rows whose times are not final."""
+        rows = self._recent[slot].rest()
         if slot in self._open:
             rows = data.join([self._open[slot], rows])
         width_ns = self._width_ns.get(slot, FIRST_CELL_NS)
-        cells = _gathered(rows, rows.stamp_ns // width_ns, ())
-        before: data.OdometerSamples | None = self._cells.get(slot)
-        return cells if before is None else data.join([before, cells])
+        cells = _cell_rows(rows, rows.stamp_ns // width_ns, ())
+        finished: data.OdometerSamples | None = self._cells.get(slot)
+        return cells if finished is None else data.join([finished, cells])
 
     def fix_rate(self) -> float:
         """Return the fix rate by the median interval, Hz; NaN with too few fixes."""
@@ -103,13 +110,12 @@ class ThinnedLeg:
 
     def _unrolled(self, slot: str, samples: data.OdometerSamples) -> data.OdometerSamples:
         """Return counts or increments as a running count that never rolls over."""
-        sent, count = self._last.get(slot, (None, 0))
+        last, count = self._last.get(slot, (samples.value[:1], 0))
         value = samples.value
         if self.form.quantity == 'increment':
             step = value.copy()
         else:
-            step = without_rollover(np.diff(value, prepend=value[:1] if sent is None else sent),
-                                    self.form.modulus)
+            step = without_rollover(np.diff(value, prepend=last), self.form.modulus)
         total: Values = count + np.cumsum(step)  # type: ignore[assignment]
         self._last[slot] = value[-1:], total[-1]
         return replace(samples, value=total)
@@ -125,8 +131,8 @@ def _usable(samples: data.SomeSamples) -> data.SomeSamples:
     return samples if keep.all() else data.take(samples, keep)
 
 
-def _gathered(rows: data.SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> data.SomeSamples:
-    """Return the last row of each run of equal ``cell``, with the means of ``averaged``."""
+def _cell_rows(rows: data.SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> data.SomeSamples:
+    """Return one row for each run of equal ``cell``: the last one, with means of ``averaged``."""
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
     count = np.diff(np.append(first, len(cell)))
     last = data.take(rows, first + count - 1)
@@ -142,30 +148,31 @@ def _gathered(rows: data.SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> 
                    **columns)
 
 
-class LateSoFar:
+class RecentCounts:
     """The newest rows of a counter that never rolls over; late rows are moved as in results."""
 
     def __init__(self) -> None:
         self._rows: data.OdometerSamples | None = None
-        self._given = 0             # number of these already returned
+        self._returned = 0             # number of these already returned
 
     def feed(self, rows: data.OdometerSamples) -> data.OdometerSamples:
         """Take rows, and return those whose times are final."""
         rows = rows if self._rows is None else data.join([self._rows, rows])
         settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
-        settled = max(settled, self._given)
-        out = data.take(_on_time(rows), slice(self._given, settled))
+        settled = max(settled, self._returned)
+        final = data.take(_at_sampling_times(rows), slice(self._returned, settled))
         first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - RHYTHM_NS))
-        self._rows, self._given = data.take(rows, slice(first, None)), settled - first
-        return out
+        self._rows, self._returned = data.take(rows, slice(first, None)), settled - first
+        return final
 
     def rest(self) -> data.OdometerSamples:
-        """Return the remaining rows at their estimated times; ``feed`` came before."""
+        """Return the rows not returned yet at their estimated times; after ``feed`` only."""
         assert self._rows is not None
-        return data.take(_on_time(self._rows), slice(self._given, None))
+        return data.take(_at_sampling_times(self._rows), slice(self._returned, None))
 
 
-def _on_time(rows: data.OdometerSamples) -> data.OdometerSamples:
-    true_s = sampling_times(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
-    true_ns = rows.stamp_ns[0] + np.rint(true_s * 1e9).astype(np.int64)
-    return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))
+def _at_sampling_times(rows: data.OdometerSamples) -> data.OdometerSamples:
+    """Return rows with rising stamps at their estimated sampling times."""
+    sampled_s = sampling_times(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
+    sampled_ns = rows.stamp_ns[0] + np.rint(sampled_s * 1e9).astype(np.int64)
+    return replace(rows, stamp_ns=np.maximum.accumulate(sampled_ns))

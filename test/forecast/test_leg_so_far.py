@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
-from odocal_ros.forecast.progress import Progress, Travel
+from odocal_ros.forecast.progress import OdometerProgress, Progress
 from odocal_ros.forecast.quantities import find_observable
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screen_leg
@@ -108,7 +108,7 @@ def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
     for bad in ([], [20, 21, 100, 190]):
         sent = value.copy()
         sent[bad] = odd
-        travel = Travel(OdometerForm(quantity, 0, '1'))
+        travel = OdometerProgress(OdometerForm(quantity, 0, '1'))
         for k in range(0, len(t), 3):
             travel.feed(take(OdometerSamples(t + SECOND, t + SECOND, sent), slice(k, k + 3)), 1.0)
         found.append((travel.total, travel.still_s(), travel.top))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.progress import Clocks, FixPath, Progress, scale_so_far, Travel
+from odocal_ros.forecast.progress import Clocks, FixPath, OdometerProgress, Progress, scale_so_far
 from odocal_ros.live.health import Health
 from odocal_ros.settings.config import Config, with_settings
 
@@ -84,7 +84,7 @@ def test_a_jump_within_a_block_is_seen_however_it_is_cut():
 def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
     stamps = 1e6 + np.arange(20.0, 24.0, 0.1)
     for at in range(1, 19):
-        health, travel, some = Health(), Travel(COUNTER), stamps.copy()
+        health, travel, some = Health(), OdometerProgress(COUNTER), stamps.copy()
         some[at] += wild
         sent = rows(some, np.arange(len(some)) >= 30)       # moves by less than counts
         for begin in range(0, len(some), rows_at_once):
@@ -131,7 +131,7 @@ def test_after_a_jump_of_time_no_stamp_is_called_zero():
 
 def travelled(*blocks, form=COUNTER, scale=0.02):
     """Return the travel after blocks of (times, s, and values)."""
-    travel = Travel(form)
+    travel = OdometerProgress(form)
     for times, values in blocks:
         travel.feed(rows(times, np.array(values)), scale)
     return travel
