@@ -13,6 +13,7 @@ from odocal_ros.reasons import Reason
 
 PERCENT_FROM = 0.01       # judgement: larger relative sigmas are printed in per cent, not ppm
 FARTHEST_LIMIT_M = 2e4    # judgement: longest remaining distance of a useful forecast
+# definition
 UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
 PREDICTED_REST_S = 10.0

@@ -143,8 +143,8 @@ class Robot:
 
     drive: str                      # as odometer.drive
     imu: bool                       # it has an IMU
-    width: float                    # m, track width, of skid steering in turns on the spot; of
-                                    # HOLONOMIC twice the rotation lever
+    # m, track width, of skid steering in turns on the spot; of HOLONOMIC twice the rotation lever
+    width: float
     straight_width: float = 0.0     # m, track width of skid steering on a straight
     wheels: int = 2
     slip: float = 1e-3              # m/sqrt(s) of each wheel while it moves
@@ -159,8 +159,8 @@ def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Fl
     """
     Return the run of a motion without errors, true states (n + 1, 5) and constants (w,).
 
-    States are position, m, heading, rad, position drift; constants those of the wheels, then 0 for
-    the lever arm and errors of the gyro.
+    States are position, m, heading, rad, and position drift, m. Constants are those of the
+    wheels, then 0: lever arm and delay of the reference, scale error and bias of the gyro.
     """
     increments = motion.increments
     wheels, drive_constants = _wheels(increments, robot)
