@@ -21,7 +21,7 @@ from odocal_ros.settings.config import Config, with_settings
 Progress = Callable[..., None]
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
-EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
+EPOCH = Decimal('1e8')        # s; larger times count from 1970, smaller from the bag's start
 EACH_STOP = 'each-stop'
 LEG_FORMS = ("required: 'A:B' or (A, B) in seconds, 'A/B' for ISO 8601 dates, or "
              f"'{EACH_STOP}'")
@@ -34,32 +34,34 @@ class Listener:
         """Receive a note for the user."""
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
+        """Return the context of a phase, which gives the function that receives its progress."""
         return nullcontext(lambda share, stage='': None)
 
 
 class Notes(Listener):
     """Store the notes, and forward everything."""
 
-    def __init__(self, following: Listener) -> None:
+    def __init__(self, listener: Listener) -> None:
         self.texts: list[str] = []
-        self._next = following
+        self._listener = listener
 
     def note(self, text: str) -> None:
         """Store and forward a note."""
         self.texts.append(text)
-        self._next.note(text)
+        self._listener.note(text)
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        return self._next.phase(title)
+        """Forward the phase."""
+        return self._listener.phase(title)
 
 
 @dataclass(frozen=True)
 class LegSpan:
-    """A requested leg; None: open on that side."""
+    """A requested leg; None: from the start, or to the end, of the recording."""
 
     start_ns: int | None
     stop_ns: int | None
-    relative: tuple[bool, bool] = (False, False)   # from the bag's first message
+    relative: tuple[bool, bool] = (False, False)   # start, stop: count from the first message
 
 
 def paths_of(argument: Any) -> list[Path]:
@@ -68,18 +70,18 @@ def paths_of(argument: Any) -> list[Path]:
 
     Raises BadUsage: there is none, or one is not a path.
     """
-    one_alone = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
-    several = [argument] if one_alone else list(argument)
-    if not several:
+    is_one = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
+    paths = [argument] if is_one else list(argument)
+    if not paths:
         raise BadUsage('no bag is given; required: one path or several')
-    for one in several:
+    for path in paths:
         try:
             with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
-                Path(one).stat()       # the reader reports a missing file
+                Path(path).stat()       # the reader reports a missing file
         except (OSError, TypeError, ValueError) as error:
-            raise BadUsage(f'{brief_line(repr(one)[:100])} is not the path of a bag: '
+            raise BadUsage(f'{brief_line(repr(path)[:100])} is not the path of a bag: '
                            f'{error_text(error)[:100]}') from None
-    return [Path(one) for one in several]
+    return [Path(path) for path in paths]
 
 
 def topics_of(argument: Any) -> dict[str, str]:
@@ -128,19 +130,22 @@ def legs_of(argument: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
         return []
     if not isinstance(argument, Iterable):
         raise BadUsage(f'legs: {argument!r}: {LEG_FORMS}')
-    one_alone = isinstance(argument, str) or isinstance(argument, tuple) and _is_pair(argument)
-    several: Iterable[Any] = [argument] if one_alone else argument
-    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in several]
+    is_one = isinstance(argument, str) or _is_pair(argument)
+    legs: Iterable[Any] = [argument] if is_one else argument
+    return [leg if leg == EACH_STOP else parse_leg(_leg_text(leg)) for leg in legs]
 
 
-def _is_pair(argument: tuple[Any, ...]) -> bool:
-    return len(argument) == 2 and not any(isinstance(edge, (str, tuple)) for edge in argument)
+def _is_pair(argument: Any) -> bool:
+    """Return True for (A, B) with seconds or None, False for a tuple of legs and other types."""
+    return isinstance(argument, tuple) and len(argument) == 2 and not any(
+        isinstance(edge, (str, tuple)) for edge in argument)
 
 
-def _text(leg: Any) -> str:
+def _leg_text(leg: Any) -> str:
+    """Return a leg as text for ``parse_leg``."""
     if isinstance(leg, str):
         return leg
-    if not (isinstance(leg, tuple) and _is_pair(leg)):
+    if not _is_pair(leg):
         raise BadUsage(f'legs: {leg!r}: {LEG_FORMS}')
     return ':'.join('' if edge is None else f'{float(edge):.9f}' for edge in leg)
 
@@ -154,33 +159,34 @@ def parse_leg(text: str) -> LegSpan:
     parts = text.split('/' if '/' in text else ':')
     if len(parts) != 2:
         raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
-    (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
-    if start is not None and stop is not None and rel_a == rel_b and stop <= start:
+    (start, start_relative), (stop, stop_relative) = (_time_ns(p.strip(), text) for p in parts)
+    if (start is not None and stop is not None and start_relative == stop_relative
+            and stop <= start):
         raise BadUsage(f'--leg {text}: the end is not after the start; give the start first')
-    return LegSpan(start, stop, (rel_a, rel_b))
+    return LegSpan(start, stop, (start_relative, stop_relative))
 
 
-def _edge(text: str, whole: str) -> tuple[int | None, bool]:
-    """Return a time, ns, and whether it counts from the bag's first message."""
+def _time_ns(text: str, leg: str) -> tuple[int | None, bool]:
+    """Return a time, ns, and whether it counts from the bag's first message; leg: for errors."""
     if not text:
         return None, False
     try:
         seconds = Decimal(text)
         if seconds.is_finite():
             if seconds.copy_abs() >= LATEST_NS // 10**9:
-                raise BadUsage(f'--leg {whole}: {text[:40]} is out of range; the limit is the '
+                raise BadUsage(f'--leg {leg}: {text[:40]} is out of range; the limit is the '
                                'year 2116')
             return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
     except InvalidOperation:
         pass
     try:
-        moment = datetime.fromisoformat(text)
+        date = datetime.fromisoformat(text)
     except ValueError:
-        raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
+        raise BadUsage(f'--leg {leg}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
                        'for seconds, A/B for dates') from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
-    if abs(whole_ns) >= LATEST_NS:
-        raise BadUsage(f'--leg {whole}: {text} is out of range; the limit is the year 2116')
-    return whole_ns, False
+    date = date if date.tzinfo else date.replace(tzinfo=UTC)
+    since = date - datetime(1970, 1, 1, tzinfo=UTC)
+    time_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    if abs(time_ns) >= LATEST_NS:
+        raise BadUsage(f'--leg {leg}: {text} is out of range; the limit is the year 2116')
+    return time_ns, False

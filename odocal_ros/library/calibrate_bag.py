@@ -29,7 +29,8 @@ from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.text_formats import date_text, one_line
 from odocal_ros.settings.config import Config, flat
 
-NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
+UNIT_TEXTS = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)',
+              '1': 'm per m (a speed)'}
 
 
 class LegDropped(BadUsage):
@@ -58,27 +59,27 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     from odocal_ros.output.program_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
-    collected = Notes(listener or Listener())
+    notes = Notes(listener or Listener())
     arguments = _Arguments(topics_of(topics), config, legs_of(legs), holdout)
     imu = known_imu(config_of(config))
     paths, repeated = unique_paths(paths_of(path))
     for duplicate in repeated:
-        collected.note(f'{duplicate} is given twice; it is read once')
+        notes.note(f'{duplicate} is given twice; it is read once')
     if len(paths) > 1:
         check_all_bags(paths, lambda one: _check_bag(one, arguments))
-    done = _calibrate_bags(paths, arguments, collected)
-    settings = done[-1].config
-    first, *others = [flat(one.config) for one in done]      # journals have their own
+    bags = _calibrate_bags(paths, arguments, notes)
+    settings = bags[-1].config
+    first, *others = [flat(bag.config) for bag in bags]      # each journal has settings
     # as text: an unset one is NaN, which is not equal to itself
     if different := [name for name, value in first.items()
                      if any(repr(other[name]) != repr(value) for other in others)]:
-        collected.note(f'{", ".join(different)}: differ between the journals; each leg uses its '
-                       f'own settings, limits and files use those of {done[-1].path.name}')
-    results, inputs = unique_names([one.path for one in done], [one.legs for one in done],
-                                   [one.entry for one in done])
-    frame = next((one.imu_frame for one in done if one.imu_frame), '')
+        notes.note(f'{", ".join(different)}: differ between the journals; each leg uses its '
+                   f'own settings, limits and files use those of {bags[-1].path.name}')
+    results, inputs = unique_names([bag.path for bag in bags], [bag.legs for bag in bags],
+                                   [bag.entry for bag in bags])
+    frame = next((bag.imu_frame for bag in bags if bag.imu_frame), '')
     result, settings = framed(combine(results, settings, imu=imu), settings, frame)
-    return Calibration(result, settings, tuple(inputs), tuple(collected.texts))
+    return Calibration(result, settings, tuple(inputs), tuple(notes.texts))
 
 
 @dataclass(frozen=True)
@@ -103,21 +104,21 @@ class _BagLegs:
     """Data kept of a bag: the results of its legs, not its rows."""
 
     path: Path
-    entry: dict[str, Any]
+    entry: dict[str, Any]     # its entry in the list of inputs
     config: Config
-    imu_frame: str
-    unit: str
+    imu_frame: str            # frame_id of the IMU
+    unit: str                 # of the scale factor
     legs: list[LegResult]
 
 
 def _calibrate_bags(paths: list[Path], arguments: _Arguments, listener: Notes) -> list[_BagLegs]:
-    """Return the stored data of each used bag."""
-    done: list[_BagLegs] = []
+    """Return the results of each bag; a journal whose leg was dropped is skipped, if not alone."""
+    bags: list[_BagLegs] = []
     dropped = None
     for path in paths:
         try:
-            unit = done[0].unit if done else None
-            done.append(_calibrate_one_bag(path, arguments, unit, listener))
+            unit = bags[0].unit if bags else None
+            bags.append(_calibrate_one_bag(path, arguments, unit, listener))
         except LegDropped as error:
             dropped = error
             if len(paths) > 1:
@@ -126,25 +127,27 @@ def _calibrate_bags(paths: list[Path], arguments: _Arguments, listener: Notes) -
             if len(paths) == 1:
                 raise
             raise BadUsage(error_about(path, error)) from None
-    if dropped and not done:
+    if dropped and not bags:
         raise dropped
-    return done
+    return bags
 
 
-def _calibrate_one_bag(path: Path, arguments: _Arguments, unit: str | None,
+def _calibrate_one_bag(path: Path, arguments: _Arguments, previous_unit: str | None,
                        listener: Notes) -> _BagLegs:
-    """Read a bag and calibrate its legs; ``unit`` is that of the scale in the bags before."""
+    """Read a bag and calibrate its legs; previous_unit: of the scale in the bags before."""
     bag = read_bag(path, arguments.topics, arguments.config, listener=listener)
-    own_unit = bag.form.scale_unit
-    if unit and own_unit != unit:
+    unit = bag.form.scale_unit
+    if previous_unit and unit != previous_unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '
-                       f'{NAMED[own_unit]}, that of the previous bags in {NAMED[unit]}: they '
-                       'cannot be combined; calibrate them separately, or name topics of one kind')
+                       f'{UNIT_TEXTS[unit]}, that of the previous bags in '
+                       f'{UNIT_TEXTS[previous_unit]}: they cannot be combined; calibrate them '
+                       'separately, or name topics of one kind')
     return _BagLegs(path, {'bag': bag.name, 'sha256': bag.sha256, 'topics': bag.topics},
-                    bag.config, bag.imu_frame, own_unit, _legs_of(bag, arguments, listener))
+                    bag.config, bag.imu_frame, unit, _calibrate_legs(bag, arguments, listener))
 
 
-def _legs_of(bag: Recording, arguments: _Arguments, listener: Notes) -> list[LegResult]:
+def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> list[LegResult]:
+    """Return the results of the requested, marked or found legs of a bag."""
     if bag.dropped and not arguments.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')
@@ -152,33 +155,34 @@ def _legs_of(bag: Recording, arguments: _Arguments, listener: Notes) -> list[Leg
     if any(not stop for _, stop in marks):
         listener.note(f'{bag.name}: {OPEN_LEG}')
     spans = bag.spans(arguments.legs)
-    limited = coverage_reasons(bag.recorder) if not (marks or arguments.legs) else ()
-    notes = [bag.notes + limited + note for note in missing_stop_reasons(spans, marks)]
-    results = _calibrated(bag, spans, notes, arguments.holdout, listener)
-    if bag.config.leg.automatic and not (marks or arguments.legs):
-        results = _without_refused(results, listener)
-    return results
+    found = not (marks or arguments.legs)      # by the standstills
+    coverage = coverage_reasons(bag.recorder) if found else ()
+    notes = [bag.notes + coverage + note for note in missing_stop_reasons(spans, marks)]
+    results = _calibrate_spans(bag, spans, notes, arguments.holdout, listener)
+    return _without_refused(results, listener) if bag.config.leg.automatic and found else results
 
 
-def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[Reason, ...]],
-                holdout: bool, listener: Notes) -> list[LegResult]:
+def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
+                     notes: list[tuple[Reason, ...]], holdout: bool,
+                     listener: Notes) -> list[LegResult]:
+    """Return the results of the legs between stamps, ns, each with its notes."""
     from odocal_ros.pipeline.calibrate import calibrate_parts
     results = []
     with listener.phase('calibrating') as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
-            which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
+            prefix = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
 
-            def of_leg(stage: Stage, which: str = which) -> None:
-                progress(None, which + stage.words())
+            def report(stage: Stage, prefix: str = prefix) -> None:
+                progress(None, prefix + stage.words())
             parts = calibrate_parts(leg, bag.config, notes=notes[number - 1], holdout=holdout,
-                                    progress=of_leg)
+                                    progress=report)
             results += [replace(one, bag=bag.name) for one in parts]
     return results
 
 
 def _without_refused(results: list[LegResult], listener: Notes) -> list[LegResult]:
-    """Return automatic legs without the unusable ones, as in the node."""
+    """Return automatic legs without the unusable ones, as in the node; all if none is usable."""
     from odocal_ros.pipeline.automatic import rejecting_reason
     kept, notes = [], []
     for leg in results:
@@ -207,7 +211,7 @@ def error_about(path: Path, error: Exception) -> str:
     text = ' '.join(str(error).split()) if isinstance(error, BadTopics) else str(error)
     if text.startswith(str(path)):
         return text
-    for name in (path.name, path.stem):      # some sentences begin with the bag's name
+    for name in (path.name, path.stem):      # some texts begin with the bag's name
         text = text.removeprefix(f'{name}: ')
     return f'{path}: {text}'
 
@@ -234,7 +238,7 @@ def unique_names(paths: list[Path], legs: list[list[LegResult]],
     """
     names = [entry['bag'] for entry in inputs]
     if len(set(names)) == len(names):
-        return [leg for some in legs for leg in some], inputs
-    return ([replace(leg, bag=one_line(path)) for path, some in zip(paths, legs, strict=True)
-             for leg in some],
+        return [leg for of_bag in legs for leg in of_bag], inputs
+    return ([replace(leg, bag=one_line(path)) for path, of_bag in zip(paths, legs, strict=True)
+             for leg in of_bag],
             [entry | {'bag': one_line(path)} for path, entry in zip(paths, inputs, strict=True)])

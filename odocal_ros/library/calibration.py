@@ -17,7 +17,7 @@ from odocal_ros.library.series import residuals, Series, states, trajectory
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
-TABLES = 'pip install pandas pyarrow'
+TABLES_INSTALL = 'pip install pandas pyarrow'
 
 
 def frame_of(columns: dict[str, Any]) -> Any:
@@ -25,7 +25,7 @@ def frame_of(columns: dict[str, Any]) -> Any:
     try:
         import pandas
     except ImportError:
-        raise BadUsage(f'a table needs pandas: {TABLES}') from None
+        raise BadUsage(f'a table needs pandas: {TABLES_INSTALL}') from None
     return pandas.DataFrame(columns)
 
 
@@ -36,9 +36,9 @@ class Calibration:
     result: result.Calibration                  # complete result of the pipeline
     config: Config = Config()                   # its settings
     inputs: tuple[dict[str, Any], ...] = ()     # name, sha256 and topics of each bag
-    notes: tuple[str, ...] = ()                 # sentences from the computation
-    # ISO 8601
-    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
+    notes: tuple[str, ...] = ()                 # sentences for the user about the computation
+    created: str = field(      # ISO 8601
+        default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
 
     @property
     def verdict(self) -> Verdict:
@@ -61,7 +61,7 @@ class Calibration:
         return {name: e.sigma for name, e in self._estimates().items()}
 
     def _estimates(self) -> dict[str, Estimate]:
-        """Return the estimates; the mandatory ones exist even if no leg was fitted."""
+        """Return the estimates by name; scale, yaw and pitch exist even if no leg was fitted."""
         from odocal_ros.output.files import ALWAYS
         estimates = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
         return estimates | self.result.estimates
@@ -78,10 +78,10 @@ class Calibration:
 
     def to_frame(self) -> Any:
         """Return a pandas.DataFrame, a row for each value: value, sigma, unit, method."""
-        found = self._estimates()
-        columns = {name: [getattr(e, name) for e in found.values()]
+        estimates = self._estimates()
+        columns = {name: [getattr(e, name) for e in estimates.values()]
                    for name in ('value', 'sigma', 'unit', 'method')}
-        return frame_of(columns).set_axis(list(found))
+        return frame_of(columns).set_axis(list(estimates))
 
     def trajectory(self) -> Series:
         """Return the smoothed drive; see ``series.trajectory``."""
@@ -134,10 +134,11 @@ class Calibration:
         return export(self.result, files)
 
     def _drawable(self, leg: int) -> Evidence:
+        """Return the track and fixes of a leg; raise BadUsage without."""
         if not 1 <= leg <= len(self.result.legs):
             raise BadUsage(f'leg {leg} does not exist; there are legs 1 to '
                            f'{len(self.result.legs)}')
-        found = self.result.legs[leg - 1].evidence
-        if found is None or not len(found.t):
+        evidence = self.result.legs[leg - 1].evidence
+        if evidence is None or not len(evidence.t):
             raise BadUsage(f'leg {leg} has no track to draw; see its reasons')
-        return found
+        return evidence

@@ -36,14 +36,15 @@ CAUSES = {
 class Difference:
     """A change of one parameter from one calibration to a later one."""
 
-    since: int                # number of the earlier one
+    since: int                # index of the earlier one
     change: float             # in the parameter's unit
     sigma: float | None       # of the change
     sigmas: float | None      # change over sigma, None if a sigma is unknown or zero
-    sigmas_if_shared_cancels: float | None
+    sigmas_if_shared_cancels: float | None    # change over its sigma without shared errors
 
     @property
     def is_significant(self) -> bool:
+        """Return True if the change is larger than its errors explain."""
         return self.sigmas is not None and abs(self.sigmas) > REMARK_SIGMAS
 
 
@@ -84,19 +85,20 @@ def changes(stored: list[Stored]) -> list[Change]:
 
 
 def notes(stored: list[Stored]) -> list[str]:
-    out = []
+    """Return notes on calibrations that are not, or not fully, comparable."""
+    texts = []
     for s in stored:
         if not s.usable:
             codes = ', '.join(dict.fromkeys(s.reasons[:3]))
-            out.append(f'{s.name} is rejected ({codes}): shown, but not compared')
+            texts.append(f'{s.name} is rejected ({codes}): shown, but not compared')
     for i, a in enumerate(stored):
         for b in stored[i + 1:]:
             if a.bags & b.bags or a.legs & b.legs:
-                out.append(f'{a.name} and {b.name} use the same drive: their errors are '
-                           'correlated, so a change is more significant than shown')
+                texts.append(f'{a.name} and {b.name} use the same drive: their errors are '
+                             'correlated, so a change is more significant than shown')
     if _differently_mounted(stored):
-        out.append('imu.mounting_rpy differs: mounting angles are not compared')
-    return out
+        texts.append('imu.mounting_rpy differs: mounting angles are not compared')
+    return texts
 
 
 def _differently_mounted(stored: list[Stored]) -> bool:
@@ -105,6 +107,7 @@ def _differently_mounted(stored: list[Stored]) -> bool:
 
 
 def _change(name: str, stored: list[Stored]) -> Change:
+    """Return a parameter in all calibrations that have it; raise BadUsage if units differ."""
     known = [i for i, s in enumerate(stored) if s.value(name) is not None]
     unit = stored[known[0]].estimates[name].unit
     entries = []
@@ -123,6 +126,7 @@ def _change(name: str, stored: list[Stored]) -> Change:
 
 def _difference(name: str, stored: list[Stored], since: int | None,
                 index: int) -> Difference | None:
+    """Return the difference between two calibrations by index, None without an earlier one."""
     if since is None:
         return None
     a, b = stored[since], stored[index]
@@ -135,12 +139,13 @@ def _difference(name: str, stored: list[Stored], since: int | None,
     if old.sigma is None or new.sigma is None:
         return Difference(since, change, None, None, None)
     sigma = math.hypot(old.sigma, new.sigma)
-    common = sum(2 * share * b.budget[name][source][0]
-                 for source, (share, shared) in a.budget.get(name, {}).items()
-                 if shared and b.budget.get(name, {}).get(source, (0, False))[1])
-    least = math.sqrt(max(sigma**2 - common, 0.0))
+    # an error that is the same in both, effects a and b, adds (a - b)^2 instead of a^2 + b^2
+    shared = sum(2 * effect * b.budget[name][source][0]
+                 for source, (effect, is_shared) in a.budget.get(name, {}).items()
+                 if is_shared and b.budget.get(name, {}).get(source, (0, False))[1])
+    smallest = math.sqrt(max(sigma**2 - shared, 0.0))
     return Difference(since, change, sigma, change / sigma if sigma > 0 else None,
-                      change / least if common and least > 0 else None)
+                      change / smallest if shared and smallest > 0 else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +160,11 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
+        """Return the summary as one text."""
         return '; '.join(self.sentences)
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON."""
         names = [s.name for s in self.stored]
 
         def difference(d: Difference | None) -> dict[str, Any] | None:
@@ -187,17 +194,20 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
     stored = [stored_from(one.to_dict(), f'calibration {number}')
               if isinstance(one, Calibration) else read_stored(Path(one))
               for number, one in enumerate(calibrations, 1)]
-    found = changes(stored)
-    return Comparison(tuple(stored), tuple(found), tuple(notes(stored)), *_verdict(found, stored))
+    all_changes = changes(stored)
+    return Comparison(tuple(stored), tuple(all_changes), tuple(notes(stored)),
+                      *_verdict(all_changes, stored))
 
 
-def _verdict(found: list[Change], stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
+def _verdict(all_changes: list[Change],
+             stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
     """Return summary sentences, and whether any change is significant; None: not comparable."""
-    if not found:
+    if not all_changes:
         return ('nothing to compare: no value exists in two calibrations that are not '
                 'rejected',), None
-    compared = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
-                for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
+    compared = [(abs(d.sigmas), c, d) for c in all_changes for e in c.entries
+                if stored[e.index].usable for d in (e.to_first, e.to_previous)
+                if d is not None and d.sigmas is not None]
     significant: dict[str, tuple[float, Change, Difference]] = {}
     for size, change, difference in compared:
         if difference.is_significant and size > significant.get(change.parameter, (0.0,))[0]:
@@ -212,6 +222,7 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[tuple[str, ...]
 
 
 def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
+    """Return the sentence on a significant change, with its likely cause."""
     words = change.parameter.split('_')
     cause = next((text for key, text in CAUSES.items() if key in words),
                  'unknown; calibrate again')
@@ -239,9 +250,9 @@ def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> 
     return f'{difference.change:+.3g} {change.unit}'
 
 
-def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
+def hints(all_changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
     """Yield notes on changes that are significant only if shared errors are the same in both."""
-    for change in found:
+    for change in all_changes:
         last = change.entries[-1]
         for d in (last.to_first, last.to_previous):
             sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0

@@ -18,7 +18,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.library import export_pictures
-from odocal_ros.library.calibration import TABLES
+from odocal_ros.library.calibration import TABLES_INSTALL
 from odocal_ros.library.series import (
     residuals,
     sensor_residuals,
@@ -31,8 +31,8 @@ from odocal_ros.library.series import (
 from odocal_ros.output.plot_style import PICTURES
 from odocal_ros.safe_io.atomic_files import whole_file
 
-RERUN = 'pip install rerun-sdk'
-IN_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # units in names of joints
+RERUN_INSTALL = 'pip install rerun-sdk'
+UNIT_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # in names of joints
 KML = 'http://www.opengis.net/kml/2.2'
 
 
@@ -56,12 +56,13 @@ def rrd(result: Calibration, path: Path) -> None:
 
 
 def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
+    """Log the series of one leg under a name."""
     import rerun
     track_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
     rotations = np.stack([pose[f'q{axis}'] for axis in 'xyzw'], -1)
-    places = np.stack([pose['latitude_deg'], pose['longitude_deg']], -1)
+    lat_lon_deg = np.stack([pose['latitude_deg'], pose['longitude_deg']], -1)
     rerun.log(f'{name}/track', rerun.LineStrips3D([track_n]), static=True, recording=recording)
-    rerun.log(f'{name}/map', rerun.GeoLineStrings(lat_lon=[places]), static=True,
+    rerun.log(f'{name}/map', rerun.GeoLineStrings(lat_lon=[lat_lon_deg]), static=True,
               recording=recording)
     times = [rerun.TimeColumn('time', timestamp=pose['stamp_ns'].astype('datetime64[ns]'))]
     rerun.send_columns(f'{name}/vehicle', times, rerun.Transform3D.columns(
@@ -97,9 +98,9 @@ def kml(columns: Series) -> str:
     document = ElementTree.SubElement(root, f'{{{KML}}}Document')
     for leg in np.unique(columns['leg']).tolist():
         rows = columns['leg'] == leg
-        place = ElementTree.SubElement(document, f'{{{KML}}}Placemark')
-        ElementTree.SubElement(place, f'{{{KML}}}name').text = f'leg {leg}'
-        line = ElementTree.SubElement(place, f'{{{KML}}}LineString')
+        placemark = ElementTree.SubElement(document, f'{{{KML}}}Placemark')
+        ElementTree.SubElement(placemark, f'{{{KML}}}name').text = f'leg {leg}'
+        line = ElementTree.SubElement(placemark, f'{{{KML}}}LineString')
         ElementTree.SubElement(line, f'{{{KML}}}tessellate').text = '1'
         ElementTree.SubElement(line, f'{{{KML}}}coordinates').text = ' '.join(
             f'{longitude:.8f},{latitude:.8f},{height:.3f}' for longitude, latitude, height in zip(
@@ -109,6 +110,7 @@ def kml(columns: Series) -> str:
 
 
 def parquet(columns: Series, path: Path) -> None:
+    """Write a series as a Parquet file."""
     import pyarrow
     from pyarrow import parquet as files
     with whole_file(path) as file:
@@ -128,43 +130,47 @@ def mcap(result: Calibration, path: Path) -> None:
 
 
 def _topics(result: Calibration) -> list[encode.Topic]:
-    pose, bias = (_by_time(make(result)) for make in (trajectory, states))
+    """Return the topics of ``mcap``."""
+    pose, bias = (_by_time(series(result)) for series in (trajectory, states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
-    whole = np.zeros(n, np.int64)
+    zeros = np.zeros(n, np.int64)
     (gyro, gyro_sigma), (force, force_sigma) = (
         [np.stack([bias[f'{sensor}_bias_{axis}{ending}'] for axis in 'xyz'], -1)
          for ending in ('', '_sigma')] for sensor in ('gyro', 'accelerometer'))
     track = FixSamples(t, t, np.deg2rad(pose['latitude_deg']), np.deg2rad(pose['longitude_deg']),
-                       pose['height_m'], np.zeros((n, 3, 3)), whole, whole)
+                       pose['height_m'], np.zeros((n, 3, 3)), zeros, zeros)
     biases = ImuSamples(t, t, gyro, force, np.stack(
         [pose[q] for q in ('qx', 'qy', 'qz', 'qw')], -1), np.zeros(n))
-    place_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
-    return [encode.pose('/odocal/track', track, place_n, 'odocal_enu')
+    track_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
+    return [encode.pose('/odocal/track', track, track_n, 'odocal_enu')
             if np.isnan(track.latitude).all() else encode.fix('/odocal/track', track, 'base_link'),
             encode.imu('/odocal/biases', biases, 'base_link', gyro_sigma**2, force_sigma**2),
             *_residual_topics(result)]
 
 
 def _residual_topics(result: Calibration) -> list[encode.Topic]:
-    sensors: dict[str, list[Any]] = {}
+    """Return a topic for each sensor, with its residuals in all legs."""
+    legs_of_sensor: dict[str, list[Any]] = {}
     for number, leg in enumerate(result.legs, 1):
-        for of_sensor in sensor_residuals(leg):
-            sensors.setdefault(of_sensor.sensor, []).append(
-                (number, leg, _component_columns(of_sensor)))
-    return [encode.joints(f'/odocal/residuals/{sensor}', {
-        name: OdometerSamples(rows['stamp_ns'], rows['stamp_ns'], column)
-        for name, column in rows.items() if name not in ('leg', 'stamp_ns', 't_s')})
-        for sensor, rows in ((sensor, _by_time(stack_legs(found)))
-                             for sensor, found in sensors.items())]
+        for residual in sensor_residuals(leg):
+            legs_of_sensor.setdefault(residual.sensor, []).append(
+                (number, leg, _component_columns(residual)))
+    topics = []
+    for sensor, legs in legs_of_sensor.items():
+        rows = _by_time(stack_legs(legs))
+        topics.append(encode.joints(f'/odocal/residuals/{sensor}', {
+            name: OdometerSamples(rows['stamp_ns'], rows['stamp_ns'], column)
+            for name, column in rows.items() if name not in ('leg', 'stamp_ns', 't_s')}))
+    return topics
 
 
-def _component_columns(of_sensor: SensorResiduals) -> Series:
+def _component_columns(residual: SensorResiduals) -> Series:
     """Return the residuals of a sensor as columns: each component, then its sigma."""
-    columns = {'t': of_sensor.t}
-    for name, value, sigma in zip(of_sensor.components, of_sensor.value.T, of_sensor.sigma.T,
+    columns, unit = {'t': residual.t}, UNIT_NAMES[residual.unit]
+    for name, value, sigma in zip(residual.components, residual.value.T, residual.sigma.T,
                                   strict=True):
-        columns |= {f'{name}_{IN_NAMES[of_sensor.unit]}': value.astype(float),
-                    f'{name}_sigma_{IN_NAMES[of_sensor.unit]}': sigma.astype(float)}
+        columns |= {f'{name}_{unit}': value.astype(float),
+                    f'{name}_sigma_{unit}': sigma.astype(float)}
     return columns
 
 
@@ -185,6 +191,7 @@ SERIES: dict[str, Callable[[Calibration], Series]] = {
     'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals,
     'scale_by_speed': export_pictures.scale_by_speed}
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
+# names of files that ``export`` writes
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
     for ending in ('csv', 'parquet')), *(f'{name}{ending}' for name in ('scale_by_speed', 'map')
@@ -195,9 +202,10 @@ def check_names(files: Iterable[Path | str]) -> None:
     """Raise BadUsage for a file with an unknown name, or without a library to write it."""
     for file in files:
         if Path(file).suffix == '.parquet' and not _is_importable('pyarrow'):
-            raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES}')
+            raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES_INSTALL}')
         if Path(file).suffix == '.rrd' and not _is_importable('rerun'):
-            raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: {RERUN}')
+            raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: '
+                           f'{RERUN_INSTALL}')
         if Path(file).name not in KNOWN:
             raise BadUsage(f'export: {file}: {unknown_name(Path(file).name, KNOWN)}')
 
@@ -231,5 +239,5 @@ def _write(result: Calibration, file: Path) -> None:
     elif ending == 'parquet':
         parquet(SERIES[name](result), file)
     else:
-        with whole_file(file) as out:
-            out.write(TEXTS[ending](SERIES[name](result)).encode())
+        with whole_file(file) as output:
+            output.write(TEXTS[ending](SERIES[name](result)).encode())

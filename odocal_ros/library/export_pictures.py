@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of a calibration: its legs as a map without a network, its scale against speed."""
+"""Pictures of a calibration: a map of its legs, drawn offline, and its scale against speed."""
 
 import math
 from pathlib import Path
@@ -17,7 +17,7 @@ from odocal_ros.library.series import Series
 from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure
 from odocal_ros.output.program_files import features
 
-POINTS = 400     # judgement: of a line or of the fixes, for a small file
+MOST_POINTS = 400     # judgement: of a line or of the fixes, for a small file
 NOT_ON_A_MAP = ('the positions are in a local frame, which has no place on a map; use '
                 'trajectory.csv or trajectory.tum')
 # estimates of SpeedScale and their units in the names of columns
@@ -31,7 +31,7 @@ def draw_map(result: Calibration, path: Path) -> None:
     Raises BadUsage: the positions are in a local frame.
     """
     shapes = [feature for number, leg in enumerate(result.legs, 1)
-              for feature in features(number, leg, POINTS)]
+              for feature in features(number, leg, MOST_POINTS)]
     if not shapes:
         raise BadUsage(f'export: {path}: {NOT_ON_A_MAP}')
     with apply_style():
@@ -60,13 +60,13 @@ def _draw_feature(ax: Any, shape: dict[str, Any]) -> None:
         geometry['coordinates']]
     for line in lines:
         longitude, latitude = np.atleast_2d(np.array(line, float))[:, :2].T
-        known = ax.get_legend_handles_labels()[1]
+        drawn_labels = ax.get_legend_handles_labels()[1]
         label = {'as_configured': 'as configured', 'mark': 'start and stop'}.get(kind, kind)
-        ax.plot(longitude, latitude, label=None if label in known else label, **style[kind])
+        ax.plot(longitude, latitude, label=None if label in drawn_labels else label, **style[kind])
 
 
 def _add_map_scale(ax: Any) -> None:
-    """Give axes of degrees a true aspect, a graticule and a scale bar."""
+    """Add a graticule and a scale bar to axes in degrees, and set their aspect ratio."""
     from pyproj import Geod
     ax.margins(0.08)
     south, north = ax.get_ylim()
@@ -121,8 +121,8 @@ def scale_by_speed(result: Calibration) -> Series:
 def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
     from odocal_ros.output.scale_plots import draw_by_speed, fit_text
-    most = 8     # legs in one picture, the newest
-    legs = _legs_with_speed_scale(result)[-most:]
+    most_legs = 8     # in one picture, the newest
+    legs = _legs_with_speed_scale(result)[-most_legs:]
     figure = new_figure(7.0, 3.2 * len(legs))
     axes = figure.subplots(len(legs), 1, squeeze=False)[:, 0]
     for ax, (number, speed_scale) in zip(axes, legs, strict=True):

@@ -26,10 +26,11 @@ from odocal_ros.settings.config import Config
 if TYPE_CHECKING:
     from odocal_ros.library.read_bag import Recording
 
-Recorded: TypeAlias = 'Bag | Recording'     # open, or read
+Recorded: TypeAlias = 'Bag | Recording'     # an open bag, or one that was read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
-OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
-CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
+# judgement: of the distance; a first stop after this share does not start a leg
+LATEST_START_SHARE = 0.2
+CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within this time
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
 
@@ -74,11 +75,11 @@ def coverage_reasons(recorder: LegRecorder) -> tuple[Reason, ...]:
     if not ends:
         return ()
     begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
-    gaps = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.0f} s {where}'
+    gaps = [f'{INPUTS[slot].label} {verb} {missing_ns * 1e-9:.0f} s {relation}'
             for slot, (a, b) in ends.items()
-            for does, missing, where in (('begins', a - begin, 'after the first topic'),
-                                         ('ends', end - b, 'before the last topic'))
-            if missing > CUT_SHORT_NS]
+            for verb, missing_ns, relation in (('begins', a - begin, 'after the first topic'),
+                                               ('ends', end - b, 'before the last topic'))
+            if missing_ns > CUT_SHORT_NS]
     return (Reason(Code.TOPIC_GAP, f'{", ".join(gaps)}: the leg is limited to the time '
                    'that all topics cover', 'Wait for messages of all topics and the first fix '
                    'before the drive, and record to its end. If a topic failed, check its driver, '
@@ -105,6 +106,7 @@ def last_statuses(bag: Bag) -> list[dict[str, str]]:
 
 
 def _store_status(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str]) -> None:
+    """Store a status as the last one of its leg; the event of a dropped leg is kept."""
     try:
         start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
     except (KeyError, ValueError):
@@ -132,8 +134,8 @@ def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan 
     """
     firsts, lasts = zip(*_first_and_last(recorder).values() or [(0, 1)], strict=True)
     first, last = max(firsts), min(lasts)     # last before first: no common time
-    has_both_ends = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
-                                 for a in requested)
+    has_both_ends = marks or any(
+        isinstance(leg, LegSpan) and None not in (leg.start_ns, leg.stop_ns) for leg in requested)
     if first - last > OFFSET_REACH * 1e9 and not has_both_ends:
         raise BadData(f'{bag.name}: {_no_common_time_text(recorder)}')
     last = max(last, first + 1)
@@ -141,7 +143,7 @@ def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan 
     def standstills() -> Standstills:
         return stops or standstills_of(screen(recorder.close(first, last, preroll=0.0), config,
                                               check_faults=False)[0], first, config)
-    legs = [_span_in_bag(a, bag, first, last) for a in requested if isinstance(a, LegSpan)]
+    legs = [_span_in_bag(leg, bag, first, last) for leg in requested if isinstance(leg, LegSpan)]
     if EACH_STOP in requested:
         legs += _each_stop(standstills(), settings_by_frame(recorder.rows('fix'), config))
     if legs:
@@ -183,6 +185,7 @@ def _no_common_time_text(recorder: LegRecorder) -> str:
 
 
 def _span_in_bag(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
+    """Return the stamps of a requested leg; raise BadUsage if it is outside the bag."""
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
     # stamps may be on another clock than bag times, as in a recording of a replay
@@ -197,7 +200,7 @@ def _span_in_bag(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[i
 
 def standstills_of(inputs: Inputs, first: int, config: Config) -> Standstills:
     """
-    Return the standstills of a recording, none if a topic lacks.
+    Return the standstills of a recording, none if a topic is missing.
 
     inputs : screened, over the common time of the topics.   first : their start, ns.
     """
@@ -225,10 +228,12 @@ def _by_standstill(first: int, last: int, stops: Standstills) -> tuple[int, int]
     count, distance = len(stops.spans_ns), stops.distance
     if not count:
         return first, last
-    start, stop, opening = first, last, 0
-    if stops.path_m[0, 0] < OPENING * distance:       # else an intermediate stop, or the last one
-        start, opening = int(stops.spans_ns[0, 1]), 1
-    if count > opening and distance - stops.path_m[-1, 1] < 0.02 * distance + 1.0:
+    start, stop = first, last
+    starts_at_rest = stops.path_m[0, 0] < LATEST_START_SHARE * distance
+    if starts_at_rest:
+        start = int(stops.spans_ns[0, 1])
+    # the same standstill is not start and end
+    if count > starts_at_rest and distance - stops.path_m[-1, 1] < 0.02 * distance + 1.0:
         stop = int(stops.spans_ns[-1, 1])
     return start, stop
 

@@ -26,15 +26,15 @@ from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW, _ = PARAMETERS
-RTK = 0.02                        # m, physical: sigma of a fix, by receivers' data sheets
+RTK_SIGMA = 0.02                  # m, physical: of a fix, by receivers' data sheets
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change and the resulting sigmas of scale and yaw, relative, rad; None: not determined."""
+    """A change of the planned drive or its sensors, and the sigmas that result."""
 
     text: str
-    sigmas: dict[str, float | None]
+    sigmas: dict[str, float | None]     # of scale, relative, and yaw, rad; None: not determined
 
     def gain(self, before: Plan, parameter: str) -> float:
         """Return the ratio of the old to the new sigma; inf if there was none before."""
@@ -48,12 +48,12 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     """Return the changes of drive and sensors, each with the sigmas that it leads to."""
     # the same keyframe spacing: a wider one alone makes a sigma larger
     spacing = keyframe_spacing(drive)
-    found = []
+    results = []
     for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
                                             *_better_sensors(drive, sigmas, before)):
-        outcome = plan_methods(other_drive, other_sigmas, spacing)
-        found.append(Change(text, {name: outcome.sigma(name) for name in (SCALE, YAW)}))
-    return found + _second_leg(drive, sigmas, before)
+        after = plan_methods(other_drive, other_sigmas, spacing)
+        results.append(Change(text, {name: after.sigma(name) for name in (SCALE, YAW)}))
+    return results + _second_leg(drive, sigmas, before)
 
 
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
@@ -78,24 +78,25 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
                     before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield (text, drive, sigmas) with better fixes, heading and IMU."""
-    if sigmas.fix > 2 * RTK:
-        yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
+    if sigmas.fix > 2 * RTK_SIGMA:
+        yield (f'RTK fixes ({RTK_SIGMA:g} m)', drive,
+               replace(sigmas, fix=RTK_SIGMA, fix_up=2 * RTK_SIGMA))
     alignment = before.two_point.alignment
-    new_sigma = alignment.heading_sigma if alignment.heading_separable else math.inf
-    outside_heading = math.radians(0.1)    # of two antennas a metre or two apart
-    better = outside_heading if new_sigma > 2 * outside_heading else new_sigma / 2
+    present = alignment.heading_sigma if alignment.heading_separable else math.inf
+    two_antennas = math.radians(0.1)    # sigma of a heading with a base line of 1 to 2 m
+    better = two_antennas if present > 2 * two_antennas else present / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
                                            'alignment.heading_sigma': better})
     yield (f'a heading with {math.degrees(better):.2g} deg uncertainty', drive,
            replace(sigmas, config=config))
-    grade = GRADES.index(sigmas.config.imu.grade)
-    if grade + 1 < len(GRADES):
-        finer = with_settings(sigmas.config, {'imu.grade': GRADES[grade + 1]})
-        yield f'an IMU of {GRADES[grade + 1]} grade', drive, replace(sigmas, config=finer)
+    better_grades = GRADES[GRADES.index(sigmas.config.imu.grade) + 1:]
+    if better_grades:
+        config = with_settings(sigmas.config, {'imu.grade': better_grades[0]})
+        yield f'an IMU of {better_grades[0]} grade', drive, replace(sigmas, config=config)
 
 
 def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
-    """Return the drive up to where it is farthest from the start, None if that is the end."""
+    """Return the drive up to its farthest point from the start, None if that is the end."""
     inside = drive.t >= 0
     position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
     k = int(np.argmax(np.abs(position - position[0])))
@@ -108,22 +109,22 @@ def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
 
 
 def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
-    """Return two legs combined, the second in reverse direction: each value by its method."""
+    """Return two legs combined, the second in the opposite direction."""
     if before.sigma(SCALE) is None:
         return []
-    other = {'two_point': predict(drive.turn_around(), sigmas).method}
-    sigmas_of_both: dict[str, float | None] = {}
-    for parameter in (SCALE, YAW):
-        sigmas_of_both[parameter] = None
+    opposite = predict(drive.turn_around(), sigmas).method
+    combined: dict[str, float | None] = {SCALE: None, YAW: None}
+    for parameter in combined:
         name = before.method_of(parameter)
         if not name:
             continue
         first = before.methods[name]
         # the smoother works in body axes: the direction of the drive does not matter
-        legs = [_with_dummy_values(leg) for leg in (first, other.get(name, first))]
+        second = opposite if name == 'two_point' else first
+        legs = [_with_dummy_values(leg) for leg in (first, second)]
         both = combine_results(name, legs, (0, round(drive.duration * 1e9)), sigmas.config)
-        sigmas_of_both[parameter] = both.estimates[parameter].sigma
-    return [Change('a second leg in the other direction', sigmas_of_both)]
+        combined[parameter] = both.estimates[parameter].sigma
+    return [Change('a second leg in the other direction', combined)]
 
 
 def _with_dummy_values(method: MethodResult) -> MethodResult:
@@ -133,16 +134,16 @@ def _with_dummy_values(method: MethodResult) -> MethodResult:
     return replace(method, estimates=known)
 
 
-def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
-    """Return the changes that help a parameter, best first."""
-    worth = 0.98    # of a sigma: a change that leaves more is not listed
-    helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
+def ranked(improvements: list[Change], before: Plan, parameter: str) -> list[Change]:
+    """Return the changes that reduce the sigma of a parameter, best first."""
+    largest_share = 0.98    # of the old sigma: a change that leaves more is not listed
+    helpful = [c for c in improvements if c.gain(before, parameter) > 1 / largest_share]
     return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigmas[parameter]))
 
 
 @dataclass(frozen=True, eq=False)
 class Planned(Plan):
-    """The prediction of a drive: its motion, its errors and settings, and each method."""
+    """The prediction of a drive by each method, with the drive and its errors and settings."""
 
     drive: PlannedDrive
     sigmas: Sigmas
@@ -184,13 +185,13 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     """
     Predict the sigmas of one drive.
 
-    distance, speed, turns, standstill, acceleration : m, m/s, turns of 90 deg, s at rest at either
-    end, m/s^2: a drive by its figures.   scenario, duration : name of a simulated drive, and its
-    duration, s.   gpx : a GPX track; one without times is driven at ``speed``.   bag, topics : a
-    recorded bag, with the accuracy and rate of its own fixes; of a journal with its settings and
-    topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.   figures :
-    fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per count,
-    sway m/s, slip m/sqrt(s).
+    distance, speed, turns, standstill, acceleration : m, m/s, number of 90 deg turns, s at rest
+    at start and end, m/s^2: a drive by its figures.   scenario, duration : name of a simulated
+    drive, and its duration, s.   gpx : a GPX track; one without times is driven at ``speed``.
+    bag, topics : a recorded bag, with the accuracy and rate of its fixes; of a journal with its
+    settings and topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.
+    figures : fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per
+    count, sway m/s, slip m/sqrt(s).
 
     Raises BadUsage, BadConfig: not exactly one drive is given, or its values are invalid.
     """
@@ -209,13 +210,13 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(Path(bag)) if bag else None
     settings = config_of(config, journal.settings if journal else None)
-    own: dict[str, Any] = {}
+    of_bag: dict[str, Any] = {}      # fields of Sigmas
     if scenario:
         drive = planned_drives.from_scenario(scenario, duration)
     elif gpx:
         drive = planned_drives.from_gpx(Path(gpx), speed)
     elif bag:
-        drive, own = planned_drives.from_bag(Path(bag), settings, dict(topics or {}), journal)
+        drive, of_bag = planned_drives.from_bag(Path(bag), settings, dict(topics or {}), journal)
     elif speed is None:
         raise BadUsage('--distance needs --speed, m/s')
     else:
@@ -223,6 +224,6 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         drive = planned_drives.from_figures(
             speed, distance, 30.0 if standstill is None else standstill, turns or 0, acceleration)
     if 'fix' in figures:
-        own |= {'fix_up': None}
-    sigmas = Sigmas(config=settings, **(own | figures))
+        of_bag |= {'fix_up': None}
+    sigmas = Sigmas(config=settings, **(of_bag | figures))
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)

@@ -28,8 +28,7 @@ from odocal_ros.sim.wheels import effective_width, STRAIGHT
 
 MARKS = 'marks'
 KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
-# m, judgement: of a run between marks: correlation length of the position error
-MARKS_LENGTH = 1.0
+MARKS_LENGTH = 1.0     # m of path, judgement: correlation length of position errors at marks
 SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever':
          'rotation lever', 'track_width_arc': 'width on arcs', 'lateral_scale_factor': 'lateral',
          'yaw_mounting_angle': 'yaw'}
@@ -37,6 +36,8 @@ SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever'
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
+    """The prediction of a run: its pattern and motion, the robot, the predicted result."""
+
     name: str
     motion: RobotMotion
     robot: Robot
@@ -69,10 +70,11 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     Predict the sigmas of runs of a small robot on a level floor.
 
     run : of PATTERNS, or ``all``.   reference : of KINDS.   drive : as ``odometer.drive``.
-    imu : the robot has one.   size, rounds, speed : m of a straight, repetitions, m/s.
-    track_width : m between the wheels (skid steering widens it by 1.7 on the spot and 1.4
-    straight on).   wheels : number.   slip : m/sqrt(s) of each.   points_sigma : m, accuracy of
-    the robot on its marks; None: ``reference.points_sigma``.   config : as ``calibrate_bag``.
+    imu : the robot has an IMU.   size, rounds, speed : m of a straight, repetitions, m/s.
+    track_width : m between the wheels; the effective one of skid steering is 1.7 times as large
+    in turns on the spot and 1.4 times on a straight.   wheels : number.   slip : m/sqrt(s) of
+    each.   points_sigma : m, accuracy of the robot on its marks; None: ``reference.points_sigma``.
+    config : as ``calibrate_bag``.
 
     Raises BadUsage, BadConfig: a name is unknown, or a value is out of range.
     """
@@ -98,11 +100,11 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
 
 
 def robot_of(options: SimOptions) -> Robot:
+    """Return robot and reference of a simulated drive."""
     usual = dict(REFERENCES[options.reference].usual)
     drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
-    model = Robot.drift_length
-    # of a correlated error its sigma; of a random walk that of the model with the same steps
-    stationary = drift * np.sqrt((length or model) / 2)
+    # the sigma of a correlated error; for a random walk that of the model with the same increments
+    stationary = drift * np.sqrt((length or Robot.drift_length) / 2)
     straight = STRAIGHT * options.track_width if options.drive == SKID else 0.0
     return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),
                  straight_width=straight, wheels=max(options.wheels or 2, 2),
@@ -111,8 +113,9 @@ def robot_of(options: SimOptions) -> Robot:
 
 
 def motion_of_drive(options: SimOptions) -> RobotMotion:
-    made = motion_of(options)
-    t: Floats = MOTION_STEP * np.arange(int(made.duration / MOTION_STEP) + 1, dtype=float)
-    state = made.at(t)
+    """Return the motion of a simulated drive."""
+    simulated = motion_of(options)
+    t: Floats = MOTION_STEP * np.arange(int(simulated.duration / MOTION_STEP) + 1, dtype=float)
+    state = simulated.at(t)
     side: Floats = state.sway[:, 0] * (options.drive in HOLONOMIC)
     return RobotMotion(t, state.speed, side, state.yaw_rate, np.empty((0, 2)))

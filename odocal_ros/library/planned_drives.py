@@ -26,7 +26,7 @@ from odocal_ros.settings.config import Config
 if TYPE_CHECKING:
     from odocal_ros.library.read_bag import JournalNotes
 
-LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of it
+LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of this
 MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
 
 
@@ -46,19 +46,20 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
         raise BadUsage(f'--standstill {standstill:g}: required: 0 s or more')
     top = min(speed, math.sqrt(distance * acceleration))
     ramp, cruise = top / acceleration, max(0.0, distance / top - top / acceleration)
-    whole = 2 * (standstill + ramp) + cruise
+    duration = 2 * (standstill + ramp) + cruise
     most_metres = 1e6
-    if distance > most_metres or whole > MOST_SECONDS:
-        raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {whole / 3600:.1f} h; the '
-                       f'limits are {most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h')
+    if distance > most_metres or duration > MOST_SECONDS:
+        raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {duration / 3600:.1f} h; '
+                       f'the limits are {most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h')
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
         raise BadUsage(f'--turns {turns}: required: 0 to {int(cruise / turn_time)}; each turn '
                        f'takes {turn_time:g} s of the {cruise:.0f} s at full speed. Use a longer '
                        '--distance or fewer turns')
-    t = np.linspace(0.0, whole, max(2, math.ceil(whole / max(DRIVE_STEP, whole / 20_000)) + 1))
+    step = max(DRIVE_STEP, duration / 20_000)
+    t = np.linspace(0.0, duration, max(2, math.ceil(duration / step) + 1))
     knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])
-    t = np.union1d(t, knots)        # kinks on the grid: the trapezoid sum is then exact
+    t = np.union1d(t, knots)        # with the knots, integration by trapezoids is exact
     rate = np.zeros_like(t)
     for k in range(turns):
         begin = standstill + ramp + (k + 1) * cruise / (turns + 1) - turn_time / 2
@@ -68,6 +69,7 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
 
 
 def from_scenario(name: str, duration: float | None) -> PlannedDrive:
+    """Return the drive of a simulated scenario; duration: s, None: that of the scenario."""
     from odocal_ros.sim.options import resolved, SimOptions
     from odocal_ros.sim.scenarios import motion_of
     options = resolved(SimOptions(scenario=name) if duration is None
@@ -148,49 +150,50 @@ def _seconds(text: str | None) -> float | None:
 
 
 def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> PlannedDrive:
-    """Return the drive through points; points closer than 5 m are skipped."""
+    """Return the drive through points (n, 3), m, at times (n,), s; path: for errors."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
-    t, p = t[rising], position_n[rising]
+    t, points = t[rising], position_n[rising]
     used = [0]
-    gpx_step = 5.0    # m between points used: nearer ones are receiver noise
+    least_step = 5.0    # m between points used: nearer ones are receiver noise
     for k in range(1, len(t)):
-        if np.hypot(*(p[k] - p[used[-1]])[:2]) >= gpx_step:
+        if np.hypot(*(points[k] - points[used[-1]])[:2]) >= least_step:
             used.append(k)
     if len(used) < 2:
-        raise BadUsage(f'{path}: the track never moves {gpx_step:g} m; give a driven track')
+        raise BadUsage(f'{path}: the track never moves {least_step:g} m; give a driven track')
     a, b = np.array(used[:-1]), np.array(used[1:])
-    step = p[b] - p[a]
-    path_length, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
+    step = points[b] - points[a]
+    step_length, horizontal = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
     # a slow step was mostly a stop: its motion is assigned to the interval before its last point
-    pace = path_length / (t[b] - t[a])
-    gpx_rest, gpx_slow = 0.3, 0.1    # m/s, of the median speed: slower steps were mostly a stop
-    rest = pace < max(gpx_rest, gpx_slow * np.median(pace))
-    begin = np.where(rest, t[b - 1], t[a])
+    mean_speed = step_length / (t[b] - t[a])
+    slow_speed, slow_share = 0.3, 0.1    # m/s, of the median speed: the larger is the limit
+    slow = mean_speed < max(slow_speed, slow_share * np.median(mean_speed))
+    begin = np.where(slow, t[b - 1], t[a])
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
     if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
         raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; required: above 0 s, '
                        f'at most {MOST_SECONDS:g} s')
-    piece = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)
-    moving = (grid >= begin[piece]) & (grid <= t[b][piece])
-    speed = np.where(moving, (path_length / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
+    number = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)      # of the step
+    moving = (grid >= begin[number]) & (grid <= t[b][number])
+    speed = np.where(moving, (step_length / np.maximum(t[b] - begin, 1e-3))[number], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
-    # s: faster changes between points are noise and spacing; rests, too long by the path to the
-    # next used point, lose half of this at each end
-    gpx_smooth = 4.0
-    wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
-    slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer
+    # s: faster changes between points are noise and spacing. A rest contains the path to the next
+    # used point, and loses half of this time at each end
+    smoothing_time = 4.0
+    window = max(1, round(smoothing_time / (grid[1] - grid[0]) / 2)) * 2 + 1
+    slope_windows = 5    # odd: heights are noisier, hills longer
     latitude, longitude, height = start.tolist()
     return with_marks(
-        grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
-        _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), slopes * wide),
+        grid, _moving_mean(speed, window), _moving_mean(np.interp(grid, middle, yaw), window),
+        _moving_mean(np.interp(grid, middle, arctan2(step[:, 2], horizontal)),
+                     slope_windows * window),
         latitude=latitude, longitude=longitude, height=height)
 
 
-def _smooth(x: Floats, wide: int) -> Floats:
-    """Return moving means over ``wide`` rows, odd; the end values are extended."""
-    total = np.concatenate([[0.0], np.cumsum(np.pad(x, wide // 2, mode='edge'))])
-    mean: Floats = (total[wide:] - total[:-wide]) / wide
+def _moving_mean(x: Floats, window: int) -> Floats:
+    """Return means over an odd number of rows; the end values are extended: (n,)."""
+    total = np.concatenate([[0.0], np.cumsum(np.pad(x, window // 2, mode='edge'))])
+    mean: Floats = (total[window:] - total[:-window]) / window
     return mean
 
 

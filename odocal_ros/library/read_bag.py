@@ -34,7 +34,7 @@ from odocal_ros.safe_io.limits import is_file
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config
 
-BLOCK = 'odocal_journal'
+JOURNAL_BLOCK = 'odocal_journal'     # name of the metadata in the settings file of a journal
 STILL_SHARE = 0.05      # judgement: of the largest travel in a second; above it the robot moves
 
 
@@ -64,8 +64,8 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     if not is_file(path):
         raise BadUsage(f'{path}: is not a regular file; remove it to replay the bag')
     from odocal_ros.settings.config_file import read_journal_file
-    settings, about = read_journal_file(path, BLOCK)
-    topics = {slot: about[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in about}
+    settings, metadata = read_journal_file(path, JOURNAL_BLOCK)
+    topics = {slot: metadata[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in metadata}
     return JournalNotes(path, settings, topics)
 
 
@@ -78,15 +78,16 @@ class Recording:
     topics: dict[str, str]                # slot -> topic
     imu_frame: str                        # frame_id of the IMU
     start_ns: int                         # bag time of its first message
-    end_ns: int                           # and of its last one
+    end_ns: int                           # bag time of its last message
     marks: tuple[tuple[int, int], ...]    # (start, stop) stamps by a node, stop 0 if missing
-    dropped: bool                         # a journal's leg was dropped
+    dropped: bool                         # the operator dropped the leg of a journal
     notes: tuple[Reason, ...]             # reasons from the bag for its results
     config: Config                        # settings, including a journal's
-    recorder: LegRecorder
+    recorder: LegRecorder                 # the samples
 
     @property
     def form(self) -> OdometerForm:
+        """Return the meaning of the odometer values."""
         return self.recorder.form
 
     def samples(self, slot: str) -> Samples:
@@ -124,7 +125,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
-    path : of the bag, or of a journal of the node, which has settings and topics of its own.
+    path : of the bag, or of a journal of the node, which contains settings and topics.
     topics : slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others
     are found by their type.   config : Config, settings by dotted name, or a parameter file.
     listener : receives notes and progress.
@@ -212,16 +213,16 @@ def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_
     if recorder.form.quantity != 'cumulative':
         value = np.cumsum(value)
 
-    def moved_within(at: Floats) -> Floats:
-        out: Floats = np.abs(np.interp(at + WITHIN, t, value) - np.interp(at - WITHIN, t, value))
-        return out
+    def travel_around(times: Floats) -> Floats:
+        travel: Floats = np.interp(times + WITHIN, t, value) - np.interp(times - WITHIN, t, value)
+        return np.abs(travel)
     times = np.array([(mark.stamp_ns - start_ns) * 1e-9 for mark in marks])
     for time in times.tolist():
         if not (len(t) and t[0] <= time - WITHIN and time + WITHIN <= t[-1]):
             raise BadUsage(f'--mark {time:g}: the odometer has no data there; required: seconds '
                            'from the first message of the bag')
-    largest = float(moved_within(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
-    for time, distance in zip(times.tolist(), moved_within(times).tolist(), strict=True):
+    largest = float(travel_around(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
+    for time, distance in zip(times.tolist(), travel_around(times).tolist(), strict=True):
         if distance > STILL_SHARE * largest:
             raise BadUsage(f'--mark {time:g}: the wheels turn within {WITHIN:g} s of it; '
                            'required: a time at which the robot stands on a point')

@@ -49,14 +49,14 @@ def states(result: Calibration) -> Series:
 
 def _of_fits(result: Calibration,
              columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
-    """Return ``columns``, a function of (leg, details), for each leg the smoother fitted."""
-    found = [(number, leg, columns(leg, leg.methods['smoother'].details))
-             for number, leg in enumerate(result.legs, 1)
-             if leg.track_n is not None
-             and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
-    if not found:
+    """Return the columns of all legs with a fit; columns: function of leg and details."""
+    legs = [(number, leg, columns(leg, leg.methods['smoother'].details))
+            for number, leg in enumerate(result.legs, 1)
+            if leg.track_n is not None
+            and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
+    if not legs:
         raise BadUsage(NO_FIT)
-    return stack_legs(found)
+    return stack_legs(legs)
 
 
 def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
@@ -68,8 +68,8 @@ def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
 def _vehicle_attitude(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
     from odocal_ros.estimator.state import C_bv
-    found = leg.methods['smoother'].estimates
-    yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
+    estimates = leg.methods['smoother'].estimates
+    yaw, pitch = (estimates[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']
     return _at_track(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
 
@@ -99,14 +99,14 @@ def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
     return columns
 
 
-def stack_legs(found: list[tuple[int, LegResult, Series]]) -> Series:
-    """Return the concatenated series of legs, with times and stamps."""
-    legs = [{'leg': np.full(len(columns['t']), number),
-             'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
-             't_s': columns['t'],
-             **{name: column for name, column in columns.items() if name != 't'}}
-            for number, leg, columns in found]
-    return {name: np.concatenate([one[name] for one in legs]) for name in legs[0]}
+def stack_legs(legs: list[tuple[int, LegResult, Series]]) -> Series:
+    """Return the concatenated series of (number, leg, columns), with times and stamps."""
+    series = [{'leg': np.full(len(columns['t']), number),
+               'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
+               't_s': columns['t'],
+               **{name: column for name, column in columns.items() if name != 't'}}
+              for number, leg, columns in legs]
+    return {name: np.concatenate([one[name] for one in series]) for name in series[0]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,18 +123,18 @@ class SensorResiduals:
 
 def sensor_residuals(leg: LegResult) -> list[SensorResiduals]:
     """Return the residuals of each sensor in a leg, none without track and fit."""
-    found = []
+    sensors = []
     if (e := leg.evidence) is not None:
         sigma = np.repeat(e.fix_sigma[:, None], 2, axis=1)
-        found = [SensorResiduals(name, 'm', ('along', 'left'), e.t_fix, rows, sigma)
-                 for name, rows in (('track', e.residual), ('track_before', e.residual_before))]
+        sensors = [SensorResiduals(name, 'm', ('along', 'left'), e.t_fix, rows, sigma)
+                   for name, rows in (('track', e.residual), ('track_before', e.residual_before))]
     smoothed = getattr(leg.methods.get('smoother'), 'details', {})
     for sensor, unit, components in SMOOTHED:
-        if f'left_{sensor}' in smoothed:
+        if f'left_{sensor}' in smoothed:      # residuals, then their sigmas
             t = smoothed['left_fix_t'] if sensor == 'fix' else smoothed['key_t'][1:]
-            found.append(SensorResiduals(sensor, unit, components, t,
-                                         *np.hsplit(smoothed[f'left_{sensor}'], 2)))
-    return found
+            sensors.append(SensorResiduals(sensor, unit, components, t,
+                                           *np.hsplit(smoothed[f'left_{sensor}'], 2)))
+    return sensors
 
 
 def residuals(result: Calibration) -> Series:
@@ -144,19 +144,22 @@ def residuals(result: Calibration) -> Series:
     sensor, component, value, sigma, unit : calibrated drive minus measurement, and one standard
     deviation of its modelled noise.   distance_m : path length so far.
 
-    ``track`` along, left: dead reckoning from the start mark minus each fix, as calibrated;
-    ``track_before`` as configured. By the smoother, if it fits: ``fix`` east, north, up; over
-    the second before, ``odometer`` along, left, up, and means of ``gyro`` and ``accelerometer``
-    x, y, z in the body frame b.   Raises BadUsage: no leg has a track.
+    Sensor ``track``, components along, left: dead reckoning from the start mark with the
+    calibrated values minus each fix; ``track_before`` with the configured values. If the smoother
+    has a fit: ``fix`` east, north, up; over each second ``odometer`` along, left, up, and means
+    of ``gyro`` and ``accelerometer`` x, y, z in the body frame b.
+
+    Raises BadUsage: no leg has a track.
     """
-    found = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
-             for one in sensor_residuals(leg)]
-    if not found:
+    legs = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
+            for one in sensor_residuals(leg)]
+    if not legs:
         raise BadUsage('no leg has a track to compare with its fixes; see the reasons')
-    return stack_legs(found)
+    return stack_legs(legs)
 
 
 def _residual_rows(leg: LegResult, residuals: SensorResiduals) -> Series:
+    """Return the residuals of a sensor as columns, a row for each known component."""
     m, c = residuals.value.shape
     known = np.isfinite(residuals.sigma).ravel()
     t, e = np.repeat(residuals.t, c), leg.evidence

@@ -56,16 +56,16 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
 
 
 def truth_paths(out: Path) -> list[Path]:
-    """Return the paths of truth and settings; with the name of the bag if others exist there."""
-    plain = [out.parent / name for name in (TRUTH, SETTINGS)]
-    text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
+    """Return the paths of truth and settings; with the bag's name if another bag has such."""
+    paths = [out.parent / name for name in (TRUTH, SETTINGS)]
+    text = paths[0].read_text(encoding='utf-8', errors='replace') if paths[0].exists() else ''
     if MADE_HERE in text and one_line(f'Truth of {out.name}.') not in text:
-        return [path.with_name(f'{out.name}.{path.name}') for path in plain]
-    return plain
+        return [path.with_name(f'{out.name}.{path.name}') for path in paths]
+    return paths
 
 
 def _check_may_replace(path: Path, force: bool) -> None:
-    """Refuse to overwrite a file, unless ``force`` is set and it was made here."""
+    """Raise BadUsage for an existing file, unless ``force`` is set and a simulation made it."""
     if not path.exists():
         return
     if not force:
@@ -77,7 +77,7 @@ def _check_may_replace(path: Path, force: bool) -> None:
 
 
 def write_yaml(path: Path, content: dict[str, Any], title: str) -> None:
-    """Write a file whole or not at all."""
+    """Write a YAML file, complete or not at all; title: its first line, a comment."""
     import yaml
     try:
         write_text(path, for_comment(one_line(f'{title} {MADE_HERE}'))

@@ -23,11 +23,10 @@ from odocal_ros.safe_io.text_formats import indented_list, one_line
 from odocal_ros.settings.config import Config, OdometerConfig
 
 SYSTEM_TOPICS = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
-COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # to a vehicle, not measured
-# poses that a person sets: Nav2 and RViz
-GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
-# names of estimates by GNSS, INS, SLAM, cameras and filters, and of joints that do not drive: no
-# odometer if there is another. Whole words, then parts of words. Judgement
+COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # sent to a vehicle, not measured
+GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')       # set by a person: Nav2 and RViz
+# judgement: names of estimates by GNSS, INS, SLAM, cameras and filters, and of joints that do not
+# drive; such a topic is no odometer if there is another one. Whole words, then parts of words
 ESTIMATES = re.compile(
     '(?:^|[/_])(?:ins|nav|map|local|imu|vio|lio|dlio|dlo|icp|ndt|sbg|arm|reference|zed[0-9a-z]*|'
     'camera[0-9]*|t265|slam|rtabmap|novatel|oem7|vectornav|applanix|microstrain|xsens)(?=[/_]|$)|'
@@ -36,8 +35,8 @@ ESTIMATES = re.compile(
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 NO_MESSAGES_REMEDY = 'Check the driver and the QoS of the recorder, then record again.'
-
-# an Odometry is the reference only if it is named: most are the wheel odometry itself
+# types of a position reference. An Odometry is one only if the user names it: most are the wheel
+# odometry itself
 REFERENCES = (*GEODETIC, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
 # slots in the order of choice; the others are chosen from the remaining topics
 CHOSEN_FIRST = ('odometer_right', 'odometer', 'heading')
@@ -51,7 +50,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     Return slot -> topic.
 
     topics : by name.   config : required inputs, and the type of the odometer.   overrides :
-    slot -> topic, by the user.   marked : the positions are those of marks.
+    slot -> topic, by the user.   marked : marks on surveyed points replace fixes.
 
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
     fit. All such inputs are named at once, with the option that selects each. BadTopics lists
@@ -102,9 +101,9 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
             return [name for name in found if _base_name(name) == 'heading']
-        # the only one is the IMU's
-        alone = len(found) == 1 and 'imu' not in chosen
-        found = [name for name in found if 'heading' in name] or ([] if alone else found)
+        # a single topic with an orientation is the IMU
+        is_imu = len(found) == 1 and 'imu' not in chosen
+        found = [name for name in found if 'heading' in name] or ([] if is_imu else found)
     elif slot == 'imu':
         found = _preferably_without(found, ('heading',))
     elif slot == 'fix':
@@ -125,7 +124,7 @@ def without_estimates(names: list[str]) -> list[str]:
 
 
 def _check_reference(chosen: dict[str, str]) -> None:
-    """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
+    """Raise BadUsage if one topic is both odometer and reference: its scale would be 1."""
     for slot in ('odometer', 'odometer_right'):
         if 'fix' in chosen and chosen.get(slot) == chosen['fix']:
             raise BadUsage(f'{chosen["fix"]} is both {topic_option(slot)} and '
@@ -196,7 +195,7 @@ def _fits_slot(msgtype: str, slot: str) -> bool:
 
 def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
                     chosen: dict[str, str]) -> str:
-    """Return the explanation why a slot is open and the option that selects it."""
+    """Return the reason for a slot without topic, and the option that selects one."""
     fix = chosen.get('fix', '')
     if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
@@ -217,9 +216,9 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     allowed = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     used = [topic for topic in chosen.values() if topics[topic].msgtype in types]
-    beside = ' besides the IMU' if slot == 'heading' else (
+    except_for = ' besides the IMU' if slot == 'heading' else (
         f' besides {", ".join(used)}' if used else '')
-    return f'no {INPUTS[slot].label} (a topic of {allowed}{beside}) in the bag'
+    return f'no {INPUTS[slot].label} (a topic of {allowed}{except_for}) in the bag'
 
 
 def _described(topics: Topics, names: Iterable[str]) -> str:

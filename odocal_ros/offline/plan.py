@@ -114,10 +114,10 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
 
 def _sigma_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the requested fields of ``forecast.predict.Sigmas``."""
-    from odocal_ros.library.plan import RTK
+    from odocal_ros.library.plan import RTK_SIGMA
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')
-    return _without_none(fix=RTK if args.rtk else args.fix_sigma, fix_rate=args.fix_rate,
+    return _without_none(fix=RTK_SIGMA if args.rtk else args.fix_sigma, fix_rate=args.fix_rate,
                          quantum=args.pulse, sway=args.sway, slip=args.slip_walk)
 
 
