@@ -25,8 +25,8 @@ VALUES = {'scale': 'scale_factor', 'width': 'track_width', 'lever': 'rotation_le
 
 def forecast(seed):
     """Return the forecast sigma of each value of a run, relative or rad, None: not determined."""
-    from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma
-    from odocal_ros.library.plan_indoor import motion_of_drive, robot_of
+    from odocal_ros.forecast.planned_indoor import predict_robot
+    from odocal_ros.library.plan_indoor import motion_of_drive, ratio_sigma, robot_of
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.options import resolved
     options = resolved(indoor.options_of(seed))

@@ -1,8 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many vehicles: each bag is a Dask task with the pipeline of replay; then vehicles and a page."""
-
+"""Calibration of a fleet: each bag is a task on Dask; then tables of vehicles, and a page."""
 
 from odocal_ros.fleet.command import calibrate_bags
 

@@ -40,7 +40,7 @@ from odocal_ros.fleet.rows import (
 )
 from odocal_ros.safe_io.text_formats import error_text
 
-# error texts without memory for the stack of a thread, or for a library
+# texts of other errors caused by a lack of memory: for the stack of a thread, or for a library
 NO_MEMORY = ("can't start new thread", 'failed to map segment')
 
 
@@ -49,11 +49,12 @@ class BagJob:
     """The job of a worker for one bag."""
 
     bag: FleetBag
-    topics: dict[str, str]        # arguments of ``library.calibrate_bag``, as the next two
+    # arguments of ``library.calibrate_bag``
+    topics: dict[str, str]
     config: dict[str, object]
     legs: tuple[str, ...]
-    settings: str                 # hash of all that affects a leg
-    folder: str
+    settings: str                 # hash of topics, legs and the settings that affect a leg
+    folder: str                   # of the data set
     seconds: float = 0.0          # limit; 0: none
     memory: int = 0               # limit, bytes; 0: none
 
@@ -62,22 +63,24 @@ class BagJob:
         """Return the key of the row of a failed bag, whose content is unknown."""
         return key_of('failed', self.bag.bag, self.settings)
 
-    def row(self, **more: Any) -> Row:
+    def row(self, **fields: Any) -> Row:
+        """Return the row of the bag with more fields."""
         return Row(bag=self.bag.bag, vehicle=self.bag.vehicle, model=self.bag.model,
-                   odometer_km=self.bag.odometer_km, **more)
+                   odometer_km=self.bag.odometer_km, **fields)
 
-    def failed(self, reason: str, **more: Any) -> Row:
+    def failed_row(self, reason: str, **fields: Any) -> Row:
+        """Return the row of the bag if it cannot be calibrated."""
         longest = 500    # characters of a reason
-        return self.row(key=self.failed_key, status=FAILED, reason=reason[:longest], **more)
+        return self.row(key=self.failed_key, status=FAILED, reason=reason[:longest], **fields)
 
 
 @dataclass(frozen=True)
 class BagOutcome:
     """The report on a bag to the command; the rest is in its row."""
 
-    key: str
+    key: str            # of its row
     status: str
-    computed: bool      # in this run
+    computed: bool      # False: the row existed
 
 
 def calibrate_bag(job: BagJob) -> BagOutcome:
@@ -85,7 +88,7 @@ def calibrate_bag(job: BagJob) -> BagOutcome:
     store, started_s = RowStore(job.folder), time.monotonic()
     fingerprint = ''
     _load_libraries()
-    with _resource_limits(job, lambda cause: store.put(job.failed(cause, seen=fingerprint))):
+    with _resource_limits(job, lambda cause: store.put(job.failed_row(cause, seen=fingerprint))):
         try:
             fingerprint = bag_fingerprint(job.bag.bag, job.settings)
             if found := _existing_row(store, job, fingerprint):
@@ -103,7 +106,7 @@ def calibrate_bag(job: BagJob) -> BagOutcome:
             if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
                 cause = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
     # outside the memory limit: the row needs memory
-    row = job.failed(cause, seen=fingerprint, seconds=time.monotonic() - started_s)
+    row = job.failed_row(cause, seen=fingerprint, seconds=time.monotonic() - started_s)
     store.put(row)
     return BagOutcome(row.key, FAILED, True)
 
@@ -127,7 +130,7 @@ def _existing_row(store: RowStore, job: BagJob, fingerprint: str) -> Row | None:
     if key := store.known(fingerprint):
         return store.get(key)
     failed = store.get(job.failed_key)
-    # a bag that ended its worker may have no hash: only its place is known
+    # a bag that ended its worker may have no fingerprint: only its path is known
     if failed is not None and failed.seen in ('', fingerprint):
         return failed
     return None
@@ -135,29 +138,30 @@ def _existing_row(store: RowStore, job: BagJob, fingerprint: str) -> Row | None:
 
 def _compute_row(job: BagJob, store: RowStore, fingerprint: str,
                  started_s: float) -> tuple[Row, bool]:
-    """Return the row of a bag, and whether it was computed, not copied from a known one."""
+    """Return the row of a bag, and whether it was computed; False: copied from an equal bag."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
-    from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
+    from odocal_ros.library.calibrate_bag import calibrate_bag as calibrate
     worker = _worker()
     with local_copy(job.bag.bag, worker.local_directory if worker else None) as path:
         with open_bag(path) as bag:
             sha256 = bag_sha256(bag)
             size = sum(Path(file).stat().st_size for file in bag.files)
         key = key_of(sha256, job.settings)
-        if (known := store.get(key)) is not None:
-            return replace(known, bag=job.bag.bag, seen=fingerprint), False
-        found = calibrated(path, job.topics, job.config, job.legs)
-    legs = found.result.legs
+        if (equal := store.get(key)) is not None:
+            return replace(equal, bag=job.bag.bag, seen=fingerprint), False
+        calibration = calibrate(path, job.topics, job.config, job.legs)
+    legs = calibration.result.legs
     return job.row(
-        key=key, seen=fingerprint, sha256=sha256, topics=json.dumps(found.inputs[0]['topics']),
-        settings=json.dumps(changed_settings(found.config), sort_keys=True), bytes=size,
+        key=key, seen=fingerprint, sha256=sha256,
+        topics=json.dumps(calibration.inputs[0]['topics']),
+        settings=json.dumps(changed_settings(calibration.config), sort_keys=True), bytes=size,
         seconds=time.monotonic() - started_s, driven_s=sum(leg.duration for leg in legs),
         start_ns=min((leg.start_ns for leg in legs), default=0),
         legs=text_of_legs(list(legs))), True
 
 
 def _worker() -> Any:
-    """Return the Dask worker that runs this, None outside of one."""
+    """Return the Dask worker of this process, None without one."""
     from distributed import get_worker
     try:
         return get_worker()
@@ -166,9 +170,9 @@ def _worker() -> Any:
 
 
 @contextmanager
-def _resource_limits(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
+def _resource_limits(job: BagJob, store_failure: Callable[[str], None]) -> Iterator[None]:
     """
-    Limit the memory, and end the worker after the time limit, once the bag's row is written.
+    Limit the memory; after the time limit store the failure of the bag and kill this worker.
 
     Nothing else ends hanging code. The worker's nanny starts another worker, which gets the bag
     again from Dask; its row then exists. Without a nanny there are no limits.
@@ -180,26 +184,25 @@ def _resource_limits(job: BagJob, give_up: Callable[[str], None]) -> Iterator[No
 
     def end() -> None:
         with suppress(Exception):
-            give_up(f'exceeded the time limit --task-timeout ({job.seconds:g} s)')
+            store_failure(f'exceeded the time limit --task-timeout ({job.seconds:g} s)')
         os.kill(os.getpid(), signal.SIGKILL)
 
-    clock = threading.Timer(job.seconds, end)
-    clock.daemon = True
+    timer = threading.Timer(job.seconds, end)
+    timer.daemon = True
     if job.seconds:
-        clock.start()
-        later = 10.0    # s after which a worker without an answer is ended
-        faulthandler.dump_traceback_later(job.seconds + later, exit=True)   # needs no interpreter
-    before = resource.getrlimit(resource.RLIMIT_DATA)
+        timer.start()
+        grace_s = 10.0    # then the process is ended even if the interpreter hangs
+        faulthandler.dump_traceback_later(job.seconds + grace_s, exit=True)
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if job.memory:
-        most = _data_bytes() + job.memory
-        hard = before[1]
+        limit = _data_bytes() + job.memory
         resource.setrlimit(resource.RLIMIT_DATA, (
-            most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+            limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-        clock.cancel()
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        timer.cancel()
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -225,13 +228,13 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     from odocal_ros.offline.replay import config_from_arguments, topics_from_arguments
     settings_of_file: dict[str, dict[str, Any]] = {}
     jobs, topics = [], topics_from_arguments(args)
-    before = changed_settings(config_of(config))
+    base = changed_settings(config_of(config))
     for bag in bags:
         file = bag.config or args.config or ''
         if file not in settings_of_file:
             settings_of_file[file] = config_from_arguments(
                 Namespace(**vars(args) | {'config': file}))
-        settings = before | settings_of_file[file] | {'vehicle': bag.vehicle}
+        settings = base | settings_of_file[file] | {'vehicle': bag.vehicle}
         legs = bag.legs or tuple(args.leg)
         legs_of(legs)
         key = settings_key(config_of(settings), topics, legs)
@@ -244,7 +247,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
 
 def computed_rows(client: Any, jobs: Sequence[BagJob],
                   again: bool = False) -> Iterator[tuple[int, BagOutcome]]:
-    """Yield (number, outcome) of each job as it ends; ``again``: retry failed ones."""
+    """Yield (index of the job, outcome) as jobs end; ``again``: retry failed bags."""
     store = RowStore(jobs[0].folder)
     open_jobs = []
     for i, job in enumerate(jobs):
@@ -256,13 +259,13 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
             yield i, BagOutcome(key, 'done', False)
     submitted = [jobs[i] for i in open_jobs]
     keys = [f'{job.failed_key}-{os.urandom(4).hex()}' for job in submitted]
-    for k, done, error in task_results(client, calibrate_bag, submitted, 'bag', keys):
+    for k, outcome, error in task_results(client, calibrate_bag, submitted, 'bag', keys):
         job = jobs[open_jobs[k]]
         if error is not None:      # the worker was ended each time, or could not write
-            row = store.get(job.failed_key) or job.failed(_failure_text(error))
+            row = store.get(job.failed_key) or job.failed_row(_failure_text(error))
             store.put(row)
-            done = BagOutcome(row.key, FAILED, True)
-        yield open_jobs[k], done
+            outcome = BagOutcome(row.key, FAILED, True)
+        yield open_jobs[k], outcome
 
 
 def _existing_key(store: RowStore, job: BagJob) -> str | None:

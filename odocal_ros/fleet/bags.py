@@ -16,21 +16,21 @@ from odocal_ros.errors import BadBag, BadUsage
 from odocal_ros.fleet.rows import key_of
 from odocal_ros.safe_io.text_formats import error_text
 
-COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
+COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')      # of a manifest
 ENDINGS = ('.mcap', '.db3', '.bag')
-META = 'metadata.yaml'       # marks a folder as a rosbag2
+METADATA = 'metadata.yaml'       # in the folder of a rosbag2
 
 
 @dataclass(frozen=True)
 class FleetBag:
-    """A bag of a vehicle; ``config`` and ``legs`` if its manifest names them."""
+    """A bag of a vehicle."""
 
     vehicle: str
-    bag: str
+    bag: str                            # path or URL
     model: str = ''
-    odometer_km: float | None = None
-    config: str = ''
-    legs: tuple[str, ...] = ()
+    odometer_km: float | None = None    # reading of the vehicle's odometer
+    config: str = ''                    # parameter file, if the manifest names one
+    legs: tuple[str, ...] = ()          # as --leg, if the manifest names them
 
 
 def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
@@ -70,12 +70,12 @@ def _pattern(text: str) -> re.Pattern[str]:
 def _bag_of_path(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
     if pattern is None:
         return FleetBag(PurePosixPath(bag).parent.name, bag)
-    found = pattern.search(bag)
-    if found is None:
+    match = pattern.search(bag)
+    if match is None:
         raise BadUsage(f'--vehicle-from {pattern.pattern}: does not match {bag}')
-    more = found.groupdict()
-    return FleetBag(more.get('vehicle') or found[1] or '', bag, more.get('model') or '',
-                    _number(more.get('odometer_km'), bag))
+    groups = match.groupdict()
+    return FleetBag(groups.get('vehicle') or match[1] or '', bag, groups.get('model') or '',
+                    _number(groups.get('odometer_km'), bag))
 
 
 def _number(value: Any, where: str) -> float | None:
@@ -95,31 +95,31 @@ def _read_manifest(name: str) -> list[FleetBag]:
     try:
         with fs.open(path, 'rb') as file:
             if name.endswith('.csv'):
-                text = dict.fromkeys(COLUMNS, pa.string())
-                table = csv.read_csv(
-                    file, csv.ReadOptions(use_threads=False), convert_options=csv.ConvertOptions(
-                        column_types=text, strings_can_be_null=True))
+                as_text = csv.ConvertOptions(column_types=dict.fromkeys(COLUMNS, pa.string()),
+                                             strings_can_be_null=True)
+                table = csv.read_csv(file, csv.ReadOptions(use_threads=False),
+                                     convert_options=as_text)
             else:
                 table = parquet.ParquetFile(file).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise BadUsage(f'{name}: cannot be read as a manifest ({error_text(error)})') from None
-    lacking = {'vehicle', 'bag'} - set(table.column_names)
-    if lacking or not table.num_rows:
-        fault = f'no column {" and ".join(sorted(lacking))}' if lacking else 'holds no bag'
+    missing = {'vehicle', 'bag'} - set(table.column_names)
+    if missing or not table.num_rows:
+        fault = f'no column {" and ".join(sorted(missing))}' if missing else 'holds no bag'
         raise BadUsage(f'{name}: {fault}; '
                        f'required columns: vehicle, bag; optional: {", ".join(COLUMNS[2:])}')
     known = [column for column in COLUMNS if column in table.column_names]
     root = name[:len(name) - len(PurePosixPath(name).name)]
     bags = []
     for number, row in enumerate(table.select(known).to_pylist(), 2):
-        text = {k: str(v) for k, v in row.items() if v is not None}
-        if not (text.get('vehicle') and text.get('bag')):
+        cells = {column: str(value) for column, value in row.items() if value is not None}
+        if not (cells.get('vehicle') and cells.get('bag')):
             raise BadUsage(f'{name}, row {number}: vehicle or bag is empty')
         bags.append(FleetBag(
-            text['vehicle'], _resolve_path(root, text['bag']), text.get('model', ''),
-            _number(text.get('odometer_km'), f'{name}, row {number}'),
-            _resolve_path(root, text['config']) if text.get('config') else '',
-            tuple(text.get('legs', '').split())))
+            cells['vehicle'], _resolve_path(root, cells['bag']), cells.get('model', ''),
+            _number(cells.get('odometer_km'), f'{name}, row {number}'),
+            _resolve_path(root, cells['config']) if cells.get('config') else '',
+            tuple(cells.get('legs', '').split())))
     return bags
 
 
@@ -131,8 +131,8 @@ def file_system(url: str) -> tuple[Any, str]:
     """Return the fsspec file system of a path or URL, and the path in it."""
     from fsspec.core import url_to_fs
     try:
-        found: tuple[Any, str] = url_to_fs(url)
-        return found
+        fs, path = url_to_fs(url)
+        return fs, path
     except (ValueError, ImportError, OSError) as error:      # no such protocol, or its package
         raise BadUsage(f'{url}: {error_text(error)}') from None
 
@@ -149,12 +149,13 @@ def _bags_in(name: str) -> list[str]:
 
 
 def _bags_in_folder(fs: Any, path: str) -> list[str]:
+    """Return all bags in a folder of a file system, or the path itself if it is a file."""
     if not fs.isdir(path):
         if not fs.exists(path):
             raise BadUsage(f'{path}: no such file or folder')
         return [path]
     files = fs.find(path)
-    folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == META}
+    folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == METADATA}
     single = [f for f in files
               if f.endswith(ENDINGS) and str(PurePosixPath(f).parent) not in folders]
     return sorted([*folders, *single])
@@ -168,7 +169,7 @@ def is_local(url: str) -> bool:
 
 def bag_fingerprint(url: str, settings: str) -> str:
     """
-    Return a hash of the place, size and date of a bag, and of settings.
+    Return a hash of the path, size and date of a bag, and of settings.
 
     Raises BadBag: the bag cannot be accessed.
     """
@@ -177,18 +178,18 @@ def bag_fingerprint(url: str, settings: str) -> str:
         files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
         if not files:
             raise FileNotFoundError(f'{url}: not found')
-    except Exception as error:     # noqa: BLE001 each kind of server has errors of its own
+    except Exception as error:     # noqa: BLE001 each kind of server has other errors
         raise BadBag(f'{url}: {error_text(error) or type(error).__name__}') from None
     dates = ('mtime', 'ETag', 'etag', 'LastModified', 'last_modified', 'updated', 'modify', 'CRC')
     return key_of('seen', settings, url, sorted(
-        [name, about.get('size'), *(str(about[d]) for d in dates if d in about)]
-        for name, about in files.items()))
+        [name, info.get('size'), *(str(info[date]) for date in dates if date in info)]
+        for name, info in files.items()))
 
 
 def _check_disk_space(url: str, fs: Any, path: str, folder: str) -> None:
     """Raise BadBag if a copy would need more than half of the free disk space."""
     files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
-    size = sum(int(about.get('size') or 0) for about in files.values())
+    size = sum(int(info.get('size') or 0) for info in files.values())
     free = shutil.disk_usage(folder).free
     if size > free // 2:
         raise BadBag(f'{url}: its copy takes {size / 1e9:.1f} GB of {free / 1e9:.1f} GB free in '

@@ -22,8 +22,8 @@ from odocal_ros.offline.replay import add_calibration_arguments
 if TYPE_CHECKING:
     from odocal_ros.fleet.bag_jobs import BagJob
 
-TIMEOUT = 3600.0      # s, judgement: for a bag
-GIB = 2**30    # definition: bytes
+TIMEOUT = 3600.0      # s, judgement: time limit of a bag, by default
+GIB = 2**30           # definition: bytes
 
 
 def _byte_count(text: str) -> int:
@@ -121,9 +121,9 @@ def _compute_rows(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -
     on_terminal = sys.stderr is not None and sys.stderr.isatty()
     with tqdm(total=len(jobs), unit='bag', disable=args.quiet, file=sys.stderr, dynamic_ncols=True,
               mininterval=0.5 if on_terminal else 30.0, desc='bags') as bar:
-        for i, done in computed_rows(client, jobs, args.again):
-            files[i] = str(store.path(done.key))
-            failed += done.status == FAILED
+        for i, outcome in computed_rows(client, jobs, args.again):
+            files[i] = str(store.path(outcome.key))
+            failed += outcome.status == FAILED
             bar.set_postfix(failed=failed, refresh=False)
             bar.update()
     return files
@@ -149,20 +149,21 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
     from odocal_ros.fleet.bags import find_bags
     vehicle_from = options.pop('vehicle_from', None)
     if hasattr(bags, 'to_dict'):
-        found = [_bag_of_row(row) for row in bags.to_dict('records')]
+        fleet_bags = [_bag_of_row(row) for row in bags.to_dict('records')]
     else:
         names = [bags] if isinstance(bags, (str, Path)) else bags
-        found = find_bags([str(name) for name in names], vehicle_from)
+        fleet_bags = find_bags([str(name) for name in names], vehicle_from)
     args = _arguments(options)
     with tempfile.TemporaryDirectory(prefix='odocal_') as temporary:
-        jobs = bag_jobs(found, args, Path(output or temporary), TIMEOUT, MEMORY, config)
+        jobs = bag_jobs(fleet_bags, args, Path(output or temporary), TIMEOUT, MEMORY, config)
         if client is not None:
             return _data_frame(client, jobs)
-        with engine(None, None, MEMORY, 3) as own:
-            return _data_frame(own, jobs)
+        with engine(None, None, MEMORY, 3) as local_client:
+            return _data_frame(local_client, jobs)
 
 
 def _bag_of_row(row: Mapping[str, Any]) -> Any:
+    """Return the bag of a row of a DataFrame; missing values are NaN or None."""
     from odocal_ros.fleet.bags import COLUMNS, FleetBag
     known = {name: row[name] for name in COLUMNS if name in row and row[name] == row[name]
              and row[name] is not None}
@@ -170,6 +171,7 @@ def _bag_of_row(row: Mapping[str, Any]) -> Any:
 
 
 def _arguments(options: dict[str, Any]) -> Any:
+    """Return the arguments of replay, by name; raise BadUsage for an unknown one."""
     parser = argparse.ArgumentParser()
     add_calibration_arguments(parser)
     args = parser.parse_args([])
@@ -189,9 +191,6 @@ def _data_frame(client: Any, jobs: Sequence[Any]) -> Any:
     from odocal_ros.fleet.rows import read_rows, RowStore
     from odocal_ros.fleet.tables import table_rows
     store = RowStore(jobs[0].folder)
-    files = {i: store.path(done.key) for i, done in computed_rows(client, jobs)}
-    table = []
-    for i in sorted(files):
-        row = next(read_rows([files[i]]))
-        table += table_rows(jobs[i].bag, row)
-    return pd.DataFrame(table)
+    files = {i: store.path(outcome.key) for i, outcome in computed_rows(client, jobs)}
+    rows = zip(jobs, read_rows(files[i] for i in sorted(files)), strict=True)
+    return pd.DataFrame([row for job, of_bag in rows for row in table_rows(job.bag, of_bag)])

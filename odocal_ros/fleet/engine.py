@@ -12,16 +12,16 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
 
-NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
+REQUIRED_PACKAGES = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 MEMORY = 2 * 2**30       # judgement: bytes for a task, by default
-FEWEST = 50              # judgement: least tasks submitted: workers may be starting
+FEWEST_TASKS = 50        # judgement: least number submitted: workers may be starting
 CONNECTION_LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the '
                    'command: finished bags are kept')
 
 
 def check_installed() -> None:
     """Raise BadUsage with the command that installs the missing packages."""
-    missing = [name for name in NEEDS if find_spec(name) is None]
+    missing = [name for name in REQUIRED_PACKAGES if find_spec(name) is None]
     if missing:
         raise BadUsage(f'odocal fleet needs {", ".join(missing)}: pip install '
                        f'{" ".join(missing)}')
@@ -33,12 +33,12 @@ def engine(scheduler: str | None, workers: int | None, memory: int, tries: int) 
     Yield a Dask client: of the scheduler at an address, or of temporary local processes.
 
     workers : None: as many as cores or memory allow.   memory : bytes of a task.
-    tries : of a bag that ends its worker; an existing cluster uses its own setting.
+    tries : attempts for a bag that ends its worker; an existing cluster has a setting for it.
     """
     import dask
     from distributed import Client, LocalCluster, Security
     if scheduler:
-        for name in ('distributed', 'tornado.application'):      # reported in a sentence
+        for name in ('distributed', 'tornado.application'):      # BadUsage reports the error
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             client = Client(scheduler, timeout='5s')
@@ -50,19 +50,19 @@ def engine(scheduler: str | None, workers: int | None, memory: int, tries: int) 
         return
     local_settings = {
         'distributed.scheduler.allowed-failures': tries - 1,
-        # above two bags a worker, one at a time: a bag that ends it affects no other bag
+        # a worker gets one bag at a time: one that ends its worker affects no other bag
         'distributed.scheduler.worker-saturation': 1.0,
         'distributed.logging.distributed': 'critical',
         'distributed.worker.memory.terminate': False,
-        # its profiling every 10 ms takes 5 % of a core
+        # profiling every 10 ms takes 5 % of a core
         'distributed.worker.profile.enabled': False,
-        # without Dask's MALLOC_TRIM_THRESHOLD_: memory returned at once causes page faults at
-        # its next use, which took a quarter of a bag's time
+        # replaces Dask's default, whose MALLOC_TRIM_THRESHOLD_ returns memory at once: page
+        # faults at its next use took a quarter of a bag's time
         'distributed.nanny.pre-spawn-environ': dict.fromkeys(
             ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
     with dask.config.set(local_settings), LocalCluster(
             n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
-            # access to a scheduler's port allows to run code: it requires the key of this run
+            # access to a scheduler's port allows to run code: a temporary key is required
             security=Security.temporary(), host='127.0.0.1',
             dashboard_address='127.0.0.1:0', memory_limit=0,
             silence_logs='CRITICAL') as cluster, Client(cluster) as client:
@@ -91,33 +91,33 @@ def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], n
     Raises OdocalError: the connection to the scheduler is lost.
     """
     from distributed import as_completed, CancelledError
-    ended, left, fewest = as_completed(), range(len(jobs)), 0
-    number: dict[str, int] = {}
-    while left or number:
-        error, found = None, None
-        if left and len(number) <= fewest:
-            fewest = _batch_size(client)
-            now, left = left[:fewest], left[fewest:]
-            futures = client.map(task, [jobs[i] for i in now], pure=True, retries=0,
-                                 key=[f'{name}-{keys[i]}' for i in now])
-            number |= {future.key: i for future, i in zip(futures, now, strict=True)}
-            ended.update(futures)
+    completed, waiting, batch_size = as_completed(), range(len(jobs)), 0
+    running: dict[str, int] = {}      # number of the job by key of its task
+    while waiting or running:
+        error, result = None, None
+        if waiting and len(running) <= batch_size:
+            batch_size = _batch_size(client)
+            batch, waiting = waiting[:batch_size], waiting[batch_size:]
+            futures = client.map(task, [jobs[i] for i in batch], pure=True, retries=0,
+                                 key=[f'{name}-{keys[i]}' for i in batch])
+            running |= {future.key: i for future, i in zip(futures, batch, strict=True)}
+            completed.update(futures)
             del futures
-        future = next(ended)
+        future = next(completed)
         try:
-            found = future.result()
+            result = future.result()
         except CancelledError:
             raise OdocalError(CONNECTION_LOST) from None
         except Exception as failure:     # noqa: BLE001 of the task, or that its workers were ended
             error = failure
-        yield number.pop(future.key), found, error
+        yield running.pop(future.key), result, error
         future.release()
 
 
 def _batch_size(client: Any) -> int:
-    """Return the number of tasks to submit at a time, and the rest at which to submit more."""
+    """Return the number of tasks to submit at a time."""
     try:
-        per_worker = 2    # tasks submitted at a time
-        return max(FEWEST, per_worker * int(sum(client.nthreads().values())))
+        per_worker = 2
+        return max(FEWEST_TASKS, per_worker * int(sum(client.nthreads().values())))
     except OSError:
         raise OdocalError(CONNECTION_LOST) from None

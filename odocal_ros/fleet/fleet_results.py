@@ -36,11 +36,11 @@ TABLE, PAGE = 'fleet.csv', 'fleet.html'
 
 @dataclass(frozen=True)
 class GroupJob:
-    """Vehicles whose legs go to one part of a table; ``files``: folder for results, or ''."""
+    """Vehicles that one task computes."""
 
     vehicles: tuple[VehicleJob, ...]
-    part: str
-    files: str = ''
+    part: str           # file for their part of the table of legs
+    files: str = ''     # folder for their results, or ''
 
 
 def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
@@ -49,10 +49,10 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
     bags_of: dict[str, list[int]] = {}
     for i, bag in enumerate(bags):
         bags_of.setdefault(bag.vehicle, []).append(i)
-    # the same bag given twice under one vehicle is one row
-    return [VehicleJob(vehicle, tuple(bags[i] for i in which),
-                       tuple(dict.fromkeys(rows[i] for i in which)), settings)
-            for vehicle, which in bags_of.items()]
+    # dict.fromkeys: a bag given twice under one vehicle has one row
+    return [VehicleJob(vehicle, tuple(bags[i] for i in numbers),
+                       tuple(dict.fromkeys(rows[i] for i in numbers)), settings)
+            for vehicle, numbers in bags_of.items()]
 
 
 def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
@@ -64,13 +64,14 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
         groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
                            str(folder / 'vehicles') if files else '')
                   for k, group in enumerate(_grouped(jobs))]
-        found: dict[int, list[dict[str, Any]]] = {}
+        rows_of_group: dict[int, list[dict[str, Any]]] = {}
         keys = [Path(group.part).stem + parts.name for group in groups]
         for k, rows, error in task_results(client, compute_group, groups, 'vehicles', keys):
             if error is not None:
                 raise error
-            found[k] = rows
-        vehicles = tables.compare_with_model([row for k in sorted(found) for row in found[k]])
+            rows_of_group[k] = rows
+        vehicles = tables.compare_with_model(
+            [row for k in sorted(rows_of_group) for row in rows_of_group[k]])
         tables.write_table(folder / tables.LEGS, tables.leg_schema(),
                            tables.part_batches(sorted(parts.glob('*.parquet'))))
         tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
@@ -81,8 +82,9 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
 
 
 def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
+    """Yield groups of vehicles with enough bags for one task."""
     group: list[VehicleJob] = []
-    least_bags = 500    # bags of a group of vehicles, at least
+    least_bags = 500
     for job in jobs:
         group.append(job)
         if sum(len(one.bags) for one in group) >= least_bags:
@@ -125,7 +127,7 @@ class ReportJob:
     """A replay of the bags of a vehicle since its last change."""
 
     jobs: tuple[BagJob, ...]
-    output: str
+    output: str     # folder
 
 
 def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
@@ -154,23 +156,23 @@ def _csv(table: Path) -> str:
     """Return a table as text for a spreadsheet."""
     import pyarrow as pa
     from pyarrow import csv, parquet as pq
-    whole = pq.ParquetFile(table).read(use_threads=False)
-    for i, name in enumerate(whole.column_names):
-        if pa.types.is_string(whole.schema.types[i]):
-            text = [None if x is None else for_table(x) for x in whole[name].to_pylist()]
-            whole = whole.set_column(i, name, pa.array(text, pa.string()))
-    sink = io.BytesIO()
-    csv.write_csv(whole, sink)
-    return sink.getvalue().decode()
+    columns = pq.ParquetFile(table).read(use_threads=False)
+    for i, name in enumerate(columns.column_names):
+        if pa.types.is_string(columns.schema.types[i]):
+            text = [None if x is None else for_table(x) for x in columns[name].to_pylist()]
+            columns = columns.set_column(i, name, pa.array(text, pa.string()))
+    output = io.BytesIO()
+    csv.write_csv(columns, output)
+    return output.getvalue().decode()
 
 
 def _draw_reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[BagJob],
                   output: Path, which: str) -> None:
     """Draw reports of vehicles, each a task; store the cause of a failure, or '', in the row."""
     job_of = {job.bag.bag: job for job in jobs}
-    reported = [row for row in vehicles if row['now'] and (
+    reported = [row for row in vehicles if row['current_bags'] and (
         which == 'all' or which == 'flagged' and tables.needs_inspection(row))]
-    report_jobs = [ReportJob(tuple(job_of[bag] for bag in row['now']), str(
+    report_jobs = [ReportJob(tuple(job_of[bag] for bag in row['current_bags']), str(
         (output / 'reports' / tables.folder_name(row['vehicle'])).resolve()))
         for row in reported]
     keys = [f'{k}-{id(report_jobs)}' for k in range(len(report_jobs))]
@@ -186,8 +188,8 @@ def draw_report(job: ReportJob) -> str:
     try:
         with ExitStack() as stack:
             bags = [stack.enter_context(local_copy(one.bag.bag, None)) for one in job.jobs]
-            found = calibrate_bag(bags, first.topics, first.config, first.legs)
-            found.save(Path(job.output), True, errors.append)
+            calibration = calibrate_bag(bags, first.topics, first.config, first.legs)
+            calibration.save(Path(job.output), True, errors.append)
     except OdocalError as error:
         return str(error)
     return '; '.join(errors)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Pass and fail rates of single legs against all legs of a vehicle: odocal fleet --kpi.
+Rates of wrong decisions on single legs, against all legs of a vehicle: odocal fleet --kpi.
 
 The result of all legs of a vehicle since its last change is the reference. Its sigma is increased
 by the scatter of these legs beyond their own sigmas, since tyres warm and wear between drives. The
@@ -26,8 +26,8 @@ from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.atomic_files import locked, write_text
 
 KPI = 'kpi.json'
-NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors
-FEWEST = 3                       # judgement: legs of a reference; a tested leg is one of them
+SIGMA_PER_MEDIAN = 1.4826        # statistical: sigma over the median of absolute errors
+FEWEST_LEGS = 3                  # judgement: legs of a reference; a tested leg is one of them
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
 SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
 WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
@@ -36,15 +36,16 @@ Limits = dict[str, tuple[float, float]]
 
 def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
     """Return counts and rates of legs, by (good vehicle, decision); None if a denominator is 0."""
-    good, bad = ({d: counted[which, d] for d in Decision} for which in (True, False))
-    goods, bads = sum(good.values()), sum(bad.values())
+    good, bad = ({d: counted[is_good, d] for d in Decision} for is_good in (True, False))
+    all_good, all_bad = sum(good.values()), sum(bad.values())
     passed = good[Decision.PASS]
     return {
-        'legs': goods + bads, 'legs_of_good': goods, 'legs_of_bad': bads,
+        'legs': all_good + all_bad, 'legs_of_good': all_good, 'legs_of_bad': all_bad,
         'precision': _ratio(passed, passed + bad[Decision.PASS]),
-        'recall': _ratio(passed, goods), 'false_accept': _ratio(bad[Decision.PASS], bads),
-        'false_reject': _ratio(good[Decision.FAIL], goods),
-        'undecided': _ratio(good[Decision.UNDECIDED] + bad[Decision.UNDECIDED], goods + bads)}
+        'recall': _ratio(passed, all_good), 'false_accept': _ratio(bad[Decision.PASS], all_bad),
+        'false_reject': _ratio(good[Decision.FAIL], all_good),
+        'undecided': _ratio(good[Decision.UNDECIDED] + bad[Decision.UNDECIDED],
+                            all_good + all_bad)}
 
 
 def _ratio(part: int, all_counts: int) -> float | None:
@@ -65,7 +66,7 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
     for row in vehicles:
         vehicle_legs = legs_since_change.get(row['vehicle'], [])
         decision = _decision(row | _sigmas_with_scatter(row, vehicle_legs, limits), limits)
-        if decision is Decision.UNDECIDED or len(vehicle_legs) < FEWEST:
+        if decision is Decision.UNDECIDED or len(vehicle_legs) < FEWEST_LEGS:
             vehicle_counts['on_the_limit'] += 1
             continue
         good = decision is Decision.PASS
@@ -92,16 +93,16 @@ def _decision(row: dict[str, Any], limits: Limits) -> Decision:
 def _sigmas_with_scatter(row: dict[str, Any], legs: Sequence[dict[str, Any]],
                          limits: Limits) -> dict[str, float]:
     """Return the sigmas of a reference, increased by the scatter of its legs."""
-    found = {}
+    increased = {}
     for name in limits:
-        sigma = f'{name}_sigma'
-        known = [leg for leg in legs if None not in (leg[name], leg[sigma])]
-        if row[name] is not None and row[sigma] is not None and known:
-            # by the median: a wrong leg must be counted, not widen the reference
-            scatter = NORMAL * median(abs(leg[name] - row[name]) for leg in known)
-            beyond = scatter**2 - median(leg[sigma] for leg in known)**2
-            found[sigma] = math.sqrt(row[sigma]**2 + max(beyond, 0.0))
-    return found
+        key = f'{name}_sigma'
+        known = [leg for leg in legs if None not in (leg[name], leg[key])]
+        if row[name] is not None and row[key] is not None and known:
+            # by the median: a wrong leg must be counted, not increase the sigma of the reference
+            scatter = SIGMA_PER_MEDIAN * median(abs(leg[name] - row[name]) for leg in known)
+            unexplained = scatter**2 - median(leg[key] for leg in known)**2
+            increased[key] = math.sqrt(row[key]**2 + max(unexplained, 0.0))
+    return increased
 
 
 def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) -> str:
@@ -110,20 +111,22 @@ def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) 
     columns = ['vehicle', 'verdict', 'period', 'duration_s', *(
         f'{name}{part}' for name in VALUES for part in ('', '_sigma'))]
     table = pq.ParquetFile(output / LEGS).read(columns=columns, use_threads=False)
-    found = kpi(vehicles, table.to_pylist(), limits)
-    plain = found | {'limits': {name: [x if math.isfinite(x) else None for x in ends]
-                                for name, ends in limits.items()}}
+    rates = kpi(vehicles, table.to_pylist(), limits)
+    as_json = rates | {'limits': {name: [x if math.isfinite(x) else None for x in ends]
+                                  for name, ends in limits.items()}}
     with locked(output):
-        write_text(output / KPI, json.dumps(plain, indent=2) + '\n')
-    return _lines(found, output)
+        write_text(output / KPI, json.dumps(as_json, indent=2) + '\n')
+    return _table_text(rates, output)
 
 
-def _lines(found: dict[str, Any], output: Path) -> str:
-    of = found['vehicles']
-    lines = ['', f'legs tested against the limits: {of["good"]} good vehicles, {of["bad"]} bad, '
-             f'{of["on_the_limit"]} left out (undecided, or fewer than {FEWEST} legs)',
+def _table_text(rates: dict[str, Any], output: Path) -> str:
+    """Return the rates as lines of text: one for each duration of legs, and one for all."""
+    counts = rates['vehicles']
+    lines = ['', f'legs tested against the limits: {counts["good"]} good vehicles, '
+             f'{counts["bad"]} bad, {counts["on_the_limit"]} left out (undecided, or fewer than '
+             f'{FEWEST_LEGS} legs)',
              table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)), WIDTHS)]
-    for row in [*found['by_minutes'], {'up_to': 'all'} | found['all']]:
+    for row in [*rates['by_minutes'], {'up_to': 'all'} | rates['all']]:
         label = 'longer' if row['up_to'] is None else row['up_to'] if row['up_to'] == 'all' \
             else f'up to {row["up_to"]:g}'
         texts = ('-' if row[k] is None else f'{100 * row[k]:.1f} %' for k in SHARES)

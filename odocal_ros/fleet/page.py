@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fleet.html: one page that needs no network, for the owner of the fleet."""
+"""fleet.html: the results of a fleet as one page that needs no network."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.statistics import LEAST, Population, population
+from odocal_ros.fleet.statistics import FEWEST_VEHICLES, Population, population
 from odocal_ros.fleet.tables import (
     folder_name,
     group_by_model,
@@ -87,42 +87,41 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
 
 
 def _limit_axis(ax: Any, points: np.ndarray) -> None:
-    """Scale the plot to most vehicles; those far beyond are arrows at its edge."""
-    shown_medians = 6.0    # of the distance from the median: half the height of the plot
+    """Limit the y axis to most points, (n, 2) x and y; others are arrows at the edge."""
+    shown_medians = 6.0    # median distances from 0: half the height of the plot
     usual = shown_medians * float(np.median(np.abs(points[:, 1])))
-    beyond = np.abs(points[:, 1]) > 2 * usual
-    if not beyond.any() or not usual:
+    outside = np.abs(points[:, 1]) > 2 * usual
+    if not outside.any() or not usual:
         return
-    most = 1.15 * max(usual, float(np.abs(points[~beyond, 1]).max()))
-    ax.set_ylim(-most, most)
+    limit = 1.15 * max(usual, float(np.abs(points[~outside, 1]).max()))
+    ax.set_ylim(-limit, limit)
     for sign, mark in ((1, '^'), (-1, 'v')):
-        hidden = points[beyond & (sign * points[:, 1] > 0)]
-        ax.plot(hidden[:, 0], np.full(len(hidden), sign * 0.95 * most), mark, ms=6, color=RED)
+        x = points[outside & (sign * points[:, 1] > 0), 0]
+        ax.plot(x, np.full(len(x), sign * 0.95 * limit), mark, ms=6, color=RED)
 
 
 def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> Drawing | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
-    base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
+    current = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
-    named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
+    shown = [row['vehicle'] for row in vehicles if row['vehicle'] in current and any(
         change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
-    named += [row['vehicle'] for row in vehicles if row['vehicle'] in base
-              and needs_inspection(row) and row['vehicle'] not in named][:most_lines - len(named)]
-    points = _read_points(legs, set(base), set(named))
+    shown += [row['vehicle'] for row in vehicles if row['vehicle'] in current
+              and needs_inspection(row) and row['vehicle'] not in shown][:most_lines - len(shown)]
+    points = _read_points(legs, set(current), set(shown))
     if not points:
         return None
     figure, (ax,) = new_figure_column(3.4)
-    rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in points
-                     if vehicle not in named]).reshape(-1, 2)
-    ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
-            label='others')
+    others = np.array([(t, scale / current[vehicle]) for vehicle, t, scale, _ in points
+                       if vehicle not in shown]).reshape(-1, 2)
+    ax.plot(others[:, 0].astype('datetime64[s]'), (others[:, 1] - 1) * 100, '.', ms=2.5,
+            color=GREY, label='others')
     styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
-    for vehicle, (colour, mark) in zip(named, styles, strict=False):
-        own = sorted((day, value, sigma) for name, day, value, sigma in points
-                     if name == vehicle)
-        day, value, sigma = np.array(own).T
-        ax.errorbar(day.astype('datetime64[s]'), (value / base[vehicle] - 1) * 100,
-                    sigma / base[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
+    for vehicle, (colour, mark) in zip(shown, styles, strict=False):
+        t, scale, sigma = np.array(sorted(point[1:] for point in points
+                                          if point[0] == vehicle)).T
+        ax.errorbar(t.astype('datetime64[s]'), (scale / current[vehicle] - 1) * 100,
+                    sigma / current[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
                     label=vehicle[:18])
     ax.set_ylabel('deviation from the current scale, %')
     figure.autofmt_xdate(rotation=20, ha='right')
@@ -136,24 +135,28 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> Drawing |
 
 
 def _read_points(path: Path, known: set[str],
-                 named: set[str]) -> list[tuple[str, float, float, float]]:
-    """Return (vehicle, seconds since 1970, scale, sigma) of legs, thinned for other vehicles."""
+                 shown: set[str]) -> list[tuple[str, float, float, float]]:
+    """
+    Return (vehicle, seconds since 1970, scale, sigma) of the legs of known vehicles.
+
+    shown : vehicles whose legs are all returned; those of others are thinned.
+    """
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
         every = max(1, file.metadata.num_rows // MOST_POINTS)
-        found, k = [], 0
+        points, k = [], 0
         for batch in file.iter_batches(columns=columns, batch_size=10_000,
                                        use_threads=False):
             for row in batch.to_pylist():
                 k += 1
                 vehicle = row['vehicle']
                 if row['scale_factor'] is None or row['verdict'] == 'rejected' \
-                        or vehicle not in known or vehicle not in named and k % every:
+                        or vehicle not in known or vehicle not in shown and k % every:
                     continue
-                found.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
-                              row['scale_factor_sigma'] or 0.0))
-    return found
+                points.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
+                               row['scale_factor_sigma'] or 0.0))
+    return points
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
@@ -162,14 +165,15 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     most_rows = 2000    # vehicles in the table
     return render_page(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
-        counts=sorted(counts.items()), models=[_model(*kind, rows) for kind, rows in sorted(
+        counts=sorted(counts.items()), models=[_model_row(*kind, rows) for kind, rows in sorted(
             group_by_model(row for row in vehicles if row['legs']).items())],
         figures=fleet_figures(vehicles, output / LEGS),
-        vehicles=[_row(row) for row in vehicles[:most_rows]],
+        vehicles=[_vehicle_row(row) for row in vehicles[:most_rows]],
         left=max(0, len(vehicles) - most_rows))
 
 
 def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
+    """Return the line with the size of the fleet."""
     dates = [row[key] for row in vehicles for key in ('first', 'last') if row[key]]
     when = f', {min(dates):%Y-%m-%d} to {max(dates):%Y-%m-%d}' if dates else ''
     bags, failed, legs = (sum(row[key] for row in vehicles)
@@ -179,35 +183,37 @@ def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
             f'{sum(row["driven_h"] for row in vehicles):.1f} h{when}; odocal_ros {__version__}')
 
 
-def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _model_row(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a row of the table of models: mean and spread of each value, outliers."""
     cells = []
     for name in MAIN_VALUES:
-        have = [row for row in rows if row[name] is not None]
-        if not have:
+        known = [row for row in rows if row[name] is not None]
+        if not known:
             cells += ['-', '-']
             continue
-        found = population(*(np.array([row[key] for row in have], float)
-                             for key in (name, f'{name}_sigma')))
-        few = len(have) < LEAST
+        values = population(*(np.array([row[key] for row in known], float)
+                              for key in (name, f'{name}_sigma')))
+        few = len(known) < FEWEST_VEHICLES
         if name == 'scale_factor':
-            cells += [f'{_mean(found, few)} {unit}',
-                      '-' if few else f'{100 * found.spread / found.mean:.2f} %']
+            cells += [f'{_mean_text(values, few)} {unit}',
+                      '-' if few else f'{100 * values.spread / values.mean:.2f} %']
         else:
-            cells += [_mean(found, few, DEG, signed=True),
-                      '-' if few else f'{DEG * found.spread:.2f}']
+            cells += [_mean_text(values, few, DEG, signed=True),
+                      '-' if few else f'{DEG * values.spread:.2f}']
     outliers = sorted(row['vehicle'] for row in rows if row['outlier'])
     more = f' and {len(outliers) - 20} more' if len(outliers) > 20 else ''
     return {'model': model, 'vehicles': len(rows), 'cells': cells,
             'outliers': ', '.join(outliers[:20]) + more}
 
 
-def _mean(found: Population, few: bool, factor: float = 1.0, signed: bool = False) -> str:
-    """Return the mean of a model, without its sigma if there are too few vehicles for one."""
-    text = with_sigma(found.mean, found.sigma, factor, signed)
+def _mean_text(values: Population, few: bool, factor: float = 1.0, signed: bool = False) -> str:
+    """Return the mean of a model as text, without sigma if there are too few vehicles."""
+    text = with_sigma(values.mean, values.sigma, factor, signed)
     return text.partition(' ±')[0] if few else text
 
 
-def _row(row: dict[str, Any]) -> dict[str, Any]:
+def _vehicle_row(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of the table of vehicles as text."""
     values = [_cell(row, 'scale_factor', 1.0), _cell(row, 'yaw_mounting_angle', DEG),
               _cell(row, 'pitch_mounting_angle', DEG), _cell(row, 'drift_per_year', 100.0)]
     no_report = [f'no report: {row["report"]}'] if row['report'] else []
@@ -228,22 +234,22 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
 
 def remarks(row: dict[str, Any]) -> list[str]:
     """Return the verdict on a vehicle, and sentences for its inspection."""
-    out = [row['decision'] or row['verdict']]
+    texts = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+z.2f} %' if change['value'] == 'scale_factor' else
                 f'{DEG * change["size"]:+z.2f} deg')
         odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
-        out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
-                   f'{change["after"][:10]} and {change["by"][:10]}'
-                   + ', too large for tyres: check the odometer' * odometer)
+        texts.append(f'{change["value"].replace("_", " ")} changed by {size} between '
+                     f'{change["after"][:10]} and {change["by"][:10]}'
+                     + ', too large for tyres: check the odometer' * odometer)
     if row['outlier']:
-        out.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
+        texts.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
     if row['odd_legs']:
-        out.append(f'outlier legs: {", ".join(row["odd_legs"].split())}')
+        texts.append(f'outlier legs: {", ".join(row["odd_legs"].split())}')
     if row['rejected_for']:
         since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
-        out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
-                   f'({", ".join(row["rejected_for"].split())}){since}')
+        texts.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
+                     f'({", ".join(row["rejected_for"].split())}){since}')
     if row['bags_failed']:
-        out.append(f'{row["bags_failed"]} of {row["bags"]} bags failed ({row["failures"]})')
-    return [*out, row['why']] if row['why'] else out
+        texts.append(f'{row["bags_failed"]} of {row["bags"]} bags failed ({row["failures"]})')
+    return [*texts, row['why']] if row['why'] else texts

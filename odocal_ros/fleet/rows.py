@@ -5,8 +5,9 @@
 The data set of a fleet: one small Parquet file per bag, written atomically.
 
 rows/ab/<key>.parquet: the key is a hash of the bag's content, the settings that affect its legs
-and the software version; for a failed bag, of its place instead of its content. seen/ab/<key>
-has the row's key by place, size and date of the bag: known bags are not read again.
+and the software version; for a failed bag, of its path instead of its content.
+seen/ab/<fingerprint> contains the key of a row; the fingerprint is a hash of path, size and date
+of the bag, so that known bags are not read again. ab are the first letters of the hash.
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,27 +38,28 @@ GROUPS_NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagn
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Data of one bag; ``legs`` from ``text_of_legs``, ``settings`` that are not the default."""
+    """Data of one bag."""
 
     key: str
-    bag: str
+    bag: str                    # path or URL
     vehicle: str
     model: str = ''
     odometer_km: float | None = None
     status: str = DONE
-    reason: str = ''
-    seen: str = ''              # place, size and date of the bag as a hash
+    reason: str = ''            # of a failure
+    seen: str = ''              # fingerprint of the bag
     sha256: str = ''
     software: str = __version__
-    settings: str = '{}'
-    topics: str = '{}'
-    bytes: int = 0
+    settings: str = '{}'        # JSON, those that are not the default
+    topics: str = '{}'          # JSON, slot -> topic
+    bytes: int = 0              # size of the bag
     seconds: float = 0.0        # computing time
-    driven_s: float = 0.0
-    start_ns: int = 0
-    legs: str = '[]'
+    driven_s: float = 0.0       # duration of its legs
+    start_ns: int = 0           # of its first leg
+    legs: str = '[]'            # from ``text_of_legs``
 
     def config(self) -> Config:
+        """Return all settings of the bag."""
         return with_settings(Config(), json.loads(self.settings))
 
 
@@ -73,10 +75,10 @@ def changed_settings(config: Config) -> dict[str, Any]:
             if repr(value) != repr(default[name])}
 
 
-def settings_key(config: Config, *more: dict[Any, Any] | tuple[Any, ...]) -> str:
-    """Return a hash of the settings that affect the legs of a bag, and of ``more``."""
+def settings_key(config: Config, *others: dict[Any, Any] | tuple[Any, ...]) -> str:
+    """Return a hash of the settings that affect the legs of a bag, and of other arguments."""
     return key_of([[name, repr(value)] for name, value in flat(config).items()
-                   if name.partition('.')[0] not in GROUPS_NOT_OF_LEGS], *more)
+                   if name.partition('.')[0] not in GROUPS_NOT_OF_LEGS], *others)
 
 
 class RowStore:
@@ -86,9 +88,11 @@ class RowStore:
         self.folder = Path(folder)
 
     def path(self, key: str) -> Path:
+        """Return the file of a row."""
         return self.folder / 'rows' / key[:2] / f'{key}.parquet'
 
     def put(self, row: Row) -> None:
+        """Write a row."""
         import pyarrow as pa
         import pyarrow.parquet as pq
         path = self.path(row.key)
@@ -105,10 +109,11 @@ class RowStore:
             return None
 
     def drop(self, key: str) -> None:
+        """Remove the row of a key, if there is one."""
         self.path(key).unlink(missing_ok=True)
 
     def remember(self, fingerprint: str, key: str) -> None:
-        """Store the key of a bag's row under the hash of its place, size and date."""
+        """Store the key of a bag's row under the fingerprint of the bag."""
         path = self._seen(fingerprint)
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path.parent):
@@ -118,10 +123,10 @@ class RowStore:
         """Return the key of the existing row of a bag, None without one."""
         try:
             key = self._seen(fingerprint).read_text()
-            whole = KEY.fullmatch(key) and _is_complete(self.path(key))
+            exists = KEY.fullmatch(key) and _is_complete(self.path(key))
         except (OSError, UnicodeDecodeError):
             return None
-        return key if whole else None
+        return key if exists else None
 
     def _seen(self, fingerprint: str) -> Path:
         return self.folder / 'seen' / fingerprint[:2] / fingerprint
@@ -149,7 +154,7 @@ def read_rows(paths: Iterable[Path | str]) -> Iterator[Row]:
     for path in paths:
         with open(path, 'rb') as file:
             try:
-                # its own threads abort the process if they still run at its end
+                # threads of pyarrow abort the process if they still run at its end
                 table = pq.ParquetFile(file).read(use_threads=False)
                 rows = [Row(**entry) for entry in table.cast(row_schema()).to_pylist()]
             except (pa.ArrowException, OSError, TypeError, ValueError) as error:

@@ -5,10 +5,11 @@
 Values of a vehicle over its legs, and comparison of the vehicles of a model.
 
 Changes of a vehicle are steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
-The model of the values is a level, steps, a slope and errors of known covariance: independent
-errors of each leg, shared errors, and the random walk of a scale. Forward selection adds the
-slope, step or single odd leg that explains most, while it is significant. Backward elimination
-then drops terms that are no longer significant: no pair is kept if one alone explains the values.
+The model of the values is a level, steps, a slope, outlier legs, and errors of known covariance:
+independent errors of each leg, shared errors, and the random walk of a scale. Forward selection
+adds the slope, step or outlier leg that explains most, while it is significant. Backward
+elimination then drops terms that are no longer significant: no pair is kept if one alone explains
+the values.
 """
 
 from collections.abc import Sequence
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
-FAR = 4.0            # statistical: sigmas of a vehicle from its model: by chance one in 16,000
-LEAST = 3            # judgement: vehicles needed for a spread
+MODEL_OUTLIER_SIGMAS = 4.0     # statistical: of a vehicle from its model; by chance 1 in 16,000
+FEWEST_VEHICLES = 3            # judgement: for a spread
 
 
 @dataclass(frozen=True)
@@ -38,29 +39,30 @@ class History:
     """The history of a value."""
 
     changes: tuple[Change, ...] = ()       # in order
-    odd: tuple[int, ...] = ()              # single outlier legs
+    outliers: tuple[int, ...] = ()         # single outlier legs
     slope: float | None = None             # per unit of ``t``; None if not determined
     slope_sigma: float | None = None
 
 
-def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None = None,
+def covariance(independent: Floats, shared: Sequence[Floats] = (), days: Floats | None = None,
                walk: float = 0.0) -> Floats:
     """
     Return the covariance of the values of n legs.
 
-    own : (n,) variance of independent errors.   shared : each (n, k), one-sigma effects of errors
-    that legs share.   walk : sigma of a random walk per square root of a day.
+    independent : (n,) variance of independent errors.   shared : each (n, k), one-sigma effects of
+    errors that legs share.   days : (n,) of a random walk.   walk : its sigma, per square root of
+    a day.
     """
-    ridge = 1e-18    # smallest variance of a leg: the inverse exists
-    V = np.diag(np.maximum(own, ridge)) + sum((g @ g.T for g in shared), np.zeros(()))
+    smallest = 1e-18    # variance of a leg: the inverse exists
+    V = np.diag(np.maximum(independent, smallest)) + sum((g @ g.T for g in shared), np.zeros(()))
     return V if days is None else V + walk**2 * np.minimum.outer(days, days)
 
 
 def significance_limit(n: int) -> float:
-    """Return the limit of steps, odd legs and slopes of n legs, in sigmas, for significance."""
+    """Return the limit for significance of steps, outliers and slopes of n legs, in sigmas."""
     from scipy.special import ndtri
-    false = 1e-3    # chance of a reported change for a vehicle without one
-    return float(-ndtri(false / (2 * max(1, 2 * n - 2))))
+    false_alarms = 1e-3    # of vehicles without a change
+    return float(-ndtri(false_alarms / (2 * max(1, 2 * n - 2))))
 
 
 def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
@@ -74,45 +76,44 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
         return History()
     L = np.linalg.cholesky(V)
     # candidates: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
-    drifts = t is not None and np.ptp(t) > 0 and n > 2
+    has_slope = t is not None and np.ptp(t) > 0 and n > 2
     white = np.linalg.solve(L, np.column_stack([
         y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
-        *([t - t[0]] if t is not None and drifts else [])]))
+        *([t - t[0]] if t is not None and has_slope else [])]))
     z, level, W = white[:, 0], white[:, 1], white[:, 2:]
-    slope = W.shape[1] - 1 if drifts else -1
-    found = sorted(_selected(z, level[:, None], W, significance_limit(n)))
-    known = [k for k in found if k != slope]
-    size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
-    ratio = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
-    if drifts and slope not in ratio and n > len(found) + 2:
-        X = np.column_stack([level, W[:, found], W[:, slope]])
+    slope = W.shape[1] - 1 if has_slope else -1
+    selected = sorted(_select(z, level[:, None], W, significance_limit(n)))
+    size, sigma = _fit(z, np.column_stack([level, W[:, selected]]))
+    estimate = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(selected, 1)}
+    if has_slope and slope not in estimate and n > len(selected) + 2:
+        X = np.column_stack([level, W[:, selected], W[:, slope]])
         if np.linalg.matrix_rank(X) == X.shape[1]:
             size, sigma = _fit(z, X)
-            ratio[slope] = float(size[-1]), float(sigma[-1])
-    return History(tuple(Change(k + 1, *ratio[k]) for k in known if k < n - 1),
-                   tuple(k - n + 2 for k in known if k >= n - 1),
-                   *ratio.get(slope, (None, None)))
+            estimate[slope] = float(size[-1]), float(sigma[-1])
+    return History(tuple(Change(k + 1, *estimate[k]) for k in selected if k < n - 1),
+                   tuple(k - n + 2 for k in selected if k >= n - 1 and k != slope),
+                   *estimate.get(slope, (None, None)))
 
 
-def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
-    """Return the columns of W that explain z significantly, in addition to the level."""
-    found: list[int] = []
-    while len(found) < (len(z) - 1) // 2 or not found:
-        rest, left = _remove_projection(np.column_stack([level, W[:, found]]), z, W)
-        size = np.linalg.norm(left, axis=0)
-        ratio = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
-                         / np.maximum(size, 1e-300), 0.0)
-        best = int(np.argmax(np.abs(ratio)))
-        if abs(ratio[best]) <= least:
+def _select(z: Floats, level: Floats, W: Floats, limit: float) -> list[int]:
+    """Return the columns of W that explain z with significance, in addition to the level."""
+    selected: list[int] = []
+    while len(selected) < (len(z) - 1) // 2 or not selected:
+        residual, W_residual = _remove_projection(np.column_stack([level, W[:, selected]]), z, W)
+        size = np.linalg.norm(W_residual, axis=0)
+        sigmas = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), W_residual.T @ residual
+                          / np.maximum(size, 1e-300), 0.0)
+        best = int(np.argmax(np.abs(sigmas)))
+        if abs(sigmas[best]) <= limit:
             break
-        found.append(best)
-    while found:
-        size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
-        ratio = np.abs(size[1:] / sigma[1:])
-        if ratio.min() > least:
+        selected.append(best)
+    while selected:
+        size, sigma = _fit(z, np.column_stack([level, W[:, selected]]))
+        sigmas = np.abs(size[1:] / sigma[1:])
+        if sigmas.min() > limit:
             break
-        del found[int(ratio.argmin())]
-    return found
+        del selected[int(sigmas.argmin())]
+    return selected
 
 
 def _remove_projection(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
@@ -134,7 +135,7 @@ class Population:
     mean: float           # robust
     sigma: float          # of the mean
     spread: float         # between vehicles, in addition to their sigmas, 1 sigma
-    deviates: Floats      # (n,) deviations over spread and own sigma; nan for too few vehicles
+    deviates: Floats      # (n,) deviations over spread and sigma; nan for too few vehicles
 
 
 def population(values: Floats, sigmas: Floats) -> Population:
@@ -146,28 +147,28 @@ def population(values: Floats, sigmas: Floats) -> Population:
     """
     x, s = np.asarray(values, float), np.asarray(sigmas, float)
     mean, spread = float(np.median(x)), 0.0
-    if len(x) < LEAST:
+    if len(x) < FEWEST_VEHICLES:
         return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
     huber = 1.5    # sigmas from which a vehicle has less weight
-    passes = 50
-    for _ in range(passes):
-        before = mean
+    most_passes = 50
+    for _ in range(most_passes):
+        previous = mean
         spread = _spread(np.abs(x - mean), s)
         total = np.hypot(s, max(spread, 1e-300))
         weight = np.minimum(1.0, huber * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
         mean = float(weight @ x / weight.sum())
-        if abs(mean - before) <= 1e-12 * max(float(total.min()), 1e-300):
+        if abs(mean - previous) <= 1e-12 * max(float(total.min()), 1e-300):
             break
     return Population(mean, float(weight.sum()**-0.5), spread, (x - mean) / total)
 
 
-def _spread(off: Floats, s: Floats) -> float:
-    """Return the spread at which the median of off / sigma is that of a normal distribution."""
-    if np.median(off / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
+def _spread(deviation: Floats, s: Floats) -> float:
+    """Return the spread at which the median of deviations over sigma is that of a normal one."""
+    if np.median(deviation / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
         return 0.0
-    low, high = 0.0, float(off.max()) / NORMAL_MEDIAN
+    low, high = 0.0, float(deviation.max()) / NORMAL_MEDIAN
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if np.median(off / np.hypot(s, middle)) > NORMAL_MEDIAN else (
-            low, middle)
+        too_small = np.median(deviation / np.hypot(s, middle)) > NORMAL_MEDIAN
+        low, high = (middle, high) if too_small else (low, middle)
     return high

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables of a fleet: rows of legs.parquet and vehicles.parquet, vehicles by model, writing."""
+"""The tables legs.parquet and vehicles.parquet: rows, columns, comparison by model, writing."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC
@@ -16,7 +16,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from_text, Row
-from odocal_ros.fleet.statistics import FAR, population
+from odocal_ros.fleet.statistics import MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.output.value_text import MAIN_VALUES
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file
@@ -35,6 +35,7 @@ def all_reasons(leg: LegResult) -> list[Reason]:
 
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
             leg: LegResult) -> dict[str, Any]:
+    """Return the row of a leg; number : of the leg in its vehicle or bag, from 1."""
     row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
            'odometer_km': odometer_km, 'start': utc(leg.start_ns), 'start_ns': leg.start_ns,
            'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
@@ -61,10 +62,12 @@ def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
 
 
 def utc(stamp_ns: int) -> datetime:
+    """Return a stamp as a date."""
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
 
 
 def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') -> Any:
+    """Return the schema of columns of five types, given as names separated by spaces."""
     import pyarrow as pa
     kinds = ((texts, pa.string()), (times, pa.timestamp('us', 'UTC')), (counts, pa.int64()),
              (flags, pa.bool_()), (numbers, pa.float64()))
@@ -72,12 +75,14 @@ def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') 
 
 
 def leg_schema() -> Any:
+    """Return the columns of legs.parquet."""
     return _schema('vehicle model bag verdict reasons unit',
                    f'odometer_km duration_s distance_m {VALUE_COLUMNS}',
                    'leg start_ns stop_ns fixes period', 'start', 'odd')
 
 
 def vehicle_schema() -> Any:
+    """Return the columns of vehicles.parquet."""
     return _schema(
         'vehicle model decision verdict unit why remedy reasons changes odd_legs '
         'outlier failures rejected_for',
@@ -87,12 +92,14 @@ def vehicle_schema() -> Any:
 
 
 def vehicle_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
+    """Yield vehicles.parquet in pieces."""
     import pyarrow as pa
     for k in range(0, len(rows), 1000):
         yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
 
 
 def part_batches(parts: Sequence[Path]) -> Iterator[Any]:
+    """Yield the tables of files."""
     import pyarrow.parquet as pq
     for part in parts:
         yield pq.ParquetFile(part).read(use_threads=False)
@@ -114,9 +121,9 @@ def folder_name(vehicle: str) -> str:
     from urllib.parse import quote
     name = quote(vehicle, safe=' ')
     name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
-    most = 120    # characters: a file system allows 255, and temporary files have longer names
-    if len(name) > most:
-        name = f'{name[:most]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
+    longest = 120    # characters: a file system allows 255, and temporary files have longer names
+    if len(name) > longest:
+        name = f'{name[:longest]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
     return name
 
 
@@ -135,13 +142,13 @@ def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for row in rows:
             row[f'{short}_deviate'] = None
         for same_model in group_by_model(row for row in rows if row[name] is not None).values():
-            found = population(*(np.array([row[key] for row in same_model], float)
-                                 for key in (name, f'{name}_sigma')))
-            for row, deviate in zip(same_model, found.deviates.tolist(), strict=True):
+            values = population(*(np.array([row[key] for row in same_model], float)
+                                  for key in (name, f'{name}_sigma')))
+            for row, deviate in zip(same_model, values.deviates.tolist(), strict=True):
                 row[f'{short}_deviate'] = None if deviate != deviate else deviate
     for row in rows:
         row['outlier'] = ' '.join(short for short in MAIN_VALUES.values()
-                                  if abs(row[f'{short}_deviate'] or 0.0) > FAR)
+                                  if abs(row[f'{short}_deviate'] or 0.0) > MODEL_OUTLIER_SIGMAS)
     return sorted(rows, key=_severity)
 
 
@@ -156,6 +163,6 @@ def _severity(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
     """Return the sorting key of a vehicle, the worst first."""
     verdict = row['decision'] or row['verdict']
     largest_deviation = max(abs(row[f'{short}_deviate'] or 0.0) for short in MAIN_VALUES.values())
-    return (not row['legs'] and -1 or 0, WORST_FIRST.index(verdict), not row['outlier'],
+    return (bool(row['legs']), WORST_FIRST.index(verdict), not row['outlier'],
             row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
             not row['rejected_for'], -largest_deviation, row['vehicle'])

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A vehicle from the rows of its bags: legs combined as in replay, changes, pass or fail."""
+"""The result of a vehicle from the rows of its bags: changes, calibration, pass or fail."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,7 +31,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import DAY_NS
 
 FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone may be a bad drive
-LOOK_AT_BAGS = 'See the column failures of vehicles.parquet for the reason of each bag.'
+FAILED_REMEDY = 'See the column failures of vehicles.parquet for the reason of each bag.'
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,72 +47,74 @@ class DrivenLeg:
         return leg_estimates(self.leg)
 
 
-def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[DrivenLeg]:
-    """Return the legs of rows by time, with unique bag names as in replay."""
+def driven_legs(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
+    """Return the legs of rows by time, with unique bag names as in replay; bags : by path."""
     legs = [legs_from_text(row.legs) for row in rows]
     entries = [{'bag': next((leg.bag for leg in of_bag), row.bag)}
                for row, of_bag in zip(rows, legs, strict=True)]
-    named, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
-    km = [known[row.bag].odometer_km if row.bag in known else row.odometer_km
+    with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
+    km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
           for row, of_bag in zip(rows, legs, strict=True) for _ in of_bag]
-    return sorted((DrivenLeg(leg, k) for leg, k in zip(named, km, strict=True)),
-                  key=lambda one: one.leg.start_ns)
+    return sorted(map(DrivenLeg, with_names, km), key=lambda one: one.leg.start_ns)
 
 
 @dataclass(frozen=True)
 class ValueHistory:
-    """The history of a value: numbers of the legs that determine it, changes over both axes."""
+    """The history of a value."""
 
-    legs: tuple[int, ...] = ()
+    legs: tuple[int, ...] = ()            # numbers of the legs that determine it
     by_date: History = History()          # over years
     by_distance: History = History()      # over 1000 km, of the scale only
 
     @property
     def first_after_change(self) -> list[int]:
-        """Return the numbers of the legs from which on the value is another one."""
+        """Return the number of the first leg after each change."""
         return [self.legs[change.leg] for change in self.by_date.changes]
 
     @property
     def outlier_legs(self) -> list[int]:
-        return [self.legs[k] for k in self.by_date.odd]
+        """Return the numbers of the single outlier legs."""
+        return [self.legs[k] for k in self.by_date.outliers]
 
 
 def history_of(name: str, driven: Sequence[DrivenLeg], config: Config) -> ValueHistory:
-    found = []
+    """Return the history of a value; a scale is compared by its logarithm."""
+    known = []
     for k, one in enumerate(driven):
         e = one.estimates.get(name)
         if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
-            found.append((k, e.value, one.leg.methods[e.method]))
-    if not found:
+            known.append((k, e.value, one.leg.methods[e.method]))
+    if not known:
         return ValueHistory()
-    scale = name == 'scale_factor'
-    numbers, values, methods = (list(column) for column in zip(*found, strict=True))
+    is_scale = name == 'scale_factor'
+    numbers, values, methods = (list(column) for column in zip(*known, strict=True))
     value = np.array(values)
-    y = np.log(value / value[0]) if scale else np.asarray(wrap(value - value[0]))
-    own, shared = _errors(name, methods)
+    y = np.log(value / value[0]) if is_scale else np.asarray(wrap(value - value[0]))
+    independent, shared = _errors(name, methods)
     days = np.array([driven[k].leg.driven_ns for k in numbers]) / DAY_NS
     days -= days[0]
-    V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
+    V = covariance(independent, shared, days,
+                   config.verdict.scale_drift_per_day if is_scale else 0.0)
     km = [driven[k].odometer_km for k in numbers]
-    by_distance = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
+    by_distance = History() if not is_scale or None in km else history(y, V, np.array(km) / 1000)
     year = 365.25    # days
     return ValueHistory(tuple(numbers), history(y, V, days / year), by_distance)
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the variance of each leg's own errors, and the effects of shared errors."""
-    own = np.zeros(len(methods))
+    """Return the variance of independent errors of legs, and the effects of shared errors."""
+    independent = np.zeros(len(methods))
     shared: dict[tuple[Any, ...], np.ndarray] = {}
     for k, method in enumerate(methods):
         i = method.parameters.index(name)
         for source in method.sources:
             if not source.shared or source.name in INDEPENDENT_SOURCES:
-                own[k] += source.effects[i] @ source.effects[i]
+                independent[k] += source.effects[i] @ source.effects[i]
                 continue
             effects = shared.setdefault((method.name, source.name, source.effects.shape[1]),
                                         np.zeros((len(methods), source.effects.shape[1])))
             effects[k] = source.effects[i]
-    return own, list(shared.values())
+    return independent, list(shared.values())
 
 
 def rejecting_reasons(leg: LegResult) -> list[Reason]:
@@ -122,7 +124,7 @@ def rejecting_reasons(leg: LegResult) -> list[Reason]:
 
 
 def rejected_state(rejected: Sequence[DrivenLeg]) -> Reason:
-    """Return the reason why the current state of a vehicle is unknown."""
+    """Return the reason for an unknown current state: the last legs are all rejected."""
     last = rejecting_reasons(rejected[-1].leg)[0]
     since = f'{utc(rejected[0].leg.start_ns):%Y-%m-%d}'
     return replace(last, text=f'the last {len(rejected)} legs, since {since}, are all rejected: '
@@ -131,35 +133,34 @@ def rejected_state(rejected: Sequence[DrivenLeg]) -> Reason:
 
 @dataclass(frozen=True)
 class VehicleJob:
-    """The bags of a vehicle, the files of their rows, and the settings in force, as ``accept``."""
+    """The bags of a vehicle."""
 
     vehicle: str
     bags: tuple[FleetBag, ...]
-    rows: tuple[str, ...]
-    settings: dict[str, Any] = field(default_factory=dict)
+    rows: tuple[str, ...]     # files of their rows
+    settings: dict[str, Any] = field(default_factory=dict)    # of this run, such as the limits
 
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """Result of a vehicle: its row of vehicles.parquet, those of legs.parquet, and more."""
+    """Result of a vehicle."""
 
-    row: dict[str, Any]
-    legs: list[dict[str, Any]]
-    calibration: Calibration | None = None
+    row: dict[str, Any]            # of vehicles.parquet
+    legs: list[dict[str, Any]]     # rows of legs.parquet
+    calibration: Calibration | None = None     # since its last change; None without legs
     config: Config | None = None
-    inputs: tuple[dict[str, Any], ...] = ()
+    inputs: tuple[dict[str, Any], ...] = ()    # entries of its bags in calibration.json
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
     """Return the result of a vehicle from the rows of its bags."""
     rows = [row for row in read_rows(job.rows) if row.vehicle == job.vehicle]
-    known = {bag.bag: bag for bag in job.bags}
     done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
     failed = [row for row in rows if row.status != DONE]
     row = {'vehicle': job.vehicle, 'model': next((b.model for b in job.bags if b.model), ''),
            'bags': len(rows), 'bags_failed': len(failed),
            'failures': '; '.join(f'{Path(r.bag).name}: {r.reason}' for r in failed[:5])}
-    driven = driven_legs(done, known)
+    driven = driven_legs(done, {bag.bag: bag for bag in job.bags})
     if not driven:
         limits = with_settings(Config(), job.settings).accept.limits
         return Vehicle(_row_without_legs(row, Decision.UNDECIDED.value if limits else ''), [])
@@ -179,7 +180,8 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
             r.code.name for one in driven for r in rejecting_reasons(one.leg))),
            'rejected_since': utc(rejected[0].leg.start_ns) if rejected else None}
     since = current[0].leg.start_ns
-    row |= {'now': [r.bag for r in done if r.start_ns >= since or r is done[-1]], 'report': None}
+    row |= {'current_bags': [r.bag for r in done if r.start_ns >= since or r is done[-1]],
+            'report': None}
     legs = [_leg_row(job, k, one, starts, histories) for k, one in enumerate(driven)]
     inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
                    for r in done)
@@ -187,15 +189,16 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
 
 
 def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
+    """Return the row of a vehicle whose bags all failed."""
     return row | value_cells({}) | dict.fromkeys((
         'first', 'last', 'since', 'rejected_since', 'drift_per_year', 'drift_per_year_sigma',
         'drift_per_1000_km', 'drift_per_1000_km_sigma', 'report')) | {
         'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'changes': '[]',
-        'verdict': Verdict.REJECTED.value, 'decision': decision, 'remedy': LOOK_AT_BAGS,
+        'verdict': Verdict.REJECTED.value, 'decision': decision, 'remedy': FAILED_REMEDY,
         'why': 'none of its bags could be calibrated', 'reasons': '', 'odd_legs': '',
-        'rejected_for': '', 'now': [], 'line': json.dumps(
+        'rejected_for': '', 'current_bags': [], 'line': json.dumps(
             {'vehicle': row['vehicle'], 'decision': decision,
-             'why': row['failures'], 'remedy': LOOK_AT_BAGS, 'values': {},
+             'why': row['failures'], 'remedy': FAILED_REMEDY, 'values': {},
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
@@ -220,18 +223,18 @@ def _current_state(calibration: Calibration, config: Config, driven: Sequence[Dr
 
 def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
-    found = []
+    changes = []
     for name, past in histories.items():
         for change in past.by_date.changes:
             before, after = (driven[past.legs[k]].leg for k in (change.leg - 1, change.leg))
-            found.append({
+            changes.append({
                 'value': name, 'after': iso(before.start_ns), 'by': iso(after.start_ns),
                 'leg': past.legs[change.leg] + 1,
                 'size': math.expm1(change.size) if name == 'scale_factor' else change.size,
                 'sigma': change.sigma, 'unit': '1' if name == 'scale_factor' else 'rad'})
     outliers = {k + 1 for past in histories.values() for k in past.outlier_legs}
     by_date, by_distance = histories['scale_factor'].by_date, histories['scale_factor'].by_distance
-    return {'changes': json.dumps(sorted(found, key=lambda change: change['by'])),
+    return {'changes': json.dumps(sorted(changes, key=lambda change: change['by'])),
             'odd_legs': ' '.join(map(str, sorted(outliers))),
             'drift_per_year': by_date.slope, 'drift_per_year_sigma': by_date.slope_sigma,
             'drift_per_1000_km': by_distance.slope,

@@ -296,15 +296,3 @@ def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) ->
     """Return the prediction of the method that calibrates this robot."""
     by_smoother = robot.imu and robot.drive == settings.DIFFERENTIAL
     return (predict_with_imu if by_smoother else predict_planar)(motion, robot, config)
-
-
-def ratio_sigma(method: MethodResult) -> float | None:
-    """Return the sigma of right over left wheel, relative; None: not determined."""
-    if 'ratio_sigma' in method.details:
-        return float(method.details['ratio_sigma'])
-    left, right = (method.estimates.get(f'scale_factor_{side}') for side in settings.SIDES)
-    rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
-    a, b = (one.relative_sigma if one else None for one in (left, right))
-    if a is None or b is None or rho is None:
-        return None
-    return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))

@@ -16,12 +16,11 @@ from odocal_ros.forecast.planned_indoor import (
     pattern_motion,
     PATTERNS,
     predict_robot,
-    ratio_sigma,
     Robot,
     RobotMotion,
 )
 from odocal_ros.library.arguments import config_of, Settings
-from odocal_ros.settings.config import DRIVES, HOLONOMIC, SKID
+from odocal_ros.settings.config import DRIVES, HOLONOMIC, SIDES, SKID
 from odocal_ros.sim.options import REFERENCES, SimOptions
 from odocal_ros.sim.scenarios import motion_of
 from odocal_ros.sim.wheels import effective_width, STRAIGHT
@@ -119,3 +118,15 @@ def motion_of_drive(options: SimOptions) -> RobotMotion:
     state = simulated.at(t)
     side: Floats = state.sway[:, 0] * (options.drive in HOLONOMIC)
     return RobotMotion(t, state.speed, side, state.yaw_rate, np.empty((0, 2)))
+
+
+def ratio_sigma(method: MethodResult) -> float | None:
+    """Return the sigma of right over left wheel, relative; None: not determined."""
+    if 'ratio_sigma' in method.details:
+        return float(method.details['ratio_sigma'])
+    left, right = (method.estimates.get(f'scale_factor_{side}') for side in SIDES)
+    rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
+    a, b = (one.relative_sigma if one else None for one in (left, right))
+    if a is None or b is None or rho is None:
+        return None
+    return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))

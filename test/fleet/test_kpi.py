@@ -10,8 +10,8 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from odocal_ros.fleet.kpi import FEWEST, kpi
-from odocal_ros.fleet.statistics import covariance, FAR, history, population
+from odocal_ros.fleet.kpi import FEWEST_LEGS, kpi
+from odocal_ros.fleet.statistics import covariance, history, MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.fleet.tables import VALUES
 from odocal_ros.offline.cli import main
 
@@ -53,9 +53,9 @@ def test_rates_are_those_counted_by_hand():
 
 
 def test_only_the_legs_since_the_last_change_count():
-    legs = [leg('a', 1.02, period=1)] * 4 + [leg('a', 1.0, period=2)] * FEWEST
+    legs = [leg('a', 1.02, period=1)] * 4 + [leg('a', 1.0, period=2)] * FEWEST_LEGS
     found = kpi([row('a', 1.0, 1e-4)], legs, LIMITS)['all']
-    assert (found['legs'], found['recall']) == (FEWEST, 1.0)
+    assert (found['legs'], found['recall']) == (FEWEST_LEGS, 1.0)
 
 
 def test_a_vehicle_that_wanders_across_the_limit_is_on_it():
@@ -103,7 +103,7 @@ def test_nothing_is_invented_more_often_than_said():
     rng = np.random.default_rng(4)
     found = [history(drawn(rng), V) for _ in range(2000)]
     # one in 1000 at most, by Bonferroni: 2 of 2000, and 3 sigma of that count
-    assert sum(bool(h.changes or h.odd) for h in found) <= 2 + 3 * 2**0.5
+    assert sum(bool(h.changes or h.outliers) for h in found) <= 2 + 3 * 2**0.5
 
 
 def test_a_change_is_found_where_it_is_with_an_honest_sigma():
@@ -123,7 +123,7 @@ def test_two_changes_and_an_odd_leg_are_told_apart():
     y = 0.004 * (np.arange(N) >= 3) - 0.006 * (np.arange(N) >= 7) + 0.02 * (np.arange(N) == 5)
     found = history(y, V)
     assert [(c.leg, round(c.size, 4)) for c in found.changes] == [(3, 0.004), (7, -0.006)]
-    assert found.odd == (5,)
+    assert found.outliers == (5,)
     # nothing comes after the last leg that could say it was odd
     assert history(0.02 * (np.arange(N) == N - 1), V).changes[0].leg == N - 1
 
@@ -158,12 +158,12 @@ def test_the_population_is_that_of_the_many_and_names_the_few():
         x = 5 + np.hypot(sigma, 1.0) * rng.standard_normal(60)
         x[:2] = 40.0
         found = population(x, sigma)
-        outliers = np.flatnonzero(np.abs(found.deviates) > FAR)
+        outliers = np.flatnonzero(np.abs(found.deviates) > MODEL_OUTLIER_SIGMAS)
         assert {0, 1} <= set(outliers)
         assert len(outliers) <= 3           # 4 sigma: one of 16,000 by chance
         means.append((found.mean - 5) / found.sigma)
         spreads.append(found.spread)
-    assert FAR == 4
+    assert MODEL_OUTLIER_SIGMAS == 4
     # Huber's mean yields to 2 of 60 by HUBER * 2 / 60 of a spread, 0.4 of its sigma
     assert abs(np.mean(means)) < 0.4 + 3 / 60**0.5
     assert abs(np.std(means) - 1) < 3 / 120**0.5

@@ -15,11 +15,10 @@ from odocal_ros.forecast.planned_indoor import (
     pattern_motion,
     PATTERNS,
     predict_robot,
-    ratio_sigma,
     Robot,
 )
 from odocal_ros.forecast.smoother_forecast import planar_forecast
-from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, robot_of
+from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, ratio_sigma, robot_of
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -105,7 +105,7 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(exact, updat
 def test_the_state_is_reckoned_on_to_where_the_vehicle_is(town_drive, exact, updates):
     so_far = SmootherSoFar()
     so_far.update(updates[-3].leg, exact)      # 7 s are to be reckoned on, at speed
-    view = so_far._view(updates[-2].leg, exact)
+    view = so_far._smoother_leg(updates[-2].leg, exact)
     state = extend_warm_start(so_far._growing._last,
                               make_problem(view, exact, make_imu_steps(view, 1.0))).state
     later = SmootherSoFar()
