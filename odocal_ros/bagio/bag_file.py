@@ -10,8 +10,8 @@ Subclasses read mcap (``mcap_file``), sqlite3 (``sqlite_file``) and rosbag1 (``r
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 import heapq
-from itertools import chain
 from operator import itemgetter
 import os
 from pathlib import Path
@@ -92,15 +92,12 @@ class BagFile:
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch]:
         """Yield the messages of some topics (name -> type), many at a time, decompressed."""
-        batches = self._fast_batches(topics)
-        first = next(batches, {}) if batches else {}
-        if batches and not any(raws[0][:4] == ZSTD for _, raws in first.values()):
-            yield from chain([first] * bool(first), batches)
-            return
-        del batches
-        stream = self._decompressed(self.messages(topics))
-        while batch := next_batch(stream):
-            yield batch
+        is_compressed = None       # each message on its own; CDR starts with a zero byte
+        for batch in self._fast_batches(topics) or in_batches(self.messages(topics)):
+            if is_compressed is None:
+                is_compressed = any(raws[0][:4] == ZSTD for _, raws in batch.values())
+            yield {topic: (times, RawMessages.of([self._decompressed(raw) for raw in raws]))
+                   for topic, (times, raws) in batch.items()} if is_compressed else batch
 
     def stream(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
         """Yield the same one by one in order of time, for merging; slower."""
@@ -111,22 +108,14 @@ class BagFile:
             for time_ns, _, channel, raw in heapq.merge(*lists, key=itemgetter(0)):
                 yield channel, time_ns, raw
 
-    def _decompressed(self, stream: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
-        """Yield messages; if each is compressed separately, decompressed, b'' if that fails."""
-        first = next(stream, None)
-        if first is None:
-            return
-        stream = chain([first], stream)
-        if first[2][:4] != ZSTD:      # CDR starts with a zero byte
-            yield from stream
-        for channel, time_ns, raw in stream:
-            try:
-                raw = self._allowance.unpack('zstd', raw)
-            except (LimitReached, MemoryError):
-                raise
-            except Exception:   # a damaged message: readers count b'' as unreadable
-                raw = b''
-            yield channel, time_ns, raw
+    def _decompressed(self, raw: bytes) -> bytes:
+        """Return a message decompressed, b'' if it is damaged: readers count it as unreadable."""
+        try:
+            return bytes(self._allowance.unpack('zstd', raw))
+        except (LimitReached, MemoryError):
+            raise
+        except Exception:
+            return b''
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages as stored: Channel (or connection of rosbags), time ns and bytes."""
@@ -170,8 +159,13 @@ def is_valid_time(time_ns: int) -> bool:
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS
 
 
-def next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
-    """Return the next messages of a stream as of ``BagFile.messages``, by topic; {} at the end."""
+def in_batches(stream: Iterator[tuple[Any, ...]]) -> Iterator[Batch]:
+    """Yield the messages of a stream as of ``BagFile.messages``, many at a time, by topic."""
+    return iter(partial(_next_batch, stream), {})
+
+
+def _next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
+    """Return the next messages of a stream; {} at its end."""
     # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
     # tuples takes as long as the reading itself)
     found: dict[str, tuple[list[int], list[bytes]]] = {}

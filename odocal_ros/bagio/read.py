@@ -13,7 +13,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from odocal_ros.bagio.bag_file import BagFile, Batch, group_overlapping, next_batch
+from odocal_ros.bagio.bag_file import BagFile, Batch, group_overlapping, in_batches
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.rosbags_readers import Rosbag1File, Types
 from odocal_ros.bagio.sources import file_names, find_source, Source, unpack
@@ -184,13 +184,10 @@ class Bag:
 
 
 def _merged(parts: list[BagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
-    """Yield the batches of files that overlap in time, merged; those of one file unchanged."""
+    """Return the batches of files that overlap in time, merged; those of one file unchanged."""
     if len(parts) == 1:
-        yield from parts[0].batches(topics)
-        return
-    stream = heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1))
-    while batch := next_batch(stream):
-        yield batch
+        return parts[0].batches(topics)
+    return in_batches(heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1)))
 
 
 @contextmanager

@@ -175,9 +175,10 @@ def test_config_file_then_set_then_default(bag, tmp_path, capsys):
     (['--set', 'method=best'], 'method')])
 def test_wrong_requests_are_one_line_and_exit_2(argv, words, bag, tmp_path, capsys):
     assert replay(bag, '--output', tmp_path / 'out', *argv) == 2
-    err = capsys.readouterr().err
-    assert words in err
-    assert err.count('\n') == 1
+    first, *listed = capsys.readouterr().err.splitlines()
+    assert words in first
+    assert all(line.startswith('  /') for line in listed)
+    assert bool(listed) == ('/other' in argv)
     assert not (tmp_path / 'out').exists()
 
 
