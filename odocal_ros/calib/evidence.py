@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.scale_variation import (
-    NO_BINS,
-    NO_WINDOWS,
+    NO_ROWS,
     Sections,
     sections,
     speed_scale,
@@ -61,9 +60,9 @@ class Evidence:
     excluded: int
     gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
     t_fit: float = np.inf              # s: later data are held out of the fit
-    by_speed: SpeedScale = SpeedScale(NO_BINS)  # of the uncorrected odometer
+    by_speed: SpeedScale = SpeedScale(NO_ROWS)  # of the uncorrected odometer
     # (w, 4) as window_scale
-    by_window: Floats = field(default_factory=lambda: NO_WINDOWS)
+    by_window: Floats = field(default_factory=lambda: NO_ROWS)
 
 
 def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,

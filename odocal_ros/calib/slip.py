@@ -10,7 +10,8 @@ constant accelerometer bias and tilt cancel; slip within the window does not. A 
 or one whose speed is low-pass filtered, differs from the IMU at every change of acceleration: the
 delay at which the two agree best is estimated first.
 
-``WheelSlips`` are the slips of single wheels, which wheel_faults.py detects with the gyro.
+``Slips`` are those of the mean of the wheels, by the accelerometer; ``WheelSlips`` those of single
+wheels, which wheel_faults.py detects with the gyro.
 """
 
 from collections.abc import Sequence
@@ -34,12 +35,12 @@ from odocal_ros.reasons import Code, Reason
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
 SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
 SPAN = round(SPIN_WINDOW / SPIN_GRID)      # definition: rows of a window
-PIN_STEPS = 2        # rows each side over which the speed at an end is averaged: judgement
+END_STEPS = 2        # rows each side over which the speed at an end is averaged: judgement
 # rad in a window: in larger turns the level error acts on another axis. Judgement
 SPIN_TURN = 0.1
 # counts, possible rounding error of a window: one over the 0.8 s of an end is 5 over the window,
 # plus 1 at the window's ends; the rest is margin: judgement
-PIN_COUNTS = 8.0
+ROUNDING_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 WEAKEST_BRAKING = 0.5
 STOPS = 0.5          # m/s, a speed below is a stop: judgement
@@ -51,19 +52,19 @@ SLIP_GRID = 0.1
 
 
 class Slips(NamedTuple):
-    """Slips of the wheels."""
+    """Slips of the mean of the wheels: (k,)."""
 
-    t: Floats                          # (k,) s, middle of each slip
-    size: Floats                       # (k,) m, > 0 if the wheel spun, < 0 if it slid
-    late: float = 0.0  # s, of the odometer against the IMU, if it would look like slip, else 0
-    unforced_sign: Ints = np.empty(0, int)  # (k,) 0 or the sign of travel no force explains
+    t: Floats                                # s, middle of each slip
+    size: Floats                             # m, > 0 if the wheel spun, < 0 if it slid
+    delay: float = 0.0                       # s, of the odometer; 0 if it does not look like slip
+    unforced_sign: Ints = np.empty(0, int)   # see ``unforced_sign``
 
 
 def count_size(travel: Travel) -> float:
     """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
     coarse = travel.coarse
     # coarse.max_error is the largest error of speeds at the ends of a window and within it
-    return travel.quantum if coarse is None else coarse.max_error * SPIN_WINDOW / PIN_COUNTS
+    return travel.quantum if coarse is None else coarse.max_error * SPIN_WINDOW / ROUNDING_COUNTS
 
 
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
@@ -72,7 +73,8 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     Return times and sizes of the slips of the odometer against the IMU, after its delay.
 
     t_imu, f_b : (n,), (n, 3) specific force, s, m/s^2.   track : attitude and travel.   f : (3,)
-    scale times forward axis.   latitude : rad.   quantum : size of an odometer count, scale units.
+    m per scale unit, scale times forward axis in b.   latitude : rad.   quantum : size of an
+    odometer count, scale units.
     """
     K = float(np.linalg.norm(f))
     grid = np.arange(max(track.t[0] - TESTED_DELAYS[0], t_imu[0]),
@@ -82,44 +84,44 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
     # in a turn the level error acts on another axis: such windows are excluded
     C = track.C_nb_at(grid)
-    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
+    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[END_STEPS:-END_STEPS]
     turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > SPIN_TURN
     windows = _Windows(grid, a, turns, track, K, quantum)
     # a mean of absolute values: slips hardly affect it
-    late = float(TESTED_DELAYS[np.argmin([np.abs(windows.excess(late)).mean()
-                                          for late in TESTED_DELAYS])])
-    t, size = windows.events(late)
-    hidden = len(windows.events(0.0)[0]) > len(t)
-    speed = K * np.diff(np.interp(grid + late, track.t, track.s)) / SPIN_GRID
+    delay = float(TESTED_DELAYS[np.argmin([np.abs(windows.excess(delay)).mean()
+                                           for delay in TESTED_DELAYS])])
+    t, size = windows.events(delay)
+    looks_like_slip = len(windows.events(0.0)[0]) > len(t)
+    speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / SPIN_GRID
     sign = [unforced_sign(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
         speed, np.full(5, 0.2), 'valid')) for at, metres in zip(t, size, strict=True)]
-    return Slips(t, size, late if hidden else 0.0, np.array(sign, int))
+    return Slips(t, size, delay if looks_like_slip else 0.0, np.array(sign, int))
 
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of a drive, with a track and its scale K, a count in scale units."""
+    """The m windows of a drive, which begin at the rows of a grid."""
 
-    grid: Floats        # (n,) s, begins
-    a: Floats           # (n - 1,) m/s^2, forward acceleration by the IMU
-    turns: Bools        # (m,) excluded windows
+    grid: Floats         # (n,) s
+    acceleration: Floats  # (n - 1,) m/s^2, forward, by the IMU
+    turns: Bools         # (m,) windows with turns, excluded
     track: Track
-    K: float
-    quantum: float
+    K: float             # scale, m per scale unit
+    quantum: float       # of a count, scale units
 
-    def excess(self, late: float) -> Floats:
+    def excess(self, delay: float) -> Floats:
         """Return odometer minus IMU path in each window, at an odometer delay, s: (m,) m."""
-        path = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
-        return np.where(self.turns, 0.0, excess_path(SPAN, self.a, path))
+        path = self.K * np.interp(self.grid + delay, self.track.t, self.track.s)
+        return np.where(self.turns, 0.0, excess_path(SPAN, self.acceleration, path))
 
-    def events(self, late: float) -> tuple[Floats, Floats]:
+    def events(self, delay: float) -> tuple[Floats, Floats]:
         """Return time, s, and size, m, of each slip, at an odometer delay, s."""
-        excess = self.excess(late)
+        excess = self.excess(delay)
         # the usual excess of the drive (rough road, soft suspension) is no event
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
         least = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
-        limit = max(least, PIN_COUNTS * self.quantum * self.K, 6 * usual)
-        return _events(self.grid[PIN_STEPS:-SPAN - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
+        limit = max(least, ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
+        return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 
 def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
@@ -138,22 +140,25 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
 
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
     means over the same few steps, so that a jump of acceleration there has no effect.
+
+    span : steps of a window.   a : (n - 1,) m/s^2.   path : (n,) m, at the rows of the grid.
     """
     speed = running_sum(a) * SPIN_GRID        # up to a constant
-    ahead = path - running_sum((speed[:-1] + speed[1:]) / 2) * SPIN_GRID
-    # its slope is odometer speed minus speed by acceleration
-    lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
-    ahead = ahead[PIN_STEPS:-PIN_STEPS]
-    lacked = (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID
-    excess: Floats = ahead[span:] - ahead[:-span] - lacked
+    difference = path - running_sum((speed[:-1] + speed[1:]) / 2) * SPIN_GRID
+    # odometer speed minus speed by acceleration, at the ends of windows
+    speed_offset = (difference[2 * END_STEPS:] - difference[:-2 * END_STEPS]) / (
+        2 * END_STEPS * SPIN_GRID)
+    difference = difference[END_STEPS:-END_STEPS]
+    by_line = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * SPIN_GRID
+    excess: Floats = difference[span:] - difference[:-span] - by_line
     return excess
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Return time and size of each event."""
+    """Return time and size of each event, by (m,) middles, s, and excess, m, of windows."""
     # windows that contain an event are one group; those in its middle contain all of it
-    far = np.flatnonzero(np.abs(excess) > limit)
-    groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > SPIN_WINDOW / 2) + 1)
+    beyond = np.flatnonzero(np.abs(excess) > limit)
+    groups = np.split(beyond, np.flatnonzero(np.diff(middle[beyond]) > SPIN_WINDOW / 2) + 1)
     centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
     k = np.array([c for c in centres if abs(excess[c]) > limit], int)
     return middle[k], excess[k]
@@ -208,12 +213,12 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """Return the reasons for delay, slip and unforced travel; time_offset : as configured, s."""
     found: tuple[Reason, ...] = ()
     by_force = slips.unforced_sign == 0
-    t, size, late = slips.t[by_force], slips.size[by_force], slips.late
-    if late:
+    t, size, delay = slips.t[by_force], slips.size[by_force], slips.delay
+    if delay:
         found += (Reason(
-            Code.DELAY_SEEN, f'odometer stamps are about {abs(late):.2f} s '
-            f'{"late" if late > 0 else "early"} relative to the IMU, or the speed is low-pass '
-            f'filtered; odometer.time_offset = {time_offset - late:.2f} would remove a delay'),)
+            Code.DELAY_SEEN, f'odometer stamps are about {abs(delay):.2f} s '
+            f'{"late" if delay > 0 else "early"} relative to the IMU, or the speed is low-pass '
+            f'filtered; odometer.time_offset = {time_offset - delay:.2f} would remove a delay'),)
     if len(t):
         found += (Reason(
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
@@ -222,7 +227,8 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     return (*found, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
 
 
-def _none(kind: type = float) -> NDArray[Any]:
+def _column(kind: type = float) -> NDArray[Any]:
+    """Declare a column, empty by default."""
     return field(default_factory=lambda: np.empty(0, kind))
 
 
@@ -230,12 +236,13 @@ def _none(kind: type = float) -> NDArray[Any]:
 class WheelSlips:
     """Slips of single wheels, in order of time: (k,)."""
 
-    begin: Floats = _none()        # s
-    end: Floats = _none()          # s
-    size: Floats = _none()         # m, > 0: farther; unknown wheel: right minus left
-    wheel: Ints = _none(np.int64)  # -1 left, +1 right, 0 unknown
-    change: float = 0.0            # of the ratio right over left in the drive, as if at half of it
-    count: int = 2                 # number of wheels in the mean
+    begin: Floats = _column()        # s
+    end: Floats = _column()          # s
+    size: Floats = _column()         # m, > 0: farther; unknown wheel: right minus left
+    wheel: Ints = _column(np.int64)  # -1 left, +1 right, 0 unknown
+    # of the ratio right over left in the drive, converted to one at half the path
+    change: float = 0.0
+    count: int = 2                   # number of wheels in the mean
 
     @property
     def t(self) -> Floats:
@@ -282,9 +289,9 @@ def wheel_slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason
     worst = int(np.argmax(np.abs(slips.size)))
     left, right = (f'the {name} wheel' for name in names)
     which = ('one of the wheels', right, left)[slips.wheel[worst]]
-    done = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
+    verb = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
     other = ' from the other' * (not slips.wheel[worst])
-    return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
+    return (Reason(Code.WHEEL_SLIP, f'{which} {verb}{other} by '
                    f'{100 * abs(slips.size[worst]):.0f} cm relative to the gyro, from t = '
                    f'{slips.begin[worst]:.1f} s for '
                    f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'

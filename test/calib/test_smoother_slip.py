@@ -285,4 +285,4 @@ def test_a_bend_to_and_fro_is_no_slip(slip, bends):
     found = find_slips(t, f_b, track, np.array([np.cos(off), np.sin(off), 0.0]), 0.8, 0.01)
     assert len(found.t) == (slip > 0)
     assert found.size.sum() == pytest.approx(slip, abs=0.2)
-    assert found.late == 0.0
+    assert found.delay == 0.0
