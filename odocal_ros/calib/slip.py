@@ -40,7 +40,7 @@ END_STEPS = 2        # rows each side over which the speed at an end is averaged
 SPIN_TURN = 0.1
 # counts, possible rounding error of a window: one over the 0.8 s of an end is 5 over the window,
 # plus 1 at the window's ends; the rest is margin: judgement
-ROUNDING_COUNTS = 8.0
+WINDOW_ROUNDING_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 WEAKEST_BRAKING = 0.5
 STOPS = 0.5          # m/s, a speed below is a stop: judgement
@@ -64,7 +64,8 @@ def count_size(travel: Travel) -> float:
     """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
     coarse = travel.coarse
     # coarse.max_error is the largest error of speeds at the ends of a window and within it
-    return travel.quantum if coarse is None else coarse.max_error * SPIN_WINDOW / ROUNDING_COUNTS
+    return travel.quantum if coarse is None else (
+        coarse.max_error * SPIN_WINDOW / WINDOW_ROUNDING_COUNTS)
 
 
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
@@ -120,7 +121,7 @@ class _Windows:
         # the usual excess of the drive (rough road, soft suspension) is no event
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
         least = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
-        limit = max(least, ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
+        limit = max(least, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
         return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 

@@ -4,10 +4,10 @@
 """
 Dead-reckoned track compared with all fixes: residuals, errors by path length, and reversing.
 
-Reversing with an odometer that counts upwards flips the direction of the track by half a turn from
-one piece of the drive to the next. The fixes remain behind the track by twice the piece's length;
-a fix error opposite to the travel disappears again. The track of this test is level, with a
-heading by the gyro about the mean upward axis: an attitude by gyros alone tilts within minutes.
+Residuals are track minus fixes. Reversing with an odometer that counts upwards flips the direction
+of the track by half a turn from one piece of the drive to the next. The fixes remain behind the
+track by twice the piece's length; a fix error opposite to the travel disappears again. The track
+of this test is level: an attitude by gyros alone tilts within minutes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,22 +29,22 @@ from odocal_ros.settings.levels import FAULT_SIGMAS, OUTLIER_SIGMAS, REMARK_SIGM
 ONE_MOTION_RATIO = 0.6, 1.6
 # smallest factor applied to stated fix sigmas. Statistical: by the median of 30 fixes, chance
 # alone gives 1.25 instead of 1 once in 30 legs
-NOISIER_WORTH = 1.25
+LEAST_NOISE_FACTOR = 1.25
 PIECE_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
-PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
+PIECE_STARTS = 10     # definition: number of starts of pieces within the length of one, as there
 # rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
 # and drift
 FLIP = np.deg2rad(135.0)
 # s around a reversal, within which a fix error disappears. Judgement: duration of multipath
-ERROR_LASTS = 60.0
+FIX_ERROR_DURATION = 60.0
 
 
 def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
-    path : t (n,) to the antenna's path, (n, 3) m, up to a constant.   pin : mark whose position
-    the path is set to.   fixes : (t, position_n) within the leg.
+    path : function of t (n,) to the antenna's path, (n, 3) m, up to a constant.   pin : mark
+    whose position the path is set to.   fixes : (t, position_n) within the leg.
     """
     t, position_n = fixes
     return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
@@ -65,20 +65,21 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     residual : (n, 3) corrected track minus fixes, m; NaN up where no height is known.
     covariance_n : (n, 3, 3) stated, m^2.   drift : possible track error by gyro drift, m, whose
     square is subtracted. The rest may include other track errors, so the factors tend to be too
-    large; below NOISIER_WORTH they are 1.   marks : the two that the track is pinned to. Their
-    errors act in proportion to the path, on average a third of each variance; the factor applies
-    to them as well.
+    large; below LEAST_NOISE_FACTOR they are 1.   marks : the two that the track is pinned to.
+    Their errors act in proportion to the path, on average a third of each variance; the factor
+    applies to them as well.
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
-    level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
-    rise = residual[:, 2] - np.median(residual[:, 2])
-    up2 = robust_sigma(rise)**2
-    observed_variance = np.array([level2, level2, up2]) - drift**2
-    level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
-    stated_variance = np.array([level, level, stated[2]])
+    # east plus north, whose squared length is exponentially distributed
+    horizontal = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)
+    up = robust_sigma(residual[:, 2] - np.median(residual[:, 2]))**2
+    observed_variance = np.array([horizontal, horizontal, up]) - drift**2
+    stated_horizontal = stated[0] + stated[1] + sum(
+        np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
+    stated_variance = np.array([stated_horizontal, stated_horizontal, stated[2]])
     factors = np.sqrt(np.maximum(np.nan_to_num(observed_variance), 0.0)
                       / np.maximum(stated_variance, 1e-12))
-    return np.where(factors > NOISIER_WORTH, factors, 1.0)
+    return np.where(factors > LEAST_NOISE_FACTOR, factors, 1.0)
 
 
 def _distance_limit(sigma: float, distance: float) -> float:
@@ -115,14 +116,14 @@ def bend_reasons(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float,
     if len(count) < 3:      # two windows show no bend
         return ()
     sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
-    allowed, most = _distance_limit(sigma, distance), np.abs(across).max()
-    if most <= allowed:
+    allowed, deviation = _distance_limit(sigma, distance), np.abs(across).max()
+    if deviation <= allowed:
         return ()
-    return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {most:.1f} m from the fixes; '
-                   f'the limit is {allowed:.1f} m. Likely cause: gyro errors larger than its '
-                   'grade, or invalid gyro values', 'Use method smoother, which also estimates '
-                   'the gyro errors. Check for lost or invalid IMU messages, or copy the '
-                   'recording again.'),)
+    return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {deviation:.1f} m from the '
+                   f'fixes; the limit is {allowed:.1f} m. Likely cause: gyro errors larger than '
+                   'its grade, or invalid gyro values', 'Use method smoother, which also '
+                   'estimates the gyro errors. Check for lost or invalid IMU messages, or copy '
+                   'the recording again.'),)
 
 
 def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
@@ -132,13 +133,13 @@ def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     residual : (n, 2 or more) corrected track minus fixes, m; the track may have large errors.
     The noise is the sigma of a fix by differences of consecutive ones, m, at least fix_sigma.
     """
-    level = residual[:, :2]
-    jump = np.median((np.diff(level, axis=0)**2).sum(axis=1)) / np.log(2) / 4
-    sigma = max(fix_sigma, float(np.sqrt(jump)))
+    horizontal = residual[:, :2]
+    variance = np.median((np.diff(horizontal, axis=0)**2).sum(axis=1)) / np.log(2) / 4
+    sigma = max(fix_sigma, float(np.sqrt(variance)))
     windows = np.lib.stride_tricks.sliding_window_view(
-        np.pad(level, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
-    off = np.hypot(*(level - np.median(windows, axis=-1)).T)
-    return off <= OUTLIER_SIGMAS * sigma, sigma
+        np.pad(horizontal, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
+    deviation = np.hypot(*(horizontal - np.median(windows, axis=-1)).T)
+    return deviation <= OUTLIER_SIGMAS * sigma, sigma
 
 
 def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
@@ -148,13 +149,13 @@ def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[Pe
     path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
     constant. The noise of the fixes is included.
     """
-    return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
-                             cut_pieces)
-                 for length, cut_pieces, (was, now) in _squared_errors(path, before, after))
+    return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())), count)
+                 for length, count, (was, now) in _squared_errors(path, before, after))
 
 
 def _squared_errors(path: Floats, before: Floats,
                     after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
+    """Yield the length of pieces, path over length, squared errors before and after, (p,) m^2."""
     for length in PIECE_LENGTHS_M:
         a, b = _piece_ends(path, length)
         if len(a):
@@ -170,8 +171,8 @@ def _piece_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
     b = np.searchsorted(path, path[a] + length)
     whole = b < len(path)
     a, b = a[whole], b[whole]
-    near = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
-    return a[near], b[near]
+    has_fixes = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
+    return a[has_fixes], b[has_fixes]
 
 
 def worse_check_reasons(path: Floats, before: Floats, after: Floats,
@@ -181,11 +182,11 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
 
     path, before, after : as for ``errors_per_distance``.   configured : a nominal scale is set.
     """
-    for length, cut_pieces, (was, now) in _squared_errors(path, before, after):
-        more = now - was
+    for length, count, (was, now) in _squared_errors(path, before, after):
+        increase = now - was
         # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
-        if cut_pieces < 3 or now.mean() < 1.1**2 * was.mean() \
-                or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(cut_pieces):
+        if count < 3 or now.mean() < 1.1**2 * was.mean() \
+                or increase.mean() < REMARK_SIGMAS * increase.std() / np.sqrt(count):
             continue
         return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
                        f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the '
@@ -197,11 +198,11 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
 class Pieces(NamedTuple):
     """Pieces of a drive between fixes, one after the other: (k,) each."""
 
-    t: Floats        # s, the middle
-    off: Floats      # rad, direction of the track minus course by the fixes
-    length: Floats   # m, by the fixes
-    stretch: Floats  # length of the track over ``length``, median 1
-    course: Floats   # rad, direction by the fixes
+    t: Floats              # s, the middle
+    heading_error: Floats  # rad, direction of the track minus course by the fixes
+    length: Floats         # m, by the fixes
+    length_ratio: Floats   # length of the track over ``length``, median 1
+    course: Floats         # rad, direction by the fixes
 
 
 def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Pieces:
@@ -217,18 +218,17 @@ def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> P
         return Pieces(*(np.empty(0),) * 5)
     a, b = knots[:-1], knots[1:]
     track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
-    length, middle = np.hypot(*fix.T), (t[a] + t[b]) / 2
-    stretch = np.hypot(*track.T) / length
-    course = arctan2(*fix.T[::-1])
-    off = wrap(arctan2(*track.T[::-1]) - course)
-    return Pieces(middle, off, length, stretch / (np.median(stretch) or 1.0), course)
+    length, course = np.hypot(*fix.T), arctan2(*fix.T[::-1])
+    ratio = np.hypot(*track.T) / length
+    return Pieces((t[a] + t[b]) / 2, wrap(arctan2(*track.T[::-1]) - course), length,
+                  ratio / (np.median(ratio) or 1.0), course)
 
 
-def find_reversed(found: Pieces) -> Bools:
+def find_reversed(pieces: Pieces) -> Bools:
     """
     Return True for pieces that are driven backwards: (k,) bool.
 
-    The heading offset is a random walk: its variance grows with the time between pieces, and its
+    The heading error is a random walk: its variance grows with the time between pieces, and its
     size is by the median of its changes. A piece beyond FLIP from the mean of those before is
     opposite to them. Where FAULT_SIGMAS of the walk exceed FLIP, the drive is divided; each part
     has its own forward direction, that of most of its pieces.
@@ -236,59 +236,62 @@ def find_reversed(found: Pieces) -> Bools:
     A piece whose path length by track and by fixes differs too much, as on the spot or with a
     jump of the fixes, has no direction.
     """
-    back = np.zeros(len(found.t), bool)
-    if len(found.t) > 1:        # without the remaining gyro bias, a constant rate of the offset
-        rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
-        found = found._replace(off=wrap(found.off - rate * found.t))
-    moves = np.flatnonzero((found.stretch > ONE_MOTION_RATIO[0])
-                           & (found.stretch < ONE_MOTION_RATIO[1]))
+    is_reversed = np.zeros(len(pieces.t), bool)
+    if len(pieces.t) > 1:        # without the remaining gyro bias, a constant rate of the error
+        rate = np.median(wrap(np.diff(pieces.heading_error)) / np.diff(pieces.t))
+        pieces = pieces._replace(heading_error=wrap(pieces.heading_error - rate * pieces.t))
+    moves = np.flatnonzero((pieces.length_ratio > ONE_MOTION_RATIO[0])
+                           & (pieces.length_ratio < ONE_MOTION_RATIO[1]))
     if len(moves) < 3:
-        return back
-    dt, step = np.maximum(np.diff(found.t[moves]), 1e-9), wrap(np.diff(found.off[moves]))
-    usual = robust_sigma(step)
-    sigma = usual * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
-    unknown = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
-    state = _is_opposite(found.off[moves])
-    for part in np.split(np.arange(len(moves)), unknown):
-        flipped = state[part] != (np.mean(state[part]) > 0.5)
+        return is_reversed
+    error = pieces.heading_error[moves]
+    dt = np.maximum(np.diff(pieces.t[moves]), 1e-9)
+    sigma = robust_sigma(wrap(np.diff(error))) * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
+    divisions = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
+    opposite = _is_opposite(error)
+    for part in np.split(np.arange(len(moves)), divisions):
+        flipped = opposite[part] != (np.mean(opposite[part]) > 0.5)
         for run in np.split(np.arange(len(part)), np.flatnonzero(np.diff(flipped)) + 1):
-            if len(run) and flipped[run[0]] and _stays_back(
-                    found, moves[part[run]], moves[part[~flipped]]):
-                back[moves[part[run]]] = True
-    return back
+            if len(run) and flipped[run[0]] and _fixes_stay_behind(
+                    pieces, moves[part[run]], moves[part[~flipped]]):
+                is_reversed[moves[part[run]]] = True
+    return is_reversed
 
 
-def _is_opposite(off: Floats) -> Bools:
-    """Return True for offsets, rad, opposite to the mean of those before, which follows: (k,)."""
-    mean, out = float(off[0]), np.zeros(len(off), bool)
-    for k, angle in enumerate(off.tolist()):
-        out[k] = abs(wrap(angle - mean)) > FLIP
-        mean += float(wrap(angle - mean - np.pi * out[k])) / 2
-    return out
+def _is_opposite(heading_error: Floats) -> Bools:
+    """Return True for angles, rad, opposite to the running mean of those before: (k,)."""
+    mean, opposite = float(heading_error[0]), np.zeros(len(heading_error), bool)
+    for k, angle in enumerate(heading_error.tolist()):
+        opposite[k] = abs(wrap(angle - mean)) > FLIP
+        mean += float(wrap(angle - mean - np.pi * opposite[k])) / 2
+    return opposite
 
 
-def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
+def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
     """
     Return True if the fixes stay behind after a run of pieces, as after a reversal.
 
-    Over ERROR_LASTS to each side, the displacement of the fixes is then nearer to that of the
-    track with the run reversed; after a fix error, which disappears, to that of the track.
+    Over FIX_ERROR_DURATION to each side, the displacement of the fixes is then nearer to that of
+    the track with the run reversed; after a fix error, which disappears, to that of the track.
+
+    run, forward : indices of the pieces of the run, and of those driven forward.
     """
-    t = found.t
-    about = np.flatnonzero((t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS))
+    t, error = pieces.t, pieces.heading_error
+    about = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)
+                           & (t <= t[run[-1]] + FIX_ERROR_DURATION))
     # the heading by most forward pieces: that of single ones contains the error
-    near = found.off[forward[np.isin(forward, about)]]
-    base = float(found.off[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
-    usual = base + (float(np.median(wrap(near - base))) if len(near) else 0.0)
-    track = found.stretch[about] * found.length[about] * np.exp(
-        1j * (found.course[about] + found.off[about] - usual))
-    off = np.sum(found.length[about] * np.exp(1j * found.course[about])) - track.sum()
-    return bool(abs(off + 2 * track[np.isin(about, run)].sum()) < abs(off))
+    of_forward = error[forward[np.isin(forward, about)]]
+    nearest = float(error[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
+    usual = nearest + (float(np.median(wrap(of_forward - nearest))) if len(of_forward) else 0.0)
+    track = pieces.length_ratio[about] * pieces.length[about] * np.exp(
+        1j * (pieces.course[about] + error[about] - usual))
+    behind = np.sum(pieces.length[about] * np.exp(1j * pieces.course[about])) - track.sum()
+    return bool(abs(behind + 2 * track[np.isin(about, run)].sum()) < abs(behind))
 
 
-def reversal_reasons(found: Pieces, signed: bool) -> tuple[Reason, ...]:
+def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
-    back = find_reversed(found)
+    back = find_reversed(pieces)
     if not back.any():
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'

@@ -58,7 +58,7 @@ class FittedTrack:
             keep, noise = find_inliers(np.stack([residual.real, residual.imag], -1), sigma)
             flat = np.stack([at.real, at.imag], -1) * self.K
             pieces = cut_pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
-            middle, rotation = pieces.t, -pieces.off
+            middle, rotation = pieces.t, -pieces.heading_error
             if not len(middle):
                 break
             centre = float(np.angle(np.exp(1j * rotation).sum()))

@@ -230,8 +230,8 @@ def test_pieces_are_long_enough_for_a_direction():
     p = np.stack([2.0 * t, np.zeros(100)], -1)
     found = cut_pieces(7.0 * p, p, t, sigma=1.0)
     np.testing.assert_array_equal(found.length, np.full(9, 20.0))       # of 20 sigmas
-    np.testing.assert_array_equal(found.off, 0.0)
-    np.testing.assert_array_equal(found.stretch, 1.0)       # whatever the unit of the track
+    np.testing.assert_array_equal(found.heading_error, 0.0)
+    np.testing.assert_array_equal(found.length_ratio, 1.0)       # whatever the unit of the track
     assert len(cut_pieces(p * 0, p * 0, t, 1.0).t) == 0
 
 
@@ -261,7 +261,7 @@ def test_a_false_course_of_two_pieces_does_not_turn_the_rest_around():
 def test_errors_of_the_gyro_are_no_reversing_and_hide_none():
     # a bias that grows by 0.3 deg/s within 20 min: 180 deg in all
     found = winding(drift=0.3 * DEG / 1200)
-    assert np.ptp(np.unwrap(found.off)) > 3.0
+    assert np.ptp(np.unwrap(found.heading_error)) > 3.0
     assert reversal_reasons(found, signed=True) == ()
     # a robot at 0.3 m/s: a bias of 1 deg/s turns the track by 30 deg from piece to piece
     slow = {'bias': DEG, 'speed': 0.3, 'seconds': 4000.0}
@@ -276,7 +276,7 @@ def test_fixes_that_run_back_and_on_again_are_no_reversing(drift):
     found = winding(drift=drift, jump=250.0)
     inside = (found.t > 600.0) & (found.t < 625.0)
     assert inside.sum() > 5
-    np.testing.assert_allclose(found.stretch[inside], 1.0, atol=0.2)
+    np.testing.assert_allclose(found.length_ratio[inside], 1.0, atol=0.2)
     assert reversal_reasons(found, signed=True) == ()
     # the same pieces, but that the fixes do not come back
     stay = found.t < 626.0
@@ -290,7 +290,7 @@ def test_an_error_that_disappears_after_a_turn_is_no_reversing():
     error = np.stack([-np.interp(path, [460.0, 500.0, 700.0, 800.0], [0.0, 80.0, 80.0, 0.0]),
                       0.0 * path], -1)
     found = cut_pieces(true, true + error, path / 10.0, 0.3)
-    assert 2 <= (np.abs(found.off) > 3.0).sum() <= 4
+    assert 2 <= (np.abs(found.heading_error) > 3.0).sum() <= 4
     assert not find_reversed(found).any()
     # if they do not catch up, it is a reversing
     error[path > 500.0] = error[path == 500.0]
@@ -301,15 +301,16 @@ def test_fixes_that_jump_have_no_direction():
     found = winding()
     jumps = np.isin(np.arange(len(found.t)), (40, 41))
     # back by 60 m while the vehicle goes on by 20
-    found = found._replace(off=found.off + np.pi * jumps,
-                           stretch=np.where(jumps, 0.33, found.stretch))
+    found = found._replace(heading_error=found.heading_error + np.pi * jumps,
+                           length_ratio=np.where(jumps, 0.33, found.length_ratio))
     assert reversal_reasons(found, signed=True) == ()
 
 
 def test_after_a_gap_in_which_the_heading_is_lost_forwards_is_what_most_pieces_are():
     found = winding()
     late = found.t > 800.0
-    noisy = found.off + np.random.default_rng(2).normal(0.0, 0.1, len(found.t))
-    turned = found._replace(off=noisy + np.pi * late, t=found.t + 60.0 * late)
+    noisy = found.heading_error + np.random.default_rng(2).normal(0.0, 0.1, len(found.t))
+    turned = found._replace(heading_error=noisy + np.pi * late, t=found.t + 60.0 * late)
     assert not find_reversed(turned).any()
-    assert find_reversed(turned._replace(off=found.off + np.pi * late)).sum() == late.sum()
+    turned = turned._replace(heading_error=found.heading_error + np.pi * late)
+    assert find_reversed(turned).sum() == late.sum()
