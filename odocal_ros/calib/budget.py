@@ -4,14 +4,13 @@
 """
 The error budget of the two-point method: every source as one-sigma effects on the parameters.
 
-A leg's end displacement D = M f (M: attitude summed over travel, f: scale times forward axis)
-is set equal to the chord between the reference positions. An error e of the chord against D, m,
-changes f by M^-1 e, and so ln K, yaw and pitch; each source is given as the e that one sigma of it
-causes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
-gyro error at time tau rotates the remaining displacement: r(tau) = D(end) - D(tau). Epochs may
-begin before the start mark, at the alignment: D is zero there, gyro errors already accumulate.
-The Earth rotation, which turns an error of one axis into the others by 4 mrad a minute, is
-omitted.
+A leg's end displacement D = M f (M: attitude summed over travel, f: scale times forward axis) is
+set equal to the chord, the vector between the reference positions. A chord error e, m, against D
+changes f by M^-1 e, and so ln K, yaw and pitch; each source is stated as the e of one sigma. An
+attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a gyro error
+at time tau rotates the remaining displacement: r(tau) = D(end) - D(tau). Epochs may begin before
+the start mark, at the alignment: D is zero there, gyro errors already accumulate. The Earth
+rotation, which turns an error of one axis into the others by 4 mrad a minute, is omitted.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -104,7 +103,7 @@ def root_of(covariance: Floats) -> Floats:
 
 
 def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
-                   end: MarkFix) -> Floats:
+                           end: MarkFix) -> Floats:
     """Return the chord error per odometer delay, (3,) m/s."""
     # travel is combined with later attitudes: the integral of dC/dt f ds; minus
     # v(end) - v(start), because the travel between the marks is shifted by the delay
@@ -114,11 +113,11 @@ def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start:
 
     middle, change = map(np.ascontiguousarray, by_step(middle_and_change, q_nb).swapaxes(0, 1))
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
-    turned: Floats = (change * speed[:, None]).sum(axis=0)
+    effect: Floats = (change * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
     v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
-    turned -= v_end - v_start
-    return turned
+    effect -= v_end - v_start
+    return effect
 
 
 def _velocity(t: Floats, D: Floats, begin: float, end: float) -> Floats:
@@ -135,9 +134,9 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     """
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
-    The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the height
-    error common to both ends, which scales the chord as a larger Earth would. ``projection`` is
-    listed although it is zero: the chord is in space, not in a plane.
+    The vertical errors of the marks are part of fix_start and fix_end; ``height`` is the height
+    error common to both, which scales the chord as a larger Earth would. ``projection`` is listed
+    although it is zero: the chord is in space, not in a plane.
 
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
     start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the

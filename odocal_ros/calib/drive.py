@@ -15,14 +15,14 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST
 
-# physical: wheels slide less far and for a shorter time, m and s; after that time GNSS_MOVES is
-# enough. Judgement: of the path, a smaller share is found elsewhere
+# motion without counts is a fault of the odometer if it is farther than wheels slide, m, or, after
+# the longest slide, s, than GNSS_MOVES: physical. Judgement: and at least this share of the path
 FURTHEST_SLIDE, LONGEST_SLIDE, LEAST_SHARE = 100.0, 20.0, 0.01
 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """Return the path length between the marks, m, and the reasons against the drive."""
+    """Return as ``check_path_and_speed``, with a reason if the leg is not straight."""
     distance, found = check_path_and_speed(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -55,10 +55,10 @@ def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
                          f'{leg.min_distance:g} m'),)
     if len(t) < 2:
         return distance, found
-    top = float(np.abs(rate_over_second(t, s)).max())
-    if top < leg.min_speed:
-        found += (Reason(Code.SPEED_TOO_LOW, f'highest speed (mean over 1 s) {top:.2f} m/s; the '
-                         f'limit is {leg.min_speed:g} m/s'),)
+    top_speed = float(np.abs(rate_over_second(t, s)).max())
+    if top_speed < leg.min_speed:
+        found += (Reason(Code.SPEED_TOO_LOW, f'highest speed (mean over 1 s) {top_speed:.2f} m/s; '
+                         f'the limit is {leg.min_speed:g} m/s'),)
     return distance, found
 
 
@@ -75,35 +75,39 @@ def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     """Return a reason if the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
     # s, shortest reported; for slow topics 1.5 times the interval of their messages
-    edge = max(0.5, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
-    what = [f'begins {late:.1f} s after the start mark'] * (late > edge)
-    what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
-    if not what:
+    shortest = max(0.5, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
+    texts = [f'begins {late:.1f} s after the start mark'] * (late > shortest)
+    texts += [f'ends {early:.1f} s before the stop mark'] * (early > shortest)
+    if not texts:
         return ()
-    return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is limited to '
+    return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(texts)}: the leg is limited to '
                    'the time of the odometer data'),)
 
 
 def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                    t_stop: float, least: float) -> tuple[Reason, ...]:
-    """Return the reason if wheels or fixes do not move, () if both do; least : of fixes, m."""
+    """
+    Return the reason if wheels or fixes do not move between the marks, () if both do.
+
+    t_fix, fixes_n : (k,) s, (k, 2 or more) m.   least : smallest significant motion of fixes, m.
+    """
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
-    t_here, here = t_fix[rows], fixes_n[rows, :2]
-    if len(here) < 2:
-        return (Reason(Code.NO_FIX, f'{len(here)} usable fix{"es" * (len(here) != 1)} between the '
-                       'marks; required: 2 or more'),)
-    if len(here) > 4:       # a single outlier is no motion: running median of three
-        here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
-        t_here = t_here[1:-1]
+    t, fixes = t_fix[rows], fixes_n[rows, :2]
+    if len(fixes) < 2:
+        return (Reason(Code.NO_FIX, f'{len(fixes)} usable fix{"es" * (len(fixes) != 1)} between '
+                       'the marks; required: 2 or more'),)
+    if len(fixes) > 4:       # a single outlier is no motion: running median of three
+        fixes = np.median(np.lib.stride_tricks.sliding_window_view(fixes, 3, axis=0), axis=-1)
+        t = t[1:-1]
     # 10 sigmas: judgement, a leg is longer. Many receivers state far more than their noise
-    sigma = min(fix_sigma, fix_white_noise(here))
-    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * sigma)
+    sigma = min(fix_sigma, fix_white_noise(fixes))
+    fixes_move = np.hypot(*np.ptp(fixes, axis=0)) > max(least, 10 * sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        return _stopped_counter_reasons(travel, t_here, here, fix_sigma)
+        return _stopped_counter_reasons(travel, t, fixes, fix_sigma)
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
     if wheels_move:
@@ -116,15 +120,16 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
 def _stopped_counter_reasons(travel: Travel, t: Floats, fixes: Floats,
                              fix_sigma: float) -> tuple[Reason, ...]:
     """Return a reason if the fixes, (k, 2) at (k,) s, move far without counts."""
-    far, since, until = max(_without_counts(travel, t, fixes, fix_sigma), default=(0.0, 0.0, 0.0))
-    if not far or far < LEAST_SHARE * path_and_chord(t, fixes)[0]:
+    distance, begin, end = max(_motion_without_counts(travel, t, fixes, fix_sigma),
+                               default=(0.0, 0.0, 0.0))
+    if not distance or distance < LEAST_SHARE * path_and_chord(t, fixes)[0]:
         return ()
-    return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
-                   f'to {until:.0f} s, but the odometer does not count'),)
+    return (Reason(Code.ODOMETER_STILL, f'the fixes move by {distance:.0f} m from t = {begin:.0f} '
+                   f's to {end:.0f} s, but the odometer does not count'),)
 
 
-def _without_counts(travel: Travel, t: Floats, fixes: Floats,
-                    fix_sigma: float) -> list[tuple[float, float, float]]:
+def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
+                           fix_sigma: float) -> list[tuple[float, float, float]]:
     """Return motion of the fixes, m, begin and end, s, of each interval without counts."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
@@ -132,40 +137,44 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
     found = []
     for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
         # at the end, where no cut helps, a parked vehicle has such errors of the fixes
-        small = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
-        least = max(GNSS_MOVES if small else FURTHEST_SLIDE, 10 * fix_sigma)
-        far = _motion_between(fixes[(t >= begin[k]) & (t <= end[k])], least)
-        if far >= least:
-            found.append((far, begin[k], end[k]))
+        is_no_slide = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
+        least = max(GNSS_MOVES if is_no_slide else FURTHEST_SLIDE, 10 * fix_sigma)
+        distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], least)
+        if distance >= least:
+            found.append((distance, begin[k], end[k]))
     return found
 
 
 def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
-    """Return (k, 2) s in which fixes move without counts, which go on afterwards: ferries."""
+    """
+    Return begin and end of motion of the fixes while the wheels stand, as on a ferry: (k, 2) s.
+
+    The odometer counts again afterwards.
+    """
     spans = []
-    for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
+    for distance, begin, end in _motion_without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
         if end >= travel.t[-1]:
             continue
         t, p, few = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
-        near = min(max(LOCAL_MOVES, 10 * fix_sigma), far / 4)
-        first, last = (np.hypot(*(p - np.median(of, axis=0)).T) > near
-                       for of in (p[:few], p[-few:]))
-        spans.append((t[np.argmax(first)], t[len(t) - 1 - np.argmax(last[::-1])]))
+        limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
+        has_left, is_before_end = (np.hypot(*(p - np.median(at, axis=0)).T) > limit
+                                   for at in (p[:few], p[-few:]))
+        spans.append((t[np.argmax(has_left)], t[len(t) - 1 - np.argmax(is_before_end[::-1])]))
     return np.reshape(np.array(spans, float), (-1, 2))
 
 
-def _motion_between(fixes: Floats, least: float) -> float:
+def _motion_of_fixes(fixes: Floats, least: float) -> float:
     """Return the motion of (k, 2) fixes without jumps and noise, m, 0 below ``least``."""
-    stretches = 20      # enough that motion extends over more than two of them
-    if len(fixes) < stretches:
+    count = 20      # of parts, enough that motion extends over more than two of them
+    if len(fixes) < count:
         return 0.0
-    parts = np.array_split(fixes, stretches)
+    parts = np.array_split(fixes, count)
     if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < least:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in parts])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
-    # a jump is one step, or two if inside a stretch: limit steps to the third largest
+    # a jump is one step, or two if inside a part: limit steps to the third largest
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
@@ -190,25 +199,25 @@ def find_reachable(t_fix: Floats, fixes_n: Floats) -> Bools:
     """Return the fixes that a vehicle can reach from the median one, in sequence: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
-    astray = 50.0       # m, possible error of any fix: physical, multipath in a street
-    if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + astray).all():
+    error_limit = 50.0       # m, possible error of any fix: physical, multipath in a street
+    if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + error_limit).all():
         return np.ones(len(p), bool)
-    amid = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
-    keep, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
-    for order in (range(amid, len(p)), range(amid, -1, -1)):
-        t, x, y = rows[amid]
+    first = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
+    reachable, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
+    for order in (range(first, len(p)), range(first, -1, -1)):
+        t, x, y = rows[first]
         for k in order:
-            far = np.hypot(rows[k][1] - x, rows[k][2] - y)
-            if far <= FASTEST * abs(rows[k][0] - t) + astray:
-                keep[k] = True
+            distance = np.hypot(rows[k][1] - x, rows[k][2] - y)
+            if distance <= FASTEST * abs(rows[k][0] - t) + error_limit:
+                reachable[k] = True
                 t, x, y = rows[k]
-    return keep
+    return reachable
 
 
 def fix_white_noise(fixes_n: Floats) -> float:
     """Return the white noise of fixes, m, by the median of their second differences."""
     if len(fixes_n) < 5:
-        return 2.5
+        return 2.5      # typical, m
     bend = np.diff(fixes_n[:, :2], n=2, axis=0)
     return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 

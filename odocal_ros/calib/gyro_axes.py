@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Gyro axes against the accelerometer and against the course of the fixes.
+Faults of gyro axes, by the accelerometer and by the course of the fixes.
 
-The ratio of turns by the gyro to turns of the course shows a wrong sign or unit.
-
-A rotation of the whole IMU (imu.mounting_rpy) turns gyro and accelerometer together. It does not
-correct a gyro that alone has an axis with the wrong sign, or two axes swapped, or an accelerometer
-that has an axis with the wrong sign. If the first level axis of the accelerometer has the wrong
-sign, the second level axis and the upright axis of the gyro appear to have it, because turn rates
-in mirrored axes have these signs.
+The ratio of turns by the gyro to turns of the course shows a wrong sign or unit. The rotation of
+gravity in the IMU shows gyro axes with a wrong sign or swapped: imu.mounting_rpy cannot correct
+these, because it rotates gyro and accelerometer together. If the first level axis of the
+accelerometer has the wrong sign, the second level axis and the upright axis of the gyro appear to
+have it, because turn rates in mirrored axes have these signs.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,11 +26,12 @@ from odocal_ros.screening.gravity_fit import gravity_fit
 from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, LocatedFixes
 
-Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
-SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a correct gyro
-TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
-# statistical: both must hold. False alarms in 0 of 384 zoo drives (lowest chance 1.9e-4); zoo.md
-LARGEST_CHANCE, NEAR_TURNED = 5e-5, 0.4
+# definition: coefficients of ``gravity_fit`` of correct axes, and of mirrored or swapped ones
+CORRECT = np.array([1.0, 1j, 0.0])
+WRONG = np.array([1.0, -1.0, 1j, -1j])
+# statistical: largest chance of a correct axis, and distance from a wrong one; both must hold.
+# False alarms in 0 of 384 zoo drives (lowest chance 1.9e-4); zoo.md
+LARGEST_CHANCE, NEAR_WRONG = 5e-5, 0.4
 FAR_SIGMAS = 5.0    # statistical: a sign of the accelerations in turns
 INVERTED = -0.5     # judgement: 1 is expected; a vehicle that leans into its turns has 0
 # statistical: least correlation of the same turns by gyro and by course, and least sigmas of the
@@ -41,6 +42,14 @@ LONGEST_GAP = 1.0      # s, judgement: of the IMU, turns within a longer one are
 # for a mower whose rows are 1.6 m apart)
 U_TURN = 0.25
 NO_ROTATION = 'imu.mounting_rpy cannot correct this: it rotates gyro and accelerometer together.'
+
+
+class WrongAxis(NamedTuple):
+    """A gyro axis that is published under another name or with the wrong sign."""
+
+    published: str    # such as 'x'
+    true: str         # with its sign, such as '-y'
+    text: str         # statement of what was observed
 
 
 def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
@@ -100,16 +109,17 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
             return _inverted_turns(orientation, found, names)
     if not found:
         return ()
-    do = ', '.join(f'negate angular_velocity.{sent}' if sent == true[-1] else
-                   f'publish angular_velocity.{sent} as {true[:-1]}angular_velocity.{true[-1]}'
-                   for sent, true, _ in found)
-    if len(found) == 1 and found[0][0] != found[0][1][-1]:
-        do += ', and check the other axes'
-    return (Reason(Code.GYRO_AXES, '; '.join(text for *_, text in found),
-                   f'Correct the IMU driver: {do}. {NO_ROTATION}'),)
+    action = ', '.join(
+        f'negate angular_velocity.{sent}' if sent == true[-1] else
+        f'publish angular_velocity.{sent} as {true[:-1]}angular_velocity.{true[-1]}'
+        for sent, true, _ in found)
+    if len(found) == 1 and found[0].published != found[0].true[-1]:
+        action += ', and check the other axes'
+    return (Reason(Code.GYRO_AXES, '; '.join(one.text for one in found),
+                   f'Correct the IMU driver: {action}. {NO_ROTATION}'),)
 
 
-def _inverted_turns(orientation: ImuOrientation, found: Found,
+def _inverted_turns(orientation: ImuOrientation, found: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     seen = ('accelerations in turns are opposite to turn rate and speed (ratio '
@@ -117,8 +127,8 @@ def _inverted_turns(orientation: ImuOrientation, found: Found,
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
-        return (Reason(Code.IMU_AXES, f'{seen}, and gravity rotates about {found[0][0]} opposite '
-                       f'to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
+        return (Reason(Code.IMU_AXES, f'{seen}, and gravity rotates about {found[0].published} '
+                       f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
                        + NO_ROTATION),)
     return (Reason(Code.GYRO_SIGN, f'{seen}: the sign of angular_velocity.{names[2][-1]}, or of '
@@ -128,7 +138,7 @@ def _inverted_turns(orientation: ImuOrientation, found: Found,
 
 
 def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
-              names: list[str]) -> Found:
+              names: list[str]) -> list[WrongAxis]:
     """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
         return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
@@ -138,34 +148,36 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
         return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
     if one_motion(ratio(axes[2])):
         return []
-    found: Found = []
+    found = []
     for name, axis in zip(names[:2], axes[:2], strict=True):
         turns = ratio(axis)
         if turns is not None and one_motion(turns):
             sent, true = _measured(name, names[2], turns)
-            found.append((sent, true, f'angular_velocity.{sent} turns with the course of the '
-                          f'fixes (ratio {turns:.2f}), angular_velocity.{names[2][-1]} does not'))
+            found.append(WrongAxis(
+                sent, true, f'angular_velocity.{sent} turns with the course of the fixes (ratio '
+                f'{turns:.2f}), angular_velocity.{names[2][-1]} does not'))
     return found
 
 
 def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
-               names: list[str]) -> Found:
+               names: list[str]) -> list[WrongAxis]:
     """Return the gyro axes that measure the rotation of gravity about another axis."""
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough)
-    found: Found = []
     if fit is None:
-        return found
-    nearest = TURNED[np.abs(TURNED - fit.coefficient[:, None]).argmin(axis=1)]
-    close, first = np.abs(nearest - fit.coefficient) < NEAR_TURNED, nearest.imag == 0
+        return []
+    found = []
+    nearest = WRONG[np.abs(WRONG - fit.coefficient[:, None]).argmin(axis=1)]
+    close, first = np.abs(nearest - fit.coefficient) < NEAR_WRONG, nearest.imag == 0
     for k, c in enumerate(fit.coefficient):
         # two gyro axes that measure one axis are no mirrored or swapped ones
-        if (nearest[k] == SOUND[k] or not close[k] or (close & (first == first[k])).sum() > 1
-                or fit.chance(k, SOUND[k]) > LARGEST_CHANCE):
+        if (nearest[k] == CORRECT[k] or not close[k] or (close & (first == first[k])).sum() > 1
+                or fit.chance(k, CORRECT[k]) > LARGEST_CHANCE):
             continue
         along, part = (names[0], c.real) if first[k] else (names[1], c.imag)
         sent, true = _measured(names[k], along, float(part))
-        found.append((sent, true, f'angular_velocity.{sent} measures the rotation of gravity '
-                      f'about {true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
+        found.append(WrongAxis(
+            sent, true, f'angular_velocity.{sent} measures the rotation of gravity about {true} '
+            f'(coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
     return found
 
 

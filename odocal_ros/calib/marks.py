@@ -5,8 +5,8 @@
 Reference positions at the marks: mean of the fixes over a standstill, or around a mark in motion.
 
 The error of the mean depends on the correlation time of fix errors. The stated covariance is the
-total error; the scatter shows the part that changes from fix to fix. Only this part averages
-down, unless the data show that the slow part changes within the window too. Errors that are
+total error; the scatter shows the fast part, which changes from fix to fix and averages down. The
+slow part does so only if the data show that it changes within the window too. Errors that are
 constant during a mark are observable along the leg, but not at the mark.
 """
 
@@ -19,7 +19,8 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.time_series import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
-Path = Callable[[Floats], Floats]     # t (n,) s to an antenna's path, (n, 3) m, or t () to (3,)
+# path of an antenna, up to a constant: t (n,) s to (n, 3) m in n, or t () to (3,)
+Path = Callable[[Floats], Floats]
 # s, least half-window of fixes about a mark in motion. Judgement: over two seconds the error of
 # dead reckoning is smaller than that of a fix
 MARK_WINDOW = 1.0
@@ -38,10 +39,10 @@ class MarkFix:
     t: float                   # s, of the mark
     position_n: Floats         # (3,) m
     covariance_n: Floats       # (3, 3) m^2
-    standing: bool             # averaged at rest
-    used: int                  # fixes
+    standing: bool             # True: averaged at rest
+    used: int                  # number of fixes
     height_known: bool = True  # False if any fix has no height
-    surveyed: bool = False     # from settings
+    surveyed: bool = False     # True: from settings
 
 
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
@@ -57,23 +58,24 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     weight = 1 / np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2)
     weight = weight / weight.sum()
     mean = weight @ position_n
-    whole = np.einsum('n,nij->ij', weight, covariance_n)
-    share = _variance_share(t, position_n - mean, whole, weight, correlation_time)
-    return mean, whole * share, int(keep.sum())
+    of_one = np.einsum('n,nij->ij', weight, covariance_n)
+    share = _variance_share(t, position_n - mean, of_one, weight, correlation_time)
+    return mean, of_one * share, int(keep.sum())
 
 
 def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
-    """Return the fixes within five robust sigmas of the median, horizontally and in height."""
-    off = np.abs(position_n - np.median(position_n, axis=0))
-    level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
+    """Return a mask of fixes, (n,), within five robust sigmas of the median, horizontal and up."""
+    deviation = np.abs(position_n - np.median(position_n, axis=0))
+    horizontal, up = np.hypot(deviation[:, 0], deviation[:, 1]), deviation[:, 2]
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
-    spread = max(np.median(level) / RAYLEIGH_MEDIAN, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
-    spread_up = max(np.median(up) / NORMAL_MEDIAN, 0.2 * np.sqrt(stated[2]))
-    out: Bools = (level <= OUTLIER_SIGMAS * spread) & (up <= OUTLIER_SIGMAS * spread_up)
-    return out
+    sigma = max(np.median(horizontal) / RAYLEIGH_MEDIAN,
+                0.2 * np.sqrt((stated[0] + stated[1]) / 2))
+    sigma_up = max(np.median(up) / NORMAL_MEDIAN, 0.2 * np.sqrt(stated[2]))
+    inliers: Bools = (horizontal <= OUTLIER_SIGMAS * sigma) & (up <= OUTLIER_SIGMAS * sigma_up)
+    return inliers
 
 
-def _variance_share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
+def _variance_share(t: Floats, residual: Floats, of_one: Floats, weight: Floats,
                     correlation_time: float) -> float:
     """Return the variance of the mean over that of a single fix: docs/method.md (T7)."""
     n = len(t)
@@ -84,7 +86,7 @@ def _variance_share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
         return _mean_variance_share(t, weight, correlation_time)
     if n < FEWEST_SCATTERED:
         return 1.0
-    sigma = np.sqrt(np.diag(whole))
+    sigma = np.sqrt(np.diag(of_one))
     z = residual[:, :2] / sigma[:2]
     scatter = (z**2).sum() / (2 * (n - 1))
     step = (np.diff(z, axis=0)**2).mean() / 2
@@ -112,11 +114,11 @@ def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
 def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
     """Return the correlation time of the slow part: structure function at a quarter window."""
     lag = max(1, len(t) // 4)
-    grown = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast
-    moved = np.clip(grown / slow, 0.0, 0.95) if slow > 0 else 0.95
-    if moved <= 0:
+    growth = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast      # slow (1 - correlation)
+    decorrelated = np.clip(growth / slow, 0.0, 0.95) if slow > 0 else 0.95
+    if decorrelated <= 0:
         return np.inf
-    return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-moved))
+    return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-decorrelated))
 
 
 def standing_at(t_mark: float, spans: Floats | Sequence[tuple[float, float]],
@@ -132,9 +134,9 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
     """
     Return the antenna position at a mark.
 
-    t_mark : s.   span : (begin, end) or None the standstill at the mark, s; None in motion.
-    fixes : (t, position_n, covariance_n) fixes of the leg.   displacement_n : (n,) times to the
-    (n, 3) motion of the antenna from the mark, m, dead reckoned.   correlation_time : as in
+    t_mark : s.   span : (begin, end) of the standstill at the mark, s; None in motion.
+    fixes : (t, position_n, covariance_n) of the leg.   displacement_n : function of (n,) times to
+    the (n, 3) motion of the antenna from the mark, m, dead reckoned.   correlation_time : as in
     mean_fix.   window : seconds each side of a mark in motion.
     """
     t, position_n, covariance_n = fixes
@@ -147,10 +149,10 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
         if abs(t[nearest] - t_mark) > window:
             return None
         pick = np.array([nearest])
-    p = position_n[pick] - displacement_n(t[pick])
-    height_known = bool(np.isfinite(p[:, 2]).all())
-    p = np.where(np.isfinite(p), p, 0.0)
-    mean, covariance, used = mean_fix(t[pick], p, covariance_n[pick], correlation_time)
+    at_mark = position_n[pick] - displacement_n(t[pick])
+    height_known = bool(np.isfinite(at_mark[:, 2]).all())
+    at_mark = np.where(np.isfinite(at_mark), at_mark, 0.0)
+    mean, covariance, used = mean_fix(t[pick], at_mark, covariance_n[pick], correlation_time)
     return MarkFix(t_mark, mean, covariance, span is not None, used, height_known)
 
 
@@ -186,24 +188,24 @@ def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
         return 0.0, np.inf
     means, places = means - means.mean(), places - places.mean()
     means = means - places * (places @ means) / max(places @ places, 1e-9)
-    free = len(count) - 2
-    jump = np.median(np.diff(along)**2) / 0.4549 / 2      # median of a squared normal deviate
-    white = min(jump, np.median(variance)) / np.median(count)
-    seen = (means**2).sum() / free - drift**2
+    freedom = len(count) - 2
+    # median of a squared normal deviate: 0.4549
+    fix_to_fix = np.median(np.diff(along)**2) / 0.4549 / 2
+    white = min(fix_to_fix, np.median(variance)) / np.median(count)
+    total = (means**2).sum() / freedom - drift**2
     # within three sigmas of the mean square by white errors alone
-    if seen <= white * (1 + 3 * np.sqrt(2 / free)):
+    if total <= white * (1 + 3 * np.sqrt(2 / freedom)):
         return 0.0, np.inf
-    next_to = (means[1:] * means[:-1])[np.diff(number) == 1]
-    correlated = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
-    return float(seen - white), _time_constant(correlated)
+    products = (means[1:] * means[:-1])[np.diff(number) == 1]
+    correlation = (products.mean() - drift**2) / (total - white) if len(products) else 1.0
+    return float(total - white), _time_constant(correlation)
 
 
-def _time_constant(correlated: float) -> float:
+def _time_constant(correlation: float) -> float:
     """Return the time constant, s, by the correlation of adjacent means of SLOW_WINDOW."""
     times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can determine
     x = SLOW_WINDOW / times
-    correlation = (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x)))
-    return float(np.interp(correlated, correlation, times))
+    return float(np.interp(correlation, (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x))), times))
 
 
 def slow_share(seconds: float, tau: float) -> float:
@@ -218,22 +220,22 @@ def with_slow_errors(mark: MarkFix, slow: float, tau: float, span: tuple[float, 
     """
     Return a mark with at least the variance of the slow fix errors.
 
-    The variance by a mark's own fixes is as reliable as that by the leg, if it includes slow
+    The variance by the fixes at a mark is as reliable as that by the leg, if it includes slow
     errors: it is increased only if it is that of white errors, or if the leg has clearly more.
 
-    mark : with the variance of its own fixes.   slow, tau : as slow_variance returns them.   span
-    : (begin, end) or None the standstill at the mark, s; None in motion.   stated : variance of
-    one fix, m^2.   up_ratio : variance up over that of a horizontal axis.
+    mark : with the variance by its fixes.   slow, tau : as slow_variance returns them.   span :
+    (begin, end) of the standstill at the mark, s; None in motion.   stated : variance of one fix,
+    m^2.   up_ratio : variance up over that of a horizontal axis.
     """
     begin, end = span or (mark.t, mark.t)
-    floor = slow * slow_share(end - begin, tau)
-    own = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
+    by_leg = slow * slow_share(end - begin, tau)
+    by_mark = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
     unclear = 2.0       # ratio of variances: below, neither of two estimates is better
-    took_for_white = own * mark.used < unclear * stated
-    if mark.surveyed or not (took_for_white or floor > unclear * own):
+    is_white = by_mark * mark.used < unclear * stated
+    if mark.surveyed or not (is_white or by_leg > unclear * by_mark):
         return mark
-    more = max(0.0, floor - own) * np.diag([1.0, 1.0, up_ratio])
-    return replace(mark, covariance_n=mark.covariance_n + more)
+    increase = max(0.0, by_leg - by_mark) * np.diag([1.0, 1.0, up_ratio])
+    return replace(mark, covariance_n=mark.covariance_n + increase)
 
 
 def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats,
@@ -242,10 +244,10 @@ def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Flo
     """
     Return both marks of a leg with at least the variance of its slow fix errors.
 
-    marks : (MarkFix, MarkFix) with the variance of their own fixes.   spans : (k, 2) standstills,
-    s.   t, path_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s,
-    corrected track there, m, track minus fix, m, and stated covariance, m^2.   chord_n : (3,) from
-    mark to mark, m.   drift_n : (3, k) possible track error by gyro drift, m.
+    marks : with the variance by their fixes.   spans : (k, 2) standstills, s.   t, path_n,
+    residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s, corrected track
+    there, m, track minus fix, m, and stated covariance, m^2.   chord_n : (3,) from mark to mark,
+    m.   drift_n : (3, k) possible track error by gyro drift, m.
     """
     along = chord_n[:2] / np.hypot(*chord_n[:2])
     stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)

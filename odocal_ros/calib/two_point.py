@@ -6,9 +6,9 @@ The two-point method: scale, yaw and pitch from the end of a leg, dead reckoned 
 
 Shi et al. 2015 uses the ratio of two chords in a plane and the angle between them, eq. (6)-(10).
 The same similarity is solved here in the Earth-fixed Cartesian frame n, where track and truth are
-exactly similar: with M the attitude summed over travel and c the chord between the reference
-positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at once. The plane and the
-geodesic of the paper are the cross-check.
+exactly similar. With M the attitude summed over travel and c the chord, the vector between the
+reference positions of the marks, M f = c gives f = K forward_b: the scale K times the forward axis
+in b, which is scale, yaw and pitch at once. The plane and the geodesic are the cross-check.
 """
 
 from collections.abc import Iterable
@@ -48,7 +48,7 @@ class Chord:
     start: MarkFix
     end: MarkFix
     lever_b: Floats     # (3,) antenna from the odometer's point, m, in v
-    velocity_change: Floats  # (3, 3) end minus start: times f gives m/s in n
+    velocity_change: Floats  # (3, 3) end minus start; times f: m/s in n
     alignment: Alignment
     # travel lost in gaps and resets: times, s, and sigmas, scale units
     lost_travel: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
@@ -64,7 +64,7 @@ class Chord:
 def solve(chord: Chord, up_scale: float = 1.0,
           limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
     """
-    Return f = K forward_b of M f = c, (3,) m per unit, and if the pitch is known: (T3), (T4).
+    Return f of M f = c, (3,) m per unit of travel, and True if the pitch is known: (T3), (T4).
 
     up_scale : factor on the stated height sigmas; np.inf: heights are not used.   limit : rad;
     heights that give a larger pitch are not used. Without information from heights, the pitch is
@@ -127,9 +127,9 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     """
     Return scale, yaw and pitch of one leg with their sigmas and the error budget.
 
-    chord : track, marks and alignment of the leg.   nominal_scale : k0, 0 where unknown.
-    scale_unit : Unit of the scale factor.   quantum : size of a count in scale units, 0 for
-    speeds.   fix_scale : (3,) factor on the stated fix sigmas, east, north, up.   config : limits.
+    chord : track, marks and alignment of the leg.   nominal_scale : K0, 0 where unknown.
+    quantum : size of a count in scale units, 0 for speeds.   fix_scale : (3,) factor on the stated
+    fix sigmas, east, north, up.   config : limits.
     """
     f, vertical_known = solve(chord, fix_scale[2])
     sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),
@@ -150,9 +150,9 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     if vertical_known:
         estimates['pitch_mounting_angle'] = Estimate(pitch, float(sigma[2]), 'rad')
     if chord.alignment.standstill is not None:
-        for axis, bias, own in zip('xyz', chord.alignment.gyro_bias,
-                                   chord.alignment.gyro_bias_sigma, strict=True):
-            estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(own), 'rad/s')
+        for axis, bias, bias_sigma in zip('xyz', chord.alignment.gyro_bias,
+                                          chord.alignment.gyro_bias_sigma, strict=True):
+            estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(bias_sigma), 'rad/s')
     check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
     reasons += _plane_reasons(check, K, sigma[0])
     return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
@@ -163,6 +163,7 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
 
 def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
              config: Config) -> tuple[Source, ...]:
+    """Return the error sources but those of lost travel and slip; arguments as for ``fit``."""
     track = chord.track
     # gyro errors accumulate from the alignment, with a fixed heading from the start mark
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
@@ -173,7 +174,7 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
     if not vertical_known:       # the prior of the pitch replaces the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
-        start, end = _blind_height(start), _blind_height(end, rise)
+        start, end = _with_height_sigma(start, 0.0), _with_height_sigma(end, rise)
     K = float(np.linalg.norm(f))
     return budget.budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
                          quantum=quantum * K, fix_scale=fix_scale,
@@ -197,8 +198,8 @@ def _travel_sources(chord: Chord, f: Floats) -> tuple[Source, ...]:
     return sources
 
 
-def _blind_height(mark: MarkFix, sigma: float = 0.0) -> MarkFix:
-    """Return the mark with its height replaced by a prior of sigma, m."""
+def _with_height_sigma(mark: MarkFix, sigma: float) -> MarkFix:
+    """Return the mark with another sigma of its height, m, without correlation."""
     covariance = mark.covariance_n.copy()
     covariance[2, :] = covariance[:, 2] = 0.0
     covariance[2, 2] = sigma**2
@@ -236,22 +237,22 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            f'({alignment.heading_source}) is {np.rad2deg(heading_sigma):.3f} deg, '
                            f'the yaw limit is {np.rad2deg(limit):.3f} deg: the end points only '
                            'constrain the sum of heading and yaw'),)
-    far = abs(float(wrap(yaw - nominal_yaw(config))))
-    if alignment.heading_separable and far > BACKWARDS_YAW:
+    deviation = abs(float(wrap(yaw - nominal_yaw(config))))
+    if alignment.heading_separable and deviation > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs opposite to the fixes: '
                            'positive counts mean backwards, or the IMU x axis points backwards '
                            f'(yaw {np.rad2deg(yaw):+z.1f} deg)'),)
-    elif alignment.heading_separable and far > FAR_YAW:
+    elif alignment.heading_separable and deviation > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
                            f'course give a yaw mounting of {np.rad2deg(yaw):+z.1f} deg, '
-                           f'{np.rad2deg(far):.1f} deg from its nominal value; the limit is '
+                           f'{np.rad2deg(deviation):.1f} deg from its nominal value; the limit is '
                            f'{np.rad2deg(FAR_YAW):.0f} deg'),)
     return reasons
 
 
 def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
-    """Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14)."""
+    """Return K and yaw by eq. (6)-(10) of Shi et al. in the plane and by the geodesic: (T14)."""
     # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark
     K = np.linalg.norm(f)
     yaw, pitch = map(float, mounting_from_forward(f / K))

@@ -28,7 +28,7 @@ from odocal_ros.calib.wheel_search.planar import (
 )
 from odocal_ros.settings.config import WheelsConfig
 
-FREE, HELD = Space(held=False), Space(held=True)
+FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
 # on the straight ones positions are blind to left against right: nothing to agree on
 TURNING = ['town', 'another town', 'noisy town', 'out and back']
 RANGES = ranges_of(WheelsConfig())
@@ -145,12 +145,12 @@ def test_the_minimum_in_a_box_is_the_least_value_there(definite):
 
 @pytest.mark.parametrize(('name', 'space'), [(name, HELD) for name in DRIVES] + [
     (name, FREE) for name in TURNING], ids=lambda x: x if isinstance(x, str) else (
-        'together' if x.held else 'free'))
+        'together' if x.fixed_difference else 'free'))
 @pytest.mark.parametrize('robust', [False, True], ids=['plain', 'robust'])
 def test_surface_and_least_squares_agree(name, space, robust):
     _, leg = simulated(**DRIVES[name])
     direct = least_squares(leg, np.zeros(3), space, robust)
-    assert direct.settled
+    assert direct.converged
 
     def surface_of(x, half, robust):
         return refine(lambda x: score(leg, sets_of(leg, x), robust, course=False).loss, x,
@@ -158,7 +158,7 @@ def test_surface_and_least_squares_agree(name, space, robust):
 
     begin = surface_of(np.zeros(3), RANGES.half, False)
     found = surface_of(begin.x, begin.half, robust)
-    assert found.settled
+    assert found.converged
     assert not found.on_edge
     assert (np.abs(found.x - direct.x) <= 1e-4 * 2 * RANGES.half).all()
     # kinks of Huber's function within a box over which it changes by 1e-6 (DROWNED)

@@ -15,13 +15,13 @@ import pytest
 from odocal_ros.calib.wheel_search import parameter_sets
 from odocal_ros.calib.wheel_search.minimisation import least_squares
 from odocal_ros.calib.wheel_search.parameter_sets import Ranges, ranges_of, Space
-from odocal_ros.calib.wheel_search.planar import repeats
+from odocal_ros.calib.wheel_search.planar import inflation
 from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
 from odocal_ros.errors import BadUsage
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import WheelsConfig
 
-FREE, HELD = Space(held=False), Space(held=True)
+FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
 RANGES = ranges_of(WheelsConfig())
 
 
@@ -29,7 +29,7 @@ RANGES = ranges_of(WheelsConfig())
 def test_cars_move_left_and_right_together_and_say_why(name):
     made, leg = simulated(**DRIVES[name])
     found = search(leg, RANGES)
-    assert found.held
+    assert found.fixed_difference
     ratio = found.refined_set[1] / found.refined_set[0]
     assert ratio == pytest.approx(leg.scale_right / leg.scale_left, rel=1e-12)
     codes = {r.code for r in found.reasons}
@@ -47,7 +47,7 @@ def test_cars_move_left_and_right_together_and_say_why(name):
 def test_a_small_lawn_tells_left_from_right():
     leg = on_a_plane()
     found = search(leg, RANGES)
-    assert not found.held
+    assert not found.fixed_difference
     assert found.reasons == ()
     z = (found.refined_set - TRUE) / found.free.sigma
     assert (np.abs(z) < 4).all()
@@ -99,7 +99,7 @@ def test_a_search_without_end_ends_and_says_so():
     assert_allclose(found.refined.half[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)
     blind = search(nothing, RANGES)
-    assert blind.held
+    assert blind.fixed_difference
     assert json.loads(json.dumps(blind.as_dict(), allow_nan=False))['condition_number'] is None
     assert search(replace(leg, t=leg.t[:3], left_n=leg.left_n[:3], right_n=leg.right_n[:3],
                           fixes_n=leg.fixes_n[:3], sigma=leg.sigma[:3]), RANGES) is None
@@ -146,7 +146,7 @@ def test_the_formal_sigma_holds_for_white_fixes():
         z.append((1 + found.x[:2] - TRUE[:2]) / found.sigma[:2])
     z = np.array(z)
     assert (np.abs(z.mean(axis=0)) < 4 / runs**0.5).all()
-    # repeats() counts chance likeness of white residuals, so sigmas are wide rather than narrow
+    # inflation() counts chance likeness of white residuals, so sigmas are wide rather than narrow
     assert (z.var(axis=0) < 1 + 4 * (2 / runs)**0.5).all()
     assert (z.var(axis=0) > 0.6).all()
 
@@ -166,13 +166,13 @@ def test_the_mean_of_both_wheels_is_known_where_their_difference_is_not():
 def test_residuals_alike_in_a_row_count_as_fewer():
     rng = np.random.default_rng(6)
     white = rng.normal(size=(2, 20000))
-    assert repeats(white) == pytest.approx(1.0, abs=0.1)
+    assert inflation(white) == pytest.approx(1.0, abs=0.1)
     slow = np.empty_like(white)
     slow[:, 0] = 0.0
     for k in range(1, white.shape[1]):
         slow[:, k] = 0.9 * slow[:, k - 1] + white[:, k]
-    assert repeats(slow) == pytest.approx(1.9 / 0.1, rel=0.3)      # (1 + r) / (1 - r)
-    assert repeats(np.zeros((2, 5))) == 1.0
+    assert inflation(slow) == pytest.approx(1.9 / 0.1, rel=0.3)      # (1 + r) / (1 - r)
+    assert inflation(np.zeros((2, 5))) == 1.0
 
 
 PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]

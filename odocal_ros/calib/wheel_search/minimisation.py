@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.wheel_search.parameter_sets import sets_of, Space
-from odocal_ros.calib.wheel_search.planar import coefficients, loss, PlanarLeg, repeats, weights
+from odocal_ros.calib.wheel_search.planar import coefficients, inflation, loss, PlanarLeg, weights
 from odocal_ros.data.arrays import Bools, Floats
 
-SETTLED = 1e-11      # judgement: relative, rad, largest last step
-HALVINGS = 40    # judgement: of a step, at most
+STEP_LIMIT = 1e-11   # judgement: relative, rad, largest last step
+HALVINGS = 40        # judgement: of a step, at most
 DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right minus left
-BENT = 1e-4          # judgement: share of path length: bend of any track by gyro, slip, tyres
+TRACK_BEND = 1e-4    # judgement: share of path length: bend of any track by gyro, slip, tyres
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +40,15 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Result of the search by surfaces."""
+    """Minimum of a criterion by response surfaces."""
 
-    x: Floats      # (3,) left, right (relative), heading (rad)
-    value: float   # of the criterion there
-    iterations: int
-    settled: bool
-    half: Floats   # (3,) last half range
-    widened: bool  # it was increased
-    on_edge: bool  # the minimum is still on its edge
+    x: Floats        # (3,) left, right (relative), heading (rad)
+    value: float     # of the criterion there
+    iterations: int  # number of surfaces
+    converged: bool
+    half: Floats     # (3,) last half range
+    widened: bool    # the range was increased
+    on_edge: bool    # the minimum is still on its edge
     first: Surface
     last: Surface
 
@@ -102,36 +102,38 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
     half of the search range about zero.   space : free parameters.   widen : double the range if
     the minimum is on its edge.
     """
-    walk = _Walk(value, space, np.asarray(half, dtype=float), np.asarray(width, dtype=float), x)
-    first = last = walk.surface()
-    settled = False
-    iterations = 1
-    most = 300    # surfaces; with the widest range a hundred are needed
+    search = _BoxSearch(value, space, np.asarray(half, dtype=float),
+                        np.asarray(width, dtype=float), x)
+    first = last = search.surface()
+    iterations, most = 1, 300    # surfaces; with the widest range a hundred are needed
     while True:
-        settled = walk.step(last)
-        if settled and walk.on_edge.any():
-            if not (widen and walk.widen()):
+        converged = search.step(last)
+        if converged and search.on_edge.any():
+            if not (widen and search.widen()):
                 break
-            settled = False
-        elif settled:
+            converged = False
+        if converged or iterations == most:
             break
-        if iterations == most:
-            break
-        last = walk.surface()
+        last = search.surface()
         iterations += 1
-    return Refined(space.T @ walk.q, walk.least, iterations, settled, walk.half,
-                   bool((walk.half > walk.first_half).any()), bool(walk.on_edge.any()), first,
-                   last)
+    return Refined(space.T @ search.q, search.least, iterations, converged, search.half,
+                   bool((search.half > search.first_half).any()), bool(search.on_edge.any()),
+                   first, last)
 
 
-class _Walk:
-    """The state of one search: position and width of the box, and the range."""
+class _BoxSearch:
+    """
+    The state of one search, in n search coordinates: the box of fitted points, and the range.
+
+    q, w : (n,) middle and half width of the box.   half : (3,) half range of x.   least : value of
+    the criterion at q.   on_edge : (n,) True where the minimum is on the edge of the range.
+    """
 
     def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
                  x: Floats) -> None:
         self.value, self.space = value, space
         self.first_half = self.half = half
-        self.first_width = np.abs(space.q_of(width) if space.held else
+        self.first_width = np.abs(space.q_of(width) if space.fixed_difference else
                                   np.array([width[:2].mean(), width[:2].sum(), width[2]]))
         self.w = self.first_width
         self.q = space.q_of(x)
@@ -140,6 +142,7 @@ class _Walk:
         self.least = np.inf
 
     def surface(self) -> Surface:
+        """Return the polynomial fitted to the criterion at 3^n points of the box."""
         self.values = self.value((self.q + self.grid * self.w) @ self.space.T.T)
         self.least = float(self.values[len(self.grid) // 2])
         return fit_surface(self.grid, self.values)
@@ -155,13 +158,13 @@ class _Walk:
         self.on_edge = (u <= low) | (u >= high)
         move = np.linalg.solve(S, u * bound)
         there = float(self.value((self.space.T @ (self.q + move))[None])[0])
-        settled = 1e-6    # share of the first half range, largest last step
-        small = np.abs(S @ move) <= settled * self.space.bounds(self.first_half)
+        step_limit = 1e-6    # share of the first half range, largest last step
+        small = np.abs(S @ move) <= step_limit * self.space.bounds(self.first_half)
         # share of the criterion: the box is not shrunk if its curvature contributes less
-        drowned = 1e-6
-        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < drowned * self.least)
+        least_curvature = 1e-6
+        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < least_curvature * self.least)
         narrow = 1e-3    # share of the first width, box of the last surface
-        done = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
+        converged = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
         beyond = np.abs(move) > self.w
         rounding = 1e-12    # share of the criterion by which equal values may differ
         if there <= self.least * (1 + rounding):
@@ -171,7 +174,7 @@ class _Walk:
         grow, shrink = 2.0, 0.25
         grown = np.minimum(grow * self.w, self.first_width)
         self.w = np.where(beyond, grown, np.where(shrinks, shrink * self.w, self.w))
-        return done
+        return converged
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:
         """Move to the best grid point in the range; return True where it is an end of the box."""
@@ -195,15 +198,15 @@ class _Walk:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Result of least squares; x as in ``space``."""
+    """Minimum of the criterion by least squares."""
 
-    x: Floats
-    value: float
+    x: Floats                # (3,) left, right (relative), heading (rad)
+    value: float             # of the criterion there
     iterations: int
-    settled: bool
-    covariance: Floats  # (3, 3) of x by the scatter, without errors of start, gyro and lever arm
-    condition: float         # of the Jacobian by relative scales (or both) and heading in rad
-    sigma_difference: float  # of right minus left, relative; with a bend of the track by BENT
+    converged: bool
+    covariance: Floats       # (3, 3) of x by the scatter, without errors of start, gyro, lever arm
+    condition: float         # number of the Jacobian by relative scales (or both) and heading, rad
+    sigma_difference: float  # of right minus left, relative; with a bend of the track
 
     @property
     def sigma(self) -> Floats:
@@ -221,38 +224,39 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     Return the parameters that minimise the (robust) mean square, by Gauss-Newton from x.
 
     leg : tracks and fixes.   x : (3,) first values: left, right (relative), heading (rad).
-    space : free parameters.   robust : as in ``criteria.score``.
+    space : free parameters.   robust : as in ``planar.score``.
     """
     q = space.q_of(x)
-    iterations, settled = 0, False
-    r, J = _linear(leg, space.T @ q)
+    iterations, converged = 0, False
+    r, J = _linearise(leg, space.T @ q)
     value = _value(leg, r, robust)
     most = 200    # iterations; with reweighting a few are needed for each digit
-    while not settled and iterations < most:
+    while not converged and iterations < most:
         iterations += 1
         root = np.sqrt(np.tile(weights(_d2(r), leg.sigma, robust), 2))
         step = _solve(root[:, None] * (J @ space.T), -root * r)
         for _ in range(HALVINGS):
-            new, J_new = _linear(leg, space.T @ (q + step))
-            lower = _value(leg, new, robust)
+            r_new, J_new = _linearise(leg, space.T @ (q + step))
+            lower = _value(leg, r_new, robust)
             if lower <= value:
                 break
             step = step / 2
         else:
-            settled = bool(np.abs(step).max() < SETTLED)
+            converged = bool(np.abs(step).max() < STEP_LIMIT)
             break
-        settled = bool(np.abs(step).max() < SETTLED) or \
-            bool(np.abs(step).max() < 1e3 * SETTLED and lower == value)
-        q, r, J, value = q + step, new, J_new, lower
-    covariance, condition = _spread(leg, r, J, space, robust)
+        largest = np.abs(step).max()
+        converged = bool(largest < STEP_LIMIT or (largest < 1e3 * STEP_LIMIT and lower == value))
+        q, r, J, value = q + step, r_new, J_new, lower
+    covariance, condition = _covariance(leg, r, J, space, robust)
     # of right minus left: by scatter, and by the bend of any track
-    reach, parts = np.linalg.norm(J[:, 2]), float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
-    bent = BENT * reach / max(parts, 1e-12)
-    return LeastSquares(space.T @ q, value, iterations, settled, covariance, condition,
-                        float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bent**2)))
+    by_heading = np.linalg.norm(J[:, 2])
+    by_difference = float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
+    by_bend = TRACK_BEND * by_heading / max(by_difference, 1e-12)
+    return LeastSquares(space.T @ q, value, iterations, converged, covariance, condition,
+                        float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + by_bend**2)))
 
 
-def _linear(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
+def _linearise(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return residuals rotated by -heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
     heading = x[2]
     by_x = np.zeros((4, 5))
@@ -264,6 +268,7 @@ def _linear(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _d2(r: Floats) -> Floats:
+    """Return squared distances of track and fixes, m^2: (2k,) to (k,)."""
     east, north = r.reshape(2, -1)
     return east**2 + north**2
 
@@ -279,11 +284,11 @@ def _solve(A: Floats, b: Floats) -> Floats:
     return np.linalg.lstsq(A / size, b, rcond=1e-14)[0] / size
 
 
-def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
-            robust: bool) -> tuple[Floats, float]:
-    """Return covariance of x and condition number."""
+def _covariance(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
+                robust: bool) -> tuple[Floats, float]:
+    """Return the covariance of x, (3, 3), and the condition number of the Jacobian."""
     w = np.tile(weights(_d2(r), leg.sigma, robust), 2)
-    s = np.linalg.svd(J @ space.T if space.held else J, compute_uv=False)
+    s = np.linalg.svd(J @ space.T if space.fixed_difference else J, compute_uv=False)
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
     root = np.sqrt(w)
     _, s, vt = np.linalg.svd(root[:, None] * (J @ space.T), full_matrices=False)
@@ -291,4 +296,4 @@ def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
     freedom = max(len(r) - len(s), 1)
     to_x = space.T @ (vt.T / s)
     rows = (root * r).reshape(2, -1)
-    return to_x @ to_x.T * ((rows**2).sum() / freedom * repeats(rows)), condition
+    return to_x @ to_x.T * ((rows**2).sum() / freedom * inflation(rows)), condition

@@ -29,7 +29,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.settings.config import WheelsConfig
 
 NAMES = ('left', 'right', 'heading')
-# definition: columns mean, difference (right minus left), heading; held: mean, heading
+# definition: columns mean, difference (right minus left), heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -137,33 +137,34 @@ def design_for(levels: int) -> Design:
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Linear map x = T q from the search coordinates q; held: without the wheel difference."""
+    """Linear map x = T q from search coordinates q: (mean, difference, heading) of the wheels."""
 
-    held: bool
+    fixed_difference: bool    # True: q is (mean, heading)
 
     @property
     def T(self) -> Floats:     # noqa: N802
-        """Return the matrix of x = T q."""
-        return FREE[:, [0, 2]] if self.held else FREE
+        """Return the matrix of x = T q: (3, n)."""
+        return FREE[:, [0, 2]] if self.fixed_difference else FREE
 
     @property
     def S(self) -> Floats:     # noqa: N802
-        """Return the matrix of v = S q, bounded by the range: x; held: mean and heading."""
-        return np.eye(2) if self.held else FREE
+        """Return the matrix, (n, n), of the bounded v = S q: v is x, or mean and heading."""
+        return np.eye(2) if self.fixed_difference else FREE
 
     def q_of(self, x: Floats) -> Floats:
-        """Return the coordinates q of x; held: without its difference."""
+        """Return the coordinates q of x, (3,): (n,)."""
         left, right, heading = x
         mean = (left + right) / 2
-        return np.array([mean, heading] if self.held else [mean, right - left, heading])
+        return np.array([mean, heading] if self.fixed_difference else
+                        [mean, right - left, heading])
 
     def bounds(self, half: Floats) -> Floats:
         """Return the half range of v from that of x: (n,)."""
-        return np.array([min(half[:2]), half[2]]) if self.held else np.array(half)
+        return np.array([min(half[:2]), half[2]]) if self.fixed_difference else np.array(half)
 
     def widened(self, half: Floats, on_edge: Bools) -> Floats:
         """Return the half range of x, doubled where v is on its edge, with positive scales."""
-        edge = np.array([on_edge[0], *on_edge]) if self.held else np.asarray(on_edge)
+        edge = np.array([on_edge[0], *on_edge]) if self.fixed_difference else np.asarray(on_edge)
         widest = np.array([0.9, 0.9, 1.5 * np.pi])    # of a half range
         return np.where(edge, np.minimum(2 * np.asarray(half), widest), half)
 

@@ -34,21 +34,23 @@ LEAST_SIGMA = 1e-4       # m, judgement: lower limit of a stated sigma
 @dataclass(frozen=True, eq=False)
 class PlanarLeg:
     """
-    A leg of two wheels as input of the search; n, metres, (k, 2) east and north.
+    A leg of two wheels as input of the search; positions are east and north in n.
 
-    left_n, right_n : sums of direction over the wheel's travel from the start to each fix, m per
-    m/unit of scale factor, with the configured heading.
+    left_n, right_n : track from the start to each fix by the travel of this wheel alone, for a
+    scale factor of 1 m per unit and the configured heading.
     """
 
     t: Floats           # (k,) s, times of the fixes
-    left_n: Floats      # (k, 2)
-    right_n: Floats     # (k, 2)
-    fixes_n: Floats     # (k, 2)
-    start_n: Floats     # (2,) antenna at the start, where every track begins
+    left_n: Floats      # (k, 2) m per m/unit
+    right_n: Floats     # (k, 2) m per m/unit
+    fixes_n: Floats     # (k, 2) m
+    start_n: Floats     # (2,) m, antenna at the start, where every track begins
     sigma: Floats       # (k,) m, of each axis of a fix
     scale_left: float   # start value, m per unit
-    scale_right: float  # start value
+    scale_right: float  # start value, m per unit
+    # (k, 2) m, change of the lever arm since the start by turns
     lever_n: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    # (c, 2) first and last fix of the pieces with a course
     pieces: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     @property
@@ -104,9 +106,9 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
-    course_baseline = 10.0    # m, minimum path between two fixes for a course
-    course_clear = 20.0    # fix sigmas, minimum as well: the sigma of a course is then 4 deg
-    ends = separated_fixes(fixes_n, max(course_baseline, course_clear * float(np.median(sigma))))
+    least_m = 10.0        # between two fixes for a course
+    least_sigmas = 20.0   # of a fix: the sigma of a course is then 4 deg
+    ends = separated_fixes(fixes_n, max(least_m, least_sigmas * float(np.median(sigma))))
     return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
 
 
@@ -120,14 +122,14 @@ def coefficients(sets: Floats) -> Floats:
 def squared_distances(leg: PlanarLeg, sets: Floats) -> Iterator[tuple[slice, Floats]]:
     """Yield (rows, squared distances of track and fix, m^2: (len(rows), k)) by bounded chunks."""
     east, north = leg.basis
-    mix = coefficients(sets)
+    weight = coefficients(sets)
     step = max(1, CHUNK // max(1, len(leg.t)))
-    for first in range(0, len(mix), step):
+    for first in range(0, len(weight), step):
         rows = slice(first, first + step)
-        d2, other = mix[rows] @ east, mix[rows] @ north
+        d2, north2 = weight[rows] @ east, weight[rows] @ north
         d2 *= d2
-        other *= other
-        d2 += other
+        north2 *= north2
+        d2 += north2
         yield rows, d2
 
 
@@ -186,8 +188,7 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
         return mean
     z2 = d2 / np.maximum(sigma, LEAST_SIGMA)**2
     far = z2 > HUBER**2
-    grown: Floats = np.where(far, 2 * HUBER * np.sqrt(np.where(far, z2, 0.0)) - HUBER**2, z2)
-    mean = grown.mean(axis=1)
+    mean = np.where(far, 2 * HUBER * np.sqrt(np.where(far, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
     return mean
 
 
@@ -202,19 +203,20 @@ def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
 def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
     """Return the direction of dead-reckoned pieces minus that by the fixes, rad: (m, c)."""
     a, b = leg.pieces.T
-    mix = coefficients(sets)[:, :3]
+    weight = coefficients(sets)[:, :3]
     east, north = (rows[:3, b] - rows[:3, a] for rows in leg.basis)
-    path_length = leg.fixes_n[b] - leg.fixes_n[a]
-    course = arctan2(path_length[:, 1], path_length[:, 0])
-    reckoned = arctan2(mix @ north, mix @ east)
+    chord = leg.fixes_n[b] - leg.fixes_n[a]
+    course = arctan2(chord[:, 1], chord[:, 0])
+    reckoned = arctan2(weight @ north, weight @ east)
     return wrap(reckoned + np.asarray(sets, dtype=float)[:, 2:] - course)
 
 
-def repeats(rows: Floats) -> float:
+def inflation(rows: Floats) -> float:
     """
-    Return the number of residuals per independent one: 1 if white, many for a drift.
+    Return the variance inflation by correlation: 1 for white residuals, large for a drift.
 
-    rows : (2, k). One plus twice the sum of their autocorrelations before the first negative one.
+    One plus twice the sum of their autocorrelations before the first negative one: the number of
+    residuals per independent one.   rows : (2, k).
     """
     k = rows.shape[1]
     spectrum = np.abs(np.fft.rfft(rows, 2 * k, axis=1))**2

@@ -43,7 +43,8 @@ class SearchResult:
     sets: Floats                # of the array's rows
     scores: Scores              # of these sets
     best: int  # row with the least mean distance (robust: loss), of equal ones the least maximum
-    held: bool  # the fixes do not separate left and right: their ratio is as at the start
+    # True: the fixes do not separate left and right, whose ratio is as at the start
+    fixed_difference: bool
     refined: Refined            # by response surfaces
     direct: LeastSquares        # by least squares
     free: LeastSquares          # the same with left and right free
@@ -69,15 +70,15 @@ class SearchResult:
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
             'meets_accuracy': None,
-            'left_and_right_held_together': self.held,
+            'left_and_right_held_together': self.fixed_difference,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
-                'iterations': r.iterations, 'settled': r.settled, 'widened': r.widened,
+                'iterations': r.iterations, 'settled': r.converged, 'widened': r.widened,
                 'on_edge': r.on_edge} | {
                 f'{name}_{place}': getattr(surface, name) for name in ('r_squared', 'lack_of_fit')
                 for place, surface in (('first', r.first), ('last', r.last))},
             'least_squares': _set(self.direct_set) | {
-                'iterations': d.iterations, 'settled': d.settled,
+                'iterations': d.iterations, 'settled': d.converged,
                 'formal_sigma': _set(d.sigma * [*self.start, 1.0])},
             'condition_number': _finite(self.free.condition),
             'correlation': [[float(c) for c in row] for row in self.free.correlation],
@@ -112,17 +113,18 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     sets = sets_of(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
-    free = direct = least_squares(leg, x[best], Space(held=False), robust)
-    held = not _separable(free, ranges)
-    space = Space(held)
-    if held:
+    free = direct = least_squares(leg, x[best], Space(fixed_difference=False), robust)
+    # twice the stated error of each wheel: the sigma of their difference
+    fixed_difference = not free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
+    space = Space(fixed_difference)
+    if fixed_difference:
         direct = least_squares(leg, x[best], space, robust)
     refined = _refined(leg, x[best], ranges, space, robust)
     refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
     return SearchResult(
-        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, held, refined,
-        direct, free, refined_set, direct_set, score(leg, leg.start, robust),
-        score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
+        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, fixed_difference,
+        refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
+        score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, fixed_difference))
 
 
 def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
@@ -142,16 +144,10 @@ def _wrapped(parameters: Floats) -> Floats:
     return np.array([*parameters[:2], wrap(parameters[2])])
 
 
-def _separable(free: LeastSquares, ranges: Ranges) -> bool:
-    """Return True if the fixes constrain the wheel difference better than the range."""
-    # which is twice the stated error of each wheel: the sigma of the difference
-    return free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
-
-
 def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
-             held: bool) -> tuple[Reason, ...]:
+             fixed_difference: bool) -> tuple[Reason, ...]:
     found = []
-    if held:
+    if fixed_difference:
         sigma = 100 * free.sigma_difference
         how = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
                'do not separate left and right wheel')
@@ -160,11 +156,12 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
                             f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
                             'together'))
     if refined.widened:
-        grown = [f'{name} ± {_amount(k, a)} to ± {_amount(k, b)}' for k, (name, a, b) in enumerate(
-            zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]
+        grown = [f'{name} ± {_amount(k, before)} to ± {_amount(k, after)}'
+                 for k, (name, before, after) in enumerate(zip(
+                     NAMES, ranges.half, refined.half, strict=True)) if after > before]
         found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
                             f'range, which was widened: {", ".join(grown)}'))
-    if not refined.settled or refined.on_edge:
+    if not refined.converged or refined.on_edge:
         where = 'ends on the edge of the widest range' if refined.on_edge else \
             f'has not converged after {refined.iterations} response surfaces'
         found.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
@@ -173,7 +170,7 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
         difference[2] = abs(wrap(difference[2]))
         share = float((difference / ranges.half).max())
         agree = 1e-3    # of the range: largest difference of surface and least squares
-        if share > agree or not direct.settled:
+        if share > agree or not direct.converged:
             found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
                                 f'differ by {100 * share:.2g} % of the range'))
     return tuple(found)

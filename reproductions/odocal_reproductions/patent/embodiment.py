@@ -86,7 +86,7 @@ class Embodiment:
         return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
                 'imbalance': self.imbalance, 'orthogonal_rows': self.least,
                 'response_surface': {'iterations': self.refined.iterations,
-                                     'settled': self.refined.settled,
+                                     'settled': self.refined.converged,
                                      'on_edge': self.refined.on_edge},
                 'least_squares': {'condition_number': float(self.direct.condition),
                                   'correlation': float(self.direct.correlation[0, 1]),
@@ -145,7 +145,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     small, whole = (_levels(rows, half) for rows in (array, full_factorial(LEVELS)))
     (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, whole))
     step = 2 * half / (np.array(LEVELS) - 1)
-    spaces = Space(held=False), Space(held=True)
+    spaces = Space(fixed_difference=False), Space(fixed_difference=True)
     refined, together = (
         refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, x_small, step, half,
                space, widen=False) for space in spaces)

@@ -25,7 +25,7 @@ def text_of(table: Embodiment, fix_noise: str, truth: tuple[float, float, float]
               for row in table.rows]
     lines += ['', f'array of 81 rows: counts of pairs deviate by at most {table.imbalance:.2f}',
               f'(an orthogonal array has a multiple of {table.least} rows)',
-              f'response surface: {r.iterations} fits, {"" if r.settled else "not "}converged, '
+              f'response surface: {r.iterations} fits, {"" if r.converged else "not "}converged, '
               f'{"" if r.on_edge else "not "}on the edge of the range; R^2 '
               f'{r.first.r_squared:.4f} first, {r.last.r_squared:.7f} last',
               f'least squares: condition number {d.condition:.3g}, correlation of left and right '
