@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Selection of the method for each value: the first in order that is not rejected.
+Selection of the method that gives each value: the first in METHOD_ORDER that is not rejected.
 
 The methods on one leg are compared: differences beyond the sigmas, with their likely cause.
 """
@@ -34,8 +34,8 @@ REASON_ESTIMATES = {
     Code.WHEELS_NOT_SEPARABLE: 'scale_factor_left',
     Code.TRACK_WIDTH_NOT_DETERMINED: 'track_width',
 }
-# methods are compared as if they were independent: those that share data differ less. Each value
-# as a word, and the likely cause in two_point, the later method of ORDER
+# methods are compared as if they were independent: those that share data differ less. Parameter:
+# its name in texts, and the likely cause in two_point, the last of METHOD_ORDER
 COMPARED = {
     'scale_factor': ('scale', 'slip or bad fixes at one of the marks'),
     'yaw_mounting_angle': ('yaw', 'an error of the configured heading (alignment.heading_source) '
@@ -119,7 +119,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
              and methods[n].verdict is not Verdict.REJECTED]
     if len(sound) < len(METHOD_ORDER):
         return []
-    (better, other), found = sound, []
+    (first, second), found = sound, []
     for name, (word, cause) in COMPARED.items():
         a, b = (m.estimates.get(name) for m in sound)
         if a is None or b is None or a.value is None or b.value is None \
@@ -129,9 +129,9 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
         difference = b.value - a.value if name == 'scale_factor' else float(wrap(b.value
                                                                                  - a.value))
         if abs(difference) > REMARK_SIGMAS * sigma:
-            off = (format_relative(difference / a.value, '+') if name == 'scale_factor' else
-                   f'{math.degrees(difference):+z.3f} deg')
+            text = (format_relative(difference / a.value, '+') if name == 'scale_factor' else
+                    f'{math.degrees(difference):+z.3f} deg')
             found.append(Reason(
-                Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by {off}, '
+                Code.METHODS_DISAGREE, f'{word}: {second.name} and {first.name} differ by {text}, '
                 f'{abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
     return found

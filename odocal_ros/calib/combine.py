@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Combination of several legs of one vehicle: own errors average down, shared ones do not.
+Combination of the results of one method on several legs of a vehicle, by a weighted mean.
 
-The equations are those of docs/method.md, (T15) and (T16).
+Errors of single legs average down, errors shared by all legs do not: docs/method.md, (T15), (T16).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 
-INDEPENDENT_SOURCES = {'initial_level'}    # an accelerometer bias: changes with each power-up
+# shared within a drive but not between power-ups, as an accelerometer bias: legs may differ by it
+DIFFERING_SOURCES = {'initial_level'}
 
 
 def combine_method(name: str, results: Sequence[MethodResult],
@@ -43,13 +44,13 @@ def combine_method(name: str, results: Sequence[MethodResult],
         if not determined:
             estimates[parameter] = Estimate(None, None, unit)
             continue
-        value, own, shared, why = _combine(parameter, i, [results[k] for k in determined],
-                                           walked[determined])
-        reasons += why
-        relative = value if parameter.startswith('scale_factor') else 1.0
-        sigma = abs(relative) * float(np.sqrt(own + sum(v @ v for v in shared.values())))
+        value, variance, shared, found = _combine(parameter, i, [results[k] for k in determined],
+                                                  walked[determined])
+        reasons += found
+        scale = value if parameter.startswith('scale_factor') else 1.0     # of ln K to K
+        sigma = abs(scale) * float(np.sqrt(variance + sum(v @ v for v in shared.values())))
         estimates[parameter] = Estimate(value, sigma, unit)
-        of_legs = np.sqrt(own) * np.eye(len(parameters))[i]
+        of_legs = np.sqrt(variance) * np.eye(len(parameters))[i]
         for source, effect in (shared | {'legs': of_legs}).items():
             sources.setdefault(source, []).append((i, effect))
     estimates |= _ratio(results, estimates) | newest(results, estimates)
@@ -77,35 +78,33 @@ def newest(results: Sequence[MethodResult],
     return found
 
 
-def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Floats,
+def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """Return value, own variance, shared effects, reasons of a parameter: (T15), (T16)."""
-    relative = parameter.startswith('scale_factor')
-    x = np.array([r.estimates[parameter].value for r in have])
-    y = np.log(x) if relative else x
-    angle = have[0].estimates[parameter].unit == 'rad'
-    if angle:       # of an IMU that faces backwards they are near +-pi
+    """
+    Return mean, variance without shared errors, shared effects, and reasons: (T15), (T16).
+
+    i : row of the parameter in the sources.   results : of J legs with a value.   walked : (J,).
+    """
+    is_scale = parameter.startswith('scale_factor')
+    x = np.array([r.estimates[parameter].value for r in results])
+    y = np.log(x) if is_scale else x
+    is_angle = results[0].estimates[parameter].unit == 'rad'
+    if is_angle:       # of an IMU that faces backwards they are near +-pi
         y = x - ((x - x[0]) - wrap(x - x[0]))
-    own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
-                    for r in have])
-    own = np.diag(np.maximum(own, 1e-18))
-    if relative:    # from the last leg back, two legs share the random walk up to the nearer one
-        own += np.minimum.outer(walked, walked)
-    names = {s.name for r in have for s in r.sources if s.shared}
-    by_leg = {}
-    for n in sorted(names):
-        effects = [next((s.effects[i] for s in r.sources if s.shared and s.name == n), None)
-                   for r in have]
-        width = max(len(e) for e in effects if e is not None)
-        by_leg[n] = np.stack([np.zeros(width) if e is None else e for e in effects])
-    weight = _weights(own + sum(g @ g.T for g in by_leg.values()))
+    variances = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
+                          for r in results])
+    unshared = np.diag(np.maximum(variances, 1e-18))
+    if is_scale:    # from the last leg back, two legs share the random walk up to the nearer one
+        unshared += np.minimum.outer(walked, walked)
+    by_leg = _shared_effects(i, results)
+    weight = _weights(unshared + sum(g @ g.T for g in by_leg.values()))
     mean = weight @ y
     shared = {n: weight @ g for n, g in by_leg.items()}
-    variance = weight @ own @ weight
-    # allowed differences: own errors of the legs, and shared errors with different effects
-    allowed = own + np.diag(sum((((g if n in INDEPENDENT_SOURCES else g
-                                   - shared[n])**2).sum(axis=1)
-                                 for n, g in by_leg.items()), np.zeros(len(y))))
+    variance = weight @ unshared @ weight
+    # allowed differences: errors of the legs, and shared errors with different effects
+    allowed = unshared + np.diag(sum((
+        ((g if n in DIFFERING_SOURCES else g - shared[n])**2).sum(axis=1)
+        for n, g in by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
     chi2 = float((y - mean) @ np.linalg.solve(allowed, y - mean)) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
@@ -114,14 +113,25 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
         variance *= factor**2
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter}: the scatter of {len(y)} legs is '
                           f'{factor:.1f} times their uncertainties'),)
-    mean = np.exp(mean) if relative else wrap(mean) if angle else mean
+    mean = np.exp(mean) if is_scale else wrap(mean) if is_angle else mean
     return float(mean), float(variance), shared, reasons
+
+
+def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats]:
+    """Return the effects of each shared source on parameter i in J legs, by name: (J, k)."""
+    by_leg = {}
+    for name in sorted({s.name for r in results for s in r.sources if s.shared}):
+        effects = [next((s.effects[i] for s in r.sources if s.shared and s.name == name), None)
+                   for r in results]
+        width = max(len(e) for e in effects if e is not None)
+        by_leg[name] = np.stack([np.zeros(width) if e is None else e for e in effects])
+    return by_leg
 
 
 def _weights(covariance: Floats) -> Floats:
     """Return the weights, none below zero, of the mean with the least variance: (T15)."""
     from scipy.optimize import nnls
-    # by own errors alone, a leg that a shared error dominates would make the mean worse
+    # by unshared errors alone, a leg that a shared error dominates would make the mean worse
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
     out: Floats = weight / weight.sum()
@@ -141,6 +151,7 @@ def _ratio(results: Sequence[MethodResult],
 
 
 def _stacked(sources: Mapping[str, list[tuple[int, Floats]]], p: int) -> tuple[Source, ...]:
+    """Return the sources from their effects by (row, effects) of each of p parameters."""
     out = []
     for name, rows in sources.items():
         effects = np.zeros((p, max(len(e) for _, e in rows)))

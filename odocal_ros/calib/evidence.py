@@ -40,7 +40,7 @@ class Evidence:
     Residuals are dead-reckoned minus fixed positions, along the vehicle's forward axis and left.
     """
 
-    t: Floats                          # (m,)
+    t: Floats                          # (m,) of the track
     distance: Floats                   # (m,) m driven since the start mark
     speed: Floats                      # (m,) m/s, below zero when reversing
     yaw_rate: Floats                   # (m,) rad/s, counter-clockwise
@@ -56,18 +56,16 @@ class Evidence:
     sections: Sections
     t_excluded: Floats                 # (x,) fixes not used
     excluded_because: tuple[str, ...]  # (x,)
-    fixes: int                         # before decimation
-    excluded: int
+    fixes: int                         # their number before decimation
+    excluded: int                      # the same
     gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
-    t_fit: float = np.inf              # s: later data are held out of the fit
+    t_fit: float = np.inf              # later data are held out of the fit
     by_speed: SpeedScale = SpeedScale(NO_ROWS)  # of the uncorrected odometer
-    # (w, 4) as window_scale
-    by_window: Floats = field(default_factory=lambda: NO_ROWS)
+    by_window: Floats = field(default_factory=lambda: NO_ROWS)    # (w, 4) as ``window_scale``
 
 
 def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,
-                  pin: MarkFix,
-                  paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
+                  pin: MarkFix, paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
                   covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
     Return the plot data of a leg, at most KEPT_ROWS of each series.
@@ -75,9 +73,9 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     leg : with all received fixes.   inputs : the screened leg.   track : epochs and attitude.
     fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool, fixes without gross
     errors; those within the time span of the track are shown.   pin : mark whose position the
-    paths are set to.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m
-    up to a constant, as configured and as calibrated.   config : settings in force.   t_fit : end
-    of the fitted data, s.   covered : begin and end of the time with an odometer, s.
+    paths are set to.   paths : the antenna's path as configured and as calibrated.   config :
+    settings in force.   t_fit : end of the fitted data, s.   covered : begin and end of the time
+    with an odometer, s.
     """
     inside = (track.t >= covered[0]) & (track.t <= min(inputs.t_stop, covered[1]))
     t = track.t[inside]
@@ -92,9 +90,9 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     forward = _forward_directions(t_fix, t, after_n, sign)
     fix_distance = np.interp(t_fix, t, distance)
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    status, t_out, because = _fix_states(leg, inputs, kept, span, config)
+    status, t_excluded, causes = _fix_states(leg, inputs, kept, span, config)
 
-    m, k, x = (_decimated_rows(n) for n in (len(t), len(t_fix), len(because)))
+    m, k, x = (_decimated_rows(n) for n in (len(t), len(t_fix), len(causes)))
     return Evidence(
         t=t[m], distance=distance[m], speed=(rate_over_second(t, distance) * sign)[m],
         yaw_rate=rate_over_second(t, yaw)[m], track_n=after_n[m], track_before_n=before(t[m]),
@@ -102,8 +100,8 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
         fix_status=status[k], residual=_along_and_across(fixed_n - fix_n, forward)[k],
         residual_before=_along_and_across(before(t_fix) - fix_n, forward)[k],
         sections=sections(fix_distance, fixed_n, fix_n, sigma),
-        t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
-        fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
+        t_excluded=t_excluded[x], excluded_because=tuple(causes[i] for i in x),
+        fixes=len(t_fix), excluded=len(causes), gaps=_gaps(inputs, span, config),
         t_fit=t_fit, by_speed=speed_scale(t_fix, fix_n, fixed_n, fix_distance, inputs.travel),
         by_window=window_scale(t_fix, fix_n, fixed_n))
 
@@ -120,6 +118,7 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
 
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:
+    """Return a path shifted to the position of a mark."""
     here = path(np.array(pin.t))
 
     def at(t: Floats) -> Floats:
@@ -135,27 +134,27 @@ def _fix_states(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float]
     """Return the status of kept fixes, the times of the others, and why those are excluded."""
     leg, _ = without_clock_steps(leg)      # as in the screening: inputs have these stamps
     fix, gnss = leg.fix, config.gnss
-    later = gnss.time_offset - config.imu.time_offset
-    t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + later
-    near = (t >= span[0]) & (t <= span[1])
-    row = {when: i for i, when in enumerate(t.tolist())}
-    rows = np.array([row[when] for when in inputs.t_fix[kept].tolist()], int)
-    near[rows] = False
+    offset = gnss.time_offset - config.imu.time_offset
+    t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + offset
+    is_excluded = (t >= span[0]) & (t <= span[1])
+    row_at = {when: i for i, when in enumerate(t.tolist())}
+    rows = np.array([row_at[when] for when in inputs.t_fix[kept].tolist()], int)
+    is_excluded[rows] = False
     usable = np.isin(t, inputs.t_fix)
     sigma = np.sqrt(fix.covariance_n[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1, initial=0))
     limit = sigma_limit(sigma[fix.status >= gnss.min_status], gnss.max_sigma)
-    out = np.flatnonzero(near)
-    because = [
+    excluded = np.flatnonzero(is_excluded)
+    causes = [
         f'status below {gnss.min_status}' if fix.status[i] < gnss.min_status else
         f'sigma above {limit:.3g} m' if limit < sigma[i] else
-        'far off the track' if usable[i] and row[t[i]] == i else
-        'implausible stamp or position' for i in out]
+        'far off the track' if usable[i] and row_at[t[i]] == i else
+        'implausible stamp or position' for i in excluded]
     status: Ints = fix.status[rows]
-    return status, t[out], because
+    return status, t[excluded], causes
 
 
 def _forward_directions(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
-    """Return the forward direction as complex numbers; at rest the last one: (k,)."""
+    """Return the forward direction at times t_new as complex numbers; at rest the last: (k,)."""
     z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
     # below 0.2 m/s noise of the track (rounding to counts) dominates the direction
     moving = np.flatnonzero(np.abs(z) > 0.2)

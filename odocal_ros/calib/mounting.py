@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientation of an IMU in the vehicle: up from gravity, forward from accelerations."""
+"""
+Orientation of an IMU in the vehicle: up from gravity, forward from accelerations.
+
+It gives the setting imu.mounting_rpy, a rotation by quarter turns, for an IMU that is mounted in
+another orientation than configured.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -29,11 +34,11 @@ class Mounting:
     """The nominal rotation estimated from a drive."""
 
     C_bi: Floats | None       # (3, 3) i to b, quarter turns only; None: not observable
-    up_i: Floats              # (3,) measured axis
+    up_i: Floats              # (3,) unit vector, measured
     forward_i: Floats | None  # (3,) the same; None: not observable
     forward_sigma: float      # rad
     assumed: bool             # forward is assumed to be x, not measured
-    off: float                # rad, angle between the measured axes and the quarter turns
+    deviation: float          # rad, angle between the measured axes and the quarter turns
 
     @property
     def rpy(self) -> list[float] | None:
@@ -43,11 +48,12 @@ class Mounting:
     @property
     def unclear(self) -> str:
         """Return the reason why the rotation is not known, '' if it is."""
-        sigma, off, limit = np.rad2deg([self.forward_sigma, self.off, MEANT_AXIS])
+        sigma, deviation, limit = np.rad2deg([self.forward_sigma, self.deviation, MEANT_AXIS])
         if self.C_bi is not None:
             return ''
         if self.forward_i is not None:
-            return f'the IMU axes are {off:.0f} deg from quarter turns (limit {limit:.0f} deg)'
+            return (f'the IMU axes are {deviation:.0f} deg from quarter turns (limit '
+                    f'{limit:.0f} deg)')
         by = f' (1 sigma: {sigma:.0f} deg; limit {limit / 2:.0f} deg)' * bool(sigma < 180)
         return f'this drive does not determine which IMU axis points forward{by}'
 
@@ -62,10 +68,10 @@ def remedy(found: Mounting) -> str:
         C = np.stack([found.forward_i, np.cross(found.up_i, found.forward_i), found.up_i])
         return f'{why}. Set imu.mounting_rpy to its angles, about {_listed(C, 2)} rad.'
     upright = [C for C in _quarter_turns() if C[2] @ found.up_i > np.abs(found.up_i).max() - 1e-9]
-    each = '; '.join(f'{"-+"[int(C[0].sum() > 0)]}{AXES[int(np.argmax(np.abs(C[0])))]}: '
-                     f'{_listed(C)}' for C in upright)
+    by_axis = '; '.join(f'{"-+"[int(C[0].sum() > 0)]}{AXES[int(np.argmax(np.abs(C[0])))]}: '
+                        f'{_listed(C)}' for C in upright)
     return (f'{why}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
-            f'({each}).')
+            f'({by_axis}).')
 
 
 def _rpy(C_bi: Floats) -> list[float]:
@@ -104,9 +110,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
     if forward_i is not None:
         C = np.stack([forward_i, np.cross(up_i, forward_i), up_i])
         nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
-        off = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
-        found = nearest if off < MEANT_AXIS + sigma else None
-        return Mounting(found, up_i, forward_i, sigma, False, off)
+        deviation = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
+        found = nearest if deviation < MEANT_AXIS + sigma else None
+        return Mounting(found, up_i, forward_i, sigma, False, deviation)
     if abs(up_i[2]) > np.cos(MEANT_AXIS):     # upright or upside down: x is forward, most likely
         C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
         return Mounting(C_bi, up_i, None, sigma, True, float(np.arccos(abs(up_i[2]))))
@@ -117,7 +123,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
     """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
     # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
-    # accelerations; else turns are inverted, as by a mirrored axis, which is tested later
+    # accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later)
     found = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if found is None:
         return None, np.pi
@@ -138,9 +144,10 @@ def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
     gain = np.vdot(A, F) / power
     if not gain:            # no accelerometer
         return 0.0, np.pi
-    rest = F - gain * A
+    residual = F - gain * A
     # half the residual is across the axis; adjacent bins share noise, so count every third
-    sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
+    variance = np.vdot(residual, residual).real / (2 * len(A) / 3)
+    sigma = float(np.sqrt(variance / power) / abs(gain))
     return float(np.angle(gain)), sigma
 
 

@@ -17,12 +17,12 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
-BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
+NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                     'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                     'pitch_mounting_angle_housing_sigma'})
-AS_SENT = 'scale_factor_as_sent'
+AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps
 FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
-TRACE = 'trace'      # key of the details: for a developer
+TRACE = 'trace'      # key of the details of a method that raised: its traceback
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ def wheel_factors(estimates: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One source of error of an estimate, as one-sigma effects."""
+    """One source of error of p parameters, as one-sigma effects."""
 
     name: str
-    effects: Floats       # (p, k) of k independent unit errors on the p parameters
+    effects: Floats       # (p, k) of k independent unit errors; on ln K for a scale factor
     shared: bool = False  # the same in every leg of a vehicle (heading source, lever arm)
 
 
@@ -76,8 +76,7 @@ class MethodResult:
     parameters: tuple[str, ...] = ()  # names, in the order of the rows of the sources
     sources: tuple[Source, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
-    # on the constants, the keyframes eliminated, of the leg or of all; None: the method has none
-    marginal: MarginalInformation | None = None
+    marginal: MarginalInformation | None = None    # None: the method has none
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -110,18 +109,18 @@ class PerDistance:
 class LegResult:
     """Everything computed from one leg."""
 
-    start_ns: int
+    start_ns: int                         # stamps of the marks
     stop_ns: int
-    distance: float
-    duration: float
-    imu_samples: int
-    pulses: int
+    distance: float                       # m, path length
+    duration: float                       # s
+    imu_samples: int                      # numbers of usable rows
+    pulses: int                           # of the odometer
     fixes: int
     rejected_fixes: int
-    reasons: tuple[Reason, ...]
+    reasons: tuple[Reason, ...]           # of the leg, for all methods
     methods: dict[str, MethodResult]
-    before: TrackCheck | None = None
-    after: TrackCheck | None = None
+    before: TrackCheck | None = None      # with the configured values
+    after: TrackCheck | None = None       # with the calibrated values
     per_distance: tuple[PerDistance, ...] = ()
     track_n: Floats | None = None         # (m, 3) corrected dead reckoning, n, m
     track_before_n: Floats | None = None  # (m, 3) as configured

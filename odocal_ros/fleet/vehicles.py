@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.combine import INDEPENDENT_SOURCES
+from odocal_ros.calib.combine import DIFFERING_SOURCES
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import DONE, legs_from_text, read_rows, Row
@@ -108,7 +108,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
     for k, method in enumerate(methods):
         i = method.parameters.index(name)
         for source in method.sources:
-            if not source.shared or source.name in INDEPENDENT_SOURCES:
+            if not source.shared or source.name in DIFFERING_SOURCES:
                 independent[k] += source.effects[i] @ source.effects[i]
                 continue
             effects = shared.setdefault((method.name, source.name, source.effects.shape[1]),

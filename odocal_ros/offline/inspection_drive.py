@@ -157,7 +157,8 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
         'accelerometer': inputs.has_accelerometer, 'rpy': m.rpy, 'assumed_forward': m.assumed,
-        'off': m.off, 'unclear': m.unclear + '; imu.mounting_rpy is used as set' * is_configured,
+        'off': m.deviation,
+        'unclear': m.unclear + '; imu.mounting_rpy is used as set' * is_configured,
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not is_configured}

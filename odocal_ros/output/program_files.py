@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from odocal_ros.calib.result import BESIDE, Calibration, LegResult
+from odocal_ros.calib.result import Calibration, LegResult, NOT_ESTIMATES
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output import device_files
@@ -69,7 +69,7 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
-        if name not in BESIDE:
+        if name not in NOT_ESTIMATES:
             result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}
     result |= {'legs': len(calibration.legs),
                'valid': calibration.verdict is not Verdict.REJECTED,

@@ -209,7 +209,7 @@ def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]
     """Return each number of the result as in calibration.json: name, value, sigma, ..."""
     rows = []
     for name, entry in content['result'].items():
-        if name in result.BESIDE:
+        if name in result.NOT_ESTIMATES:
             rows += [(f'{name.replace("_", " ")}, {key.replace("_", " ")}',
                       LOST if x is None else ', '.join(map(repr, np.atleast_1d(x).tolist())),
                       '', '', '') for key, x in entry.items() if key != 'unit']

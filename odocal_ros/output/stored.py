@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from odocal_ros.calib.marginal_information import CarriedInformation, read_carried
-from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
+from odocal_ros.calib.result import Estimate, NOT_ESTIMATES, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, plain, SCHEMA
 from odocal_ros.output.value_text import with_sigma, with_unit
@@ -93,13 +93,13 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
     return Stored(
         name, _part(content, 'created', str), Verdict(verdict),
         tuple(str(r.get('code')) for r in _part(content, 'reasons', list) if isinstance(r, dict)),
-        {key: _estimate(entry, key) for key, entry in result.items() if key not in BESIDE},
+        {key: _estimate(entry, key) for key, entry in result.items() if key not in NOT_ESTIMATES},
         frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
                   if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
         frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
         _part(content, 'config', dict),
         {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
-         if key not in BESIDE},
+         if key not in NOT_ESTIMATES},
         str(content.get('vehicle') or ''),
         *(read_carried(content[part]) if isinstance(content.get(part), dict) else None
           for part in ('carried', 'imu')))
