@@ -4,13 +4,13 @@
 """
 Alignment: level, gyro bias and heading at the start of a leg, each with its sigma.
 
-An ``Alignment`` is an input of the pure pipeline, so that a simulation can put errors in it.
+First the level from the specific force, at rest or in motion (``Level``), then with a heading the
+``Alignment``. It is an input of the pure pipeline, so that a simulation can put errors in it.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
@@ -31,19 +31,19 @@ REST_EDGE = 0.3
 class Alignment:
     """Attitude and gyro bias at one epoch; sigmas are 1 sigma."""
 
-    t: float                               # s since the start mark, start of the strapdown
-    C_nb: NDArray[np.float64]              # (3, 3) b to n
-    gyro_bias: NDArray[np.float64]         # (3,) rad/s, in b
-    level_sigma: float                     # rad, each of east and north
-    heading_sigma: float                   # rad
-    gyro_bias_sigma: NDArray[np.float64]   # (3,) rad/s
-    gyro_noise: float                      # rad/s/sqrt(Hz)
-    gyro_bias_walk: float                  # rad/s/sqrt(s)
-    heading_source: str                    # that of ``course`` includes the mounting angle
-    heading_shared: bool                   # its error is the same in every leg
+    t: float                  # s since the start mark, start of the strapdown
+    C_nb: Floats              # (3, 3) b to n
+    gyro_bias: Floats         # (3,) rad/s, in b
+    level_sigma: float        # rad, each of east and north
+    heading_sigma: float      # rad
+    gyro_bias_sigma: Floats   # (3,) rad/s
+    gyro_noise: float         # rad/s/sqrt(Hz)
+    gyro_bias_walk: float     # rad/s/sqrt(s)
+    heading_source: str       # that of ``course`` includes the mounting angle
+    heading_shared: bool      # True: its error is the same in every leg
     standstill: tuple[float, float] | None = None    # begin and end, s; None: in motion
-    gyro_scale_sigma: float = 0.0          # relative
-    gyro_axes_sigma: float = 0.0           # rad, of an axis
+    gyro_scale_sigma: float = 0.0    # relative
+    gyro_axes_sigma: float = 0.0     # rad, of an axis
 
     @property
     def heading_separable(self) -> bool:
@@ -51,7 +51,7 @@ class Alignment:
         return self.heading_source != 'course'
 
     @property
-    def q_nb(self) -> NDArray[np.float64]:
+    def q_nb(self) -> Floats:
         """Return C_nb as a quaternion x y z w."""
         return quat_from_matrix(self.C_nb)
 
@@ -59,25 +59,26 @@ class Alignment:
 @dataclass(frozen=True, eq=False)
 class Level:
     """
-    Level and turn rate before heading is known: L is level, its x axis the projection of b's.
+    Level and turn rate before heading is known.
 
-    It is level at the position p of the vehicle: C_np is the rotation from ENU at p to n.
+    The frame L is level at the position p of the vehicle, its x axis the projection of b's. C_np
+    is the rotation from ENU at p to n.
     """
 
-    t: float
-    C_Lb: NDArray[np.float64]           # (3, 3)
-    level_sigma: float                  # rad, each axis
-    mean_rate_b: NDArray[np.float64]    # (3,) rad/s over the standstill, zero in motion
-    rate_sigma: float                   # rad/s, of the mean as bias at t
-    standstill: tuple[float, float] | None
-    C_np: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    t: float               # s since the start mark
+    C_Lb: Floats           # (3, 3) b to L
+    level_sigma: float     # rad, each axis
+    mean_rate_b: Floats    # (3,) rad/s over the standstill, zero in motion
+    rate_sigma: float      # rad/s, of the mean as bias at t
+    standstill: tuple[float, float] | None    # begin and end, s; None: in motion
+    C_np: Floats = field(default_factory=lambda: np.eye(3))
 
 
 def level_frame(up_b: Floats) -> Floats:
     """Return C_Lb for up in b: x of L is b's x axis on the level; if vertical, y is b's."""
     u = up_b / np.linalg.norm(up_b)
-    level = np.hypot(u[1], u[2])
-    y = np.array([0.0, u[2], -u[1]]) / level if level else np.array([0.0, 1.0, 0.0])
+    across = np.hypot(u[1], u[2])
+    y = np.array([0.0, u[2], -u[1]]) / across if across else np.array([0.0, 1.0, 0.0])
     return np.stack([np.cross(y, u), y, u])
 
 
@@ -128,8 +129,7 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     C_0b = matrix_from_quat(q_0b)
     f_0 = rotate(C_0b, f_b)
     lift = np.sum((f_0[:-1] + f_0[1:]) / 2 * np.diff(t)[:, None], axis=0)
-    change = C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0]
-    up_0 = lift - change
+    up_0 = lift - (C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0])
     g = gravity(latitude, 0.0)
     fastest = np.abs(speed).max()
     earth = OMEGA * (T / 2 + 2 * fastest / g)       # rotation of the level, and Coriolis
@@ -155,10 +155,10 @@ def earth_rate_deviation(level: Level, latitude: float, grade: Grade) -> float:
     """Return the deviation of the rate at rest from the Earth's, level or up, in sigmas."""
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
-    off = np.array([np.hypot(rate_L[0], rate_L[1]) - level_rate, rate_L[2] - up_rate])
-    tilt = level.level_sigma * np.array([up_rate, level_rate])
-    sigma = np.sqrt(grade.gyro_bias**2 + level.rate_sigma**2 + tilt**2)
-    return float(np.abs(off / sigma).max())
+    deviation = np.array([np.hypot(rate_L[0], rate_L[1]) - level_rate, rate_L[2] - up_rate])
+    by_tilt = level.level_sigma * np.array([up_rate, level_rate])
+    sigma = np.sqrt(grade.gyro_bias**2 + level.rate_sigma**2 + by_tilt**2)
+    return float(np.abs(deviation / sigma).max())
 
 
 def make_alignment(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,

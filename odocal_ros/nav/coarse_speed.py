@@ -4,10 +4,11 @@
 """
 Speeds in coarse steps: whole km/h of a car's bus, truncated or rounded, sometimes interpolated.
 
-Such a value determines a cell of the grid, and its error is not noise: a cruise stays in one cell
-for half a minute. Changes are accurate: when the value changes by one step, the speed passes the
-edge between two cells. When it changes by more, each value only determines its cell. Zero is not a
-cell: it includes all speeds that the sender treats as rest.
+Such values are on a grid of steps. A value only determines the cell, one step wide, that contains
+the speed, and its error is not noise: a cruise stays in one cell for half a minute. Changes are
+accurate: when the value changes by one step, the speed passes the edge between two cells. When it
+changes by more, each value only determines its cell. Zero is not a cell: it includes all speeds
+that the sender treats as rest.
 
 Other speeds are held, repeated until they have changed by a step, as on many buses. The value
 after a change is correct. Until the next change the speed is within one step of it, in the
@@ -23,7 +24,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.nav.time_series import MISSING_INTERVALS
 
-LEAST_CROSSING = 0.02      # judgement: of a cell, minimum sigma of a crossing
+LEAST_CROSSING = 0.02      # judgement: in cells, minimum sigma of a speed at an edge
 LEAST_CELLS = 3.0          # judgement: cells that the values must span
 # judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 GRID_COHERENCE = 0.9
@@ -39,17 +40,17 @@ FEWEST_CHANGES, LEAST_OVER_TENTH = 50, 0.6
 
 @dataclass(frozen=True, eq=False)
 class SpeedInstants:
-    """Speeds at instants t, s: ``value`` + side * offset, scale units per s, 1 sigma."""
+    """Speeds at m instants: value + side * offset, with an unknown offset common to all."""
 
-    t: Floats        # (m,)
-    value: Floats    # (m,)
+    t: Floats        # (m,) s
+    value: Floats    # (m,) scale units per s
     side: Floats     # (m,) 1 forwards, -1 backwards
-    sigma: Floats    # (m,)
+    sigma: Floats    # (m,) scale units per s
 
     def between(self, begin: float, end: float) -> 'SpeedInstants':
         """Return the instants between two times, s."""
-        pick = (self.t >= begin) & (self.t <= end)
-        return SpeedInstants(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
+        inside = (self.t >= begin) & (self.t <= end)
+        return SpeedInstants(*(x[inside] for x in (self.t, self.value, self.side, self.sigma)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class CoarseSpeed:
 
     @cached_property
     def max_error(self) -> float:
-        """Return the limit of the deviation of a speed from lines between rows, with curvature."""
+        """Return the largest deviation of the speed from lines between rows, scale units per s."""
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
@@ -91,15 +92,14 @@ class CoarseSpeed:
         """
         first = np.flatnonzero(np.diff(self.value, prepend=np.nan))
         begin = self.t[first]
-        lasts = np.diff(begin, append=self.t[-1])
-        power = self.step**2 / 12 * lasts * (self.value[first] != 0)
-        total = np.interp(t, np.append(begin, self.t[-1]),
-                          running_sum(power * lasts))
+        duration = np.diff(begin, append=self.t[-1])
+        power = self.step**2 / 12 * duration * (self.value[first] != 0)
+        total = np.interp(t, np.append(begin, self.t[-1]), running_sum(power * duration))
         # before and after a motion the speed is within a step of zero, for an unknown time
         moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
-        hidden = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
-        out: Floats = np.diff(total) + hidden**2 / 3
-        return out
+        unseen = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
+        variance: Floats = np.diff(total) + unseen**2 / 3
+        return variance
 
     @cached_property
     def instants(self) -> SpeedInstants:
@@ -119,20 +119,20 @@ class CoarseSpeed:
         outer = np.maximum(np.abs(cell[at]), np.abs(cell[at + 1]))
         inner = np.minimum(np.abs(cell[at]), np.abs(cell[at + 1]))
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
-        gained = _rate_limits(middle, edge, q) * h
-        jump = np.where(gained > q, 2, jump)    # there a step may pass two edges, or none
+        speed_change = _rate_limits(middle, edge, q) * h
+        jump = np.where(speed_change > q, 2, jump)    # there a step may pass two edges, or none
         least_cell = 2    # cells from zero: the first may have a dead band
         single = (jump == 1) & (outer >= least_cell) & (inner > 0)
         if not self.interpolated:
             single &= h <= MISSING_INTERVALS * usual
-        sigma = gained[single]
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= least_cell)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
         golden = 0.618034    # steps through a range evenly
         # rows at varying places: at an extremum of the speed, the middle one would be the fastest
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
-        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), LEAST_CROSSING * q)
+        width = np.r_[speed_change[single], np.full(len(row), q)]
+        sigma = np.hypot(width / np.sqrt(12), LEAST_CROSSING * q)
         order = np.argsort(when, kind='stable')
         return SpeedInstants(when[order], value[order], np.sign(value[order]), sigma[order])
 
@@ -204,9 +204,9 @@ def find_grid_step(value: Floats) -> float | None:
 
 def _coherence(u: Ints, size: int) -> Floats:
     """Return |mean of exp(2 pi i k u / size)| of cells u, (size / 2 + 1,) by k."""
-    there = np.zeros(size)
-    there[u] = 1.0
-    return np.abs(np.fft.rfft(there)) / len(u)
+    occupied = np.zeros(size)
+    occupied[u] = 1.0
+    return np.abs(np.fft.rfft(occupied)) / len(u)
 
 
 def _may_be_grid(u: Ints) -> bool:
@@ -216,9 +216,9 @@ def _may_be_grid(u: Ints) -> bool:
     A peak with coherence c, GRID_COHERENCE, is within half a step of one of them, so that phases
     differ by at most pi / 4 to either side: there it is at least (c - sqrt(1 - c^2)) / sqrt(2).
     """
-    left = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
-    fewest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
-    return bool(_coherence(u, GRID_ROUGH)[fewest:].max() >= left)
+    least = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
+    lowest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
+    return bool(_coherence(u, GRID_ROUGH)[lowest:].max() >= least)
 
 
 def _step_of_few_values(value: Floats, u: Floats, count: Ints) -> float | None:
@@ -227,9 +227,9 @@ def _step_of_few_values(value: Floats, u: Floats, count: Ints) -> float | None:
     if len(u) < few_values or np.median(count) < often_sent:
         return None
     step = _refine_step(value, float(np.diff(u).min()))
-    off = u / step - np.rint(u / step)
-    divides_cell = 0.02    # of a cell, largest deviation of values from the grid
-    return step if np.abs(off).max() < divides_cell else None
+    deviation = u / step - np.rint(u / step)
+    largest = 0.02    # of a cell
+    return step if np.abs(deviation).max() < largest else None
 
 
 def _refine_step(value: Floats, step: float) -> float:
@@ -243,7 +243,7 @@ def _refine_step(value: Floats, step: float) -> float:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeldSpeed(CoarseSpeed):
-    """A speed held until it has changed by ``step``; ``value``: centre of its interval."""
+    """A speed held until it has changed by ``step``; ``value`` is the middle of its interval."""
 
     sent: Floats             # (n,) as published
 

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Filter of a receiver: error of its fixes, described by one unknown ``square``, s^2.
+Errors of fixes by the filter of a receiver, described by one unknown ``square``, s^2.
 
 Above zero: the mean of past positions, weighted by exp(-age / tau) / tau, square = tau^2. The
 delay of a stamp is the mean age; this module computes the rest, the smoothed position at t + tau
 minus the position at t. Below zero: a filter of position and velocity, square = -2 tau^2, which
-follows a constant velocity without delay and overshoots where it changes:
-e'' + sqrt(2) e' / tau + e / tau^2 = -p''. For small tau both are p'' square / 2, the first term
-of a series that converges slowly: at 0.6 s in town its next terms are decimetres.
+follows a constant velocity without delay and overshoots where it changes. Its error e of the
+position p is e'' + sqrt(2) e' / tau + e / tau^2 = -p''. For small tau both are p'' square / 2, the
+first term of a series that converges slowly: at 0.6 s in town its next terms are decimetres.
 """
 
 import numpy as np
@@ -26,10 +26,10 @@ def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, squa
     """
     Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
 
-    t, place, velocity : (n,) s, (n, 3) m and m/s, rising, with cubics in between.
+    t, place, velocity : (n,) s, rising, (n, 3) m and m/s of the antenna, with cubics in between.
     at : (k,) s, stamps minus the mean age of the content of a fix.   square : s^2, as above.
     """
-    def off(square: float) -> Floats:
+    def error(square: float) -> Floats:
         if square > 0:
             track, tau = _Track(t, place, velocity), np.sqrt(square)
             return track.smoothed(at + tau, tau) - track.at(at)
@@ -37,11 +37,11 @@ def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, squa
 
     if abs(square) <= LEAST_LAG2:
         least = -LEAST_LAG2 if square < 0 else LEAST_LAG2
-        rate = off(least) / least
+        rate = error(least) / least
         return rate * square, rate
-    here = off(square)
+    value = error(square)
     lag2_step = 1e-4    # relative, of the difference that gives a derivative
-    return here, (off(square * (1 + lag2_step)) - here) / (square * lag2_step)
+    return value, (error(square * (1 + lag2_step)) - value) / (square * lag2_step)
 
 
 def _cubic_coefficients(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats,
@@ -102,34 +102,35 @@ class _Track:
         first = tau**2 * (2 * bend - 6 * tau * twist)
         last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
         decay = np.append(-np.exp(-T[:-1, 0] / tau), 0.0)
-        left = solve_banded((1, 0), np.stack([np.ones_like(decay), decay]),
-                            np.concatenate([-first[:1], last[:-1] - first[1:]]))
+        transient = solve_banded((1, 0), np.stack([np.ones_like(decay), decay]),
+                                 np.concatenate([-first[:1], last[:-1] - first[1:]]))
         k, s, p = self._cubic(at)
         rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
-        after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
-        out: Floats = after + left[k] * np.exp(-np.maximum(s, 0.0) / tau)
-        return out
+        steady = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
+        mean: Floats = steady + transient[k] * np.exp(-np.maximum(s, 0.0) / tau)
+        return mean
 
 
 def _tracking_error(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
     """Return the error at ``at`` of a filter of position and velocity, (k, 3)."""
     T, bend, twist = _cubic_coefficients(t, place, velocity)
 
-    def forced(k: Ints | slice, s: Floats) -> Floats:
+    def forced_response(k: Ints | slice, s: Floats) -> Floats:
+        """Return error and derivative on cubics k at times s in them, without transients."""
         jerk = 6 * twist[k]
         return tau**2 * np.stack([np.sqrt(2) * tau * jerk - 2 * bend[k] - jerk * s, -jerk], 1)
 
-    swing = _transition_matrices(np.append(0.0, T[:-1, 0]), tau)
-    first, last = forced(slice(None), np.zeros_like(T)), forced(slice(None), T)
-    left = -first
-    left[1:] += last[:-1]       # error and its derivative are continuous where two cubics meet
+    transition = _transition_matrices(np.append(0.0, T[:-1, 0]), tau)
+    first, last = forced_response(slice(None), np.zeros_like(T)), forced_response(slice(None), T)
+    transient = -first
+    transient[1:] += last[:-1]       # error and derivative are continuous where two cubics meet
     for m in range(1, len(T)):
-        left[m] += swing[m] @ left[m - 1]
+        transient[m] += transition[m] @ transient[m - 1]
     k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
     s = (at - t[k])[:, None]
-    off: Floats = forced(k, s)[:, 0] + np.einsum(
-        'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], left[k])
-    return off
+    error: Floats = forced_response(k, s)[:, 0] + np.einsum(
+        'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], transient[k])
+    return error
 
 
 def _transition_matrices(s: Floats, tau: float) -> Floats:

@@ -35,17 +35,17 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
         return np.empty((0, 2))
     edges = np.linspace(t0, t1, max(2, round((t1 - t0) / REST_GRID)) + 1)
     middle = (edges[:-1] + edges[1:]) / 2
-    rate, steady = _gyro(edges, t_imu, w_b)
-    quiet = _still_wheels(middle, travel, metres_per_unit) & steady
-    quiet &= _not_turning(rate, quiet, edges, shortest)
-    spans = _spans(quiet, edges, shortest)
+    rate, steady = _steady_rates(edges, t_imu, w_b)
+    at_rest = _still_wheels(middle, travel, metres_per_unit) & steady
+    at_rest &= _not_turning(rate, at_rest, edges, shortest)
+    spans = _spans(at_rest, edges, shortest)
     moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
-    allowed = _allowed(travel, metres_per_unit)
-    creep_speed = 0.02    # m/s, largest mean speed of a long standstill
-    return spans[moved <= creep_speed * (spans[:, 1] - spans[:, 0]) + allowed]
+    speed_limit = 0.02    # m/s, largest mean speed of a long standstill
+    return spans[moved <= speed_limit * (spans[:, 1] - spans[:, 0])
+                 + _travel_limit(travel, metres_per_unit)]
 
 
-def _allowed(travel: Travel, metres_per_unit: float) -> float:
+def _travel_limit(travel: Travel, metres_per_unit: float) -> float:
     """Return the largest travel at rest, m: REST_TRAVEL, or the jitter of counts."""
     count = travel.quantum * metres_per_unit
     coarse_count = 0.5    # m, larger counts are coarse
@@ -53,43 +53,44 @@ def _allowed(travel: Travel, metres_per_unit: float) -> float:
     return max(REST_TRAVEL, (1.5 if count <= coarse_count else 0.5) * count)
 
 
-def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
-    """Return begin and end of the runs of quiet cells of ``shortest`` s or more: (k, 2)."""
-    spans: Floats = edges[runs(quiet)]
+def _spans(at_rest: Bools, edges: Floats, shortest: float) -> Floats:
+    """Return begin and end of the runs of cells at rest of ``shortest`` s or more: (k, 2)."""
+    spans: Floats = edges[runs(at_rest)]
     return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
+    """Return a mask of cells, by their middles, with little travel around them: (m,)."""
     # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
-    reach = np.max(probes, axis=0) - np.min(probes, axis=0)
-    still: Bools = reach * metres_per_unit <= _allowed(travel, metres_per_unit)
+    distance = np.max(probes, axis=0) - np.min(probes, axis=0)
+    still: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
     return still
 
 
-def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
-    """Return the mean turn rate around each cell, (m, 3), and a mask of spread < REST_TURN."""
+def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
+    """Return the mean turn rate around each cell, (m, 3), and a mask of scatter < REST_TURN."""
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
     reach = round(REST_WINDOW / REST_GRID)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
-    beside = [padded[k:k + len(rate)] for k in range(2 * reach + 1)]
-    mean = reduce(np.add, beside) / len(beside)
-    spread = np.sqrt(reduce(np.add, [(x - mean)**2 for x in beside]) / len(beside))
-    seen = np.ones(len(rate), bool)
+    shifted = [padded[k:k + len(rate)] for k in range(2 * reach + 1)]
+    mean = reduce(np.add, shifted) / len(shifted)
+    scatter = np.sqrt(reduce(np.add, [(x - mean)**2 for x in shifted]) / len(shifted))
+    has_data = np.ones(len(rate), bool)
     if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
         dt = np.diff(t_imu)
-        unseen = running_sum(np.where(dt > REST_WINDOW, dt, 0.0))
-        seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # no data within a gap
-    return mean, reduce_columns(np.logical_and, spread < REST_TURN) & seen
+        time_in_gaps = running_sum(np.where(dt > REST_WINDOW, dt, 0.0))
+        has_data = np.diff(np.interp(edges, t_imu, time_in_gaps)) == 0
+    return mean, reduce_columns(np.logical_and, scatter < REST_TURN) & has_data
 
 
-def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
-    """Return a mask of windows with the lowest steady turn rate, which is the bias at rest."""
-    means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
-             for a, b in _spans(quiet, edges, shortest)]
-    if not means:
-        return quiet
-    rest = min(means, key=np.linalg.norm)
-    if np.abs(rest).max() > MOST_BIAS:
-        return np.zeros_like(quiet)
-    return reduce_columns(np.logical_and, np.abs(rate - rest) < REST_TURN)
+def _not_turning(rate: Floats, at_rest: Bools, edges: Floats, shortest: float) -> Bools:
+    """Return a mask of cells with the lowest steady turn rate, which is the bias at rest."""
+    medians = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
+               for a, b in _spans(at_rest, edges, shortest)]
+    if not medians:
+        return at_rest
+    bias = min(medians, key=np.linalg.norm)
+    if np.abs(bias).max() > MOST_BIAS:
+        return np.zeros_like(at_rest)
+    return reduce_columns(np.logical_and, np.abs(rate - bias) < REST_TURN)
