@@ -13,7 +13,7 @@ on the ellipsoid.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import chunks, Floats, running_sum, work_array
 from odocal_ros.nav import geodesy
@@ -31,14 +31,14 @@ FOLDED = 1.3
 @dataclass(frozen=True, eq=False)
 class Origin:
     """
-    Origin of n: geodetic position, rad, rad, m.
+    Origin of n, a geodetic position.
 
     local : the Earth rate of a local frame, whose y axis does not point to north; None: it does.
     """
 
-    latitude: float
-    longitude: float
-    height: float
+    latitude: float     # rad
+    longitude: float    # rad
+    height: float       # m, ellipsoidal
     local: geodesy.PartlyKnownRate | None = None
 
     @property
@@ -49,13 +49,13 @@ class Origin:
     def to_n(self, geodetic: Floats) -> Floats:
         """Return positions in n, m, from (..., 3) latitude, longitude (rad), height (m)."""
         r_e = geodesy.ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
-        own_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
-        return (r_e - own_e) @ geodesy.C_en(self.latitude, self.longitude)
+        origin_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        return (r_e - origin_e) @ geodesy.C_en(self.latitude, self.longitude)
 
     def to_geodetic(self, position_n: Floats) -> Floats:
         """Return (..., 3) latitude, longitude (rad), height (m) from positions in n, m."""
-        own_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
-        r_e = own_e + position_n @ geodesy.C_en(self.latitude, self.longitude).T
+        origin_e = geodesy.ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        r_e = origin_e + position_n @ geodesy.C_en(self.latitude, self.longitude).T
         return np.stack(geodesy.geodetic_from_ecef(r_e), -1)
 
 
@@ -63,10 +63,10 @@ class Origin:
 class Track:
     """A dead-reckoned leg, before scale and forward axis are chosen."""
 
-    t: NDArray[np.float64]       # (m,) s, epochs
-    q_nb: NDArray[np.float64]    # (m, 4) attitude there
-    s: NDArray[np.float64]       # (m,) travel, scale units
-    P: NDArray[np.float64]       # (m, 3, 3) sum of C_nb over travel from the first epoch
+    t: Floats       # (m,) s, epochs
+    q_nb: Floats    # (m, 4) x y z w, attitude there
+    s: Floats       # (m,) travel, scale units
+    P: Floats       # (m, 3, 3) scale units, sum of C_nb over travel from the first epoch
 
     def at(self, t: float | Floats) -> Floats:
         """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""
@@ -76,11 +76,11 @@ class Track:
         least_epoch_step = 1e-9    # s, shorter than any step
         step = np.maximum(self.t[after] - self.t[k], least_epoch_step)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
-        before, beyond = self.P.take(k, axis=0), self.P.take(after, axis=0)
-        before *= 1 - x
-        beyond *= x
-        before += beyond
-        return before
+        P, P_after = self.P.take(k, axis=0), self.P.take(after, axis=0)
+        P *= 1 - x
+        P_after *= x
+        P += P_after
+        return P
 
     def C_nb_at(self, t: float | Floats) -> Floats:
         """Return attitude at the epoch nearest to t: (...) to (..., 3, 3)."""
@@ -112,8 +112,8 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
     """Return yaw and pitch mounting, rad, of an axis in b; backwards: yaw of pi (T5)."""
     d_b = np.asarray(d_b, dtype=float)
     x, y, z = d_b[..., 0], d_b[..., 1], d_b[..., 2]
-    side = np.where(x < 0, -1.0, 1.0)
-    return np.arctan2(-y, side * np.hypot(x, z)), np.arctan2(side * z, side * x)
+    sign = np.where(x < 0, -1.0, 1.0)
+    return np.arctan2(-y, sign * np.hypot(x, z)), np.arctan2(sign * z, sign * x)
 
 
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
@@ -152,9 +152,9 @@ def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | N
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
         chord = np.hypot(*np.diff(p[k], axis=0).T)
         run = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
-        onward = run > 0
-        if onward.any() and np.median(chord[onward]) >= least:
-            return float(np.median(chord[onward] / run[onward]))
+        moves = run > 0
+        if moves.any() and np.median(chord[moves]) >= least:
+            return float(np.median(chord[moves] / run[moves]))
         pieces //= 2
     return None
 

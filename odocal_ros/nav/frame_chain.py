@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Position of one frame in another, through the frames between them, as tf2 computes it."""
+"""
+Positions of one TF frame in another, through the frames between them, as tf2 computes them.
+
+Transforms are fed in order of arrival; positions are available once all transforms are known.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -59,7 +63,7 @@ class FrameChain:
         self._static: dict[str, tuple[str, Values]] = {}
         self._path: list[str] | None = None      # children, from the parent downwards
         self._last: Values | None = None         # of the moving frame next to the parent
-        self._done: list[StampedPositions] = []             # before the stamps started again
+        self._computed: list[StampedPositions] = []    # not yet popped
 
     def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
             ) -> None:
@@ -69,12 +73,12 @@ class FrameChain:
             if edge.parent != parent:
                 return
             if stamp_ns < edge.newest_ns - RESTART_NS:
-                self._done.append(self._compute_positions())
+                self._computed.append(self._compute_positions())
                 for other in self._moving.values():
                     other.drop_oldest(len(other.stamps))
                     other.newest_ns = -1
             if len(edge.stamps) == MOST_WAITING:
-                self._done.append(self._compute_positions())
+                self._computed.append(self._compute_positions())
                 edge.drop_oldest(len(edge.stamps) - MOST_WAITING + 1)
             edge.add(stamp_ns, received_ns, values)
 
@@ -107,8 +111,8 @@ class FrameChain:
 
     def pop_positions(self) -> StampedPositions:
         """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
-        done, self._done = [*self._done, self._compute_positions()], []
-        stamps, received, position = (np.concatenate(some) for some in zip(*done, strict=True))
+        found, self._computed = [*self._computed, self._compute_positions()], []
+        stamps, received, position = (np.concatenate(some) for some in zip(*found, strict=True))
         return stamps, received, position
 
     def _compute_positions(self) -> StampedPositions:
@@ -121,13 +125,14 @@ class FrameChain:
             self._path = path
             self._moving = {name: e for name, e in self._moving.items() if name in path}
         first, *others = (self._moving[name] for name in self._path if name in self._moving)
+        # rows of the first moving frame up to the newest stamp of all others
         known_ns = min((edge.newest_ns for edge in others), default=first.newest_ns)
         n = int(np.searchsorted(first.stamps, known_ns, side='right'))
         if not n:
             return nothing
         stamps, received = np.array(first.stamps[:n]), np.array(first.received[:n])
         position, good = np.zeros((n, 3)), np.ones(n, bool)
-        if others:
+        if others:      # a repeated correction gives no position
             before = [self._last or first.values[0], *first.values]
             good = np.array([a != b for a, b in zip(before, first.values[:n], strict=False)])
             self._last = first.values[n - 1]
@@ -152,13 +157,13 @@ def _interpolate(edge: _MovingFrame, stamps: Ints) -> tuple[Floats, Bools]:
     good = before >= 0
     before = np.maximum(before, 0)
     after = np.minimum(before + 1, len(t) - 1)
-    step, past = t[after] - t[before], stamps - t[before]
-    good &= (past == 0) | (step <= LONGEST_STEP_NS) & (past <= step)
-    share = (past / np.maximum(step, 1))[:, None]
+    step, elapsed = t[after] - t[before], stamps - t[before]
+    good &= (elapsed == 0) | (step <= LONGEST_STEP_NS) & (elapsed <= step)
+    share = (elapsed / np.maximum(step, 1))[:, None]
     a, b = values[before], values[after].copy()
     # q and -q are the same rotation. Not slerp: the direction differs by less than angle^3 / 100
-    turned = a[:, 3] * b[:, 3] + a[:, 4] * b[:, 4] + a[:, 5] * b[:, 5] + a[:, 6] * b[:, 6] < 0
-    b[turned, 3:] = -b[turned, 3:]
+    opposite = a[:, 3] * b[:, 3] + a[:, 4] * b[:, 4] + a[:, 5] * b[:, 5] + a[:, 6] * b[:, 6] < 0
+    b[opposite, 3:] = -b[opposite, 3:]
     return a + share * (b - a), good
 
 
@@ -174,6 +179,6 @@ def _to_parent_frame(values: Floats, position: Floats) -> Floats:
     with np.errstate(invalid='ignore', divide='ignore'):     # a quaternion of zeros: NaN
         twice = 2 / (x * x + y * y + z * z + w * w)
         d, e, f = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-        turned: Floats = np.stack([a + twice * (y * f - z * e), b + twice * (z * d - x * f),
-                                   c + twice * (x * e - y * d)], -1)
-    return values[:, :3] + turned
+        rotated: Floats = np.stack([a + twice * (y * f - z * e), b + twice * (z * d - x * f),
+                                    c + twice * (x * e - y * d)], -1)
+    return values[:, :3] + rotated

@@ -137,10 +137,10 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     with np.errstate(invalid='ignore'):      # a signalling NaN
         near = np.all(np.abs(position) <= LARGEST_FRAME, axis=1)[:, None]
     x, y, z = np.where(near, position, np.nan).T
-    own_e = ecef_from_geodetic(latitude, FRAME_LONGITUDE, 0.0)
+    origin_e = ecef_from_geodetic(latitude, FRAME_LONGITUDE, 0.0)
     # no matrix product: its last bits depend on the number of rows, so replay would differ
-    r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
-        own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
+    r_e = np.stack([origin + a * x + b * y + c * z for origin, (a, b, c) in zip(
+        origin_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
     lat, longitude, height = geodetic_from_ecef(r_e.T)
     return lat, longitude, np.where(z == 0, np.nan, height)
 
@@ -149,16 +149,16 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
     """Return a function that makes fixes from stamps, arrivals, positions and covariances."""
     def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
         n = len(stamps)
-        known = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
-        given = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
+        kind = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
+        covariance_n = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
         return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
-                          given, known, np.full(n, LOCAL))
+                          covariance_n, kind, np.full(n, LOCAL))
     return build
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A transverse Mercator plane."""
+    """A transverse Mercator plane, for the chord of the two-point method."""
 
     central_meridian: float     # deg
     scale: float = 1.0          # on the central meridian

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, running_sum, runs, Values
 from odocal_ros.data.samples import OdometerForm
@@ -16,7 +15,7 @@ from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is not motion
 RESET_FACTOR = 5.0
-# s to each side of a row. Judgement: in which a vehicle accelerates evenly
+# s to each side of a row for smoothing. Judgement: in which a vehicle accelerates evenly
 SMOOTHED = 0.2
 FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
 
@@ -25,12 +24,12 @@ FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets
 class Travel:
     """Travel of the odometer's measuring point, in scale units: pulses, rad or configured m."""
 
-    t: NDArray[np.float64]    # (n,) s since the start mark, rising
-    s: NDArray[np.float64]    # (n,) signed travel from the first row
-    quantum: float            # size of one count in s, 0 for speeds and floats
+    t: Floats         # (n,) s since the start mark, rising
+    s: Floats         # (n,) signed travel from the first row
+    quantum: float    # size of one count, scale units; 0 for speeds and floats
     coarse: CoarseSpeed | None = None    # measured speeds, if on a grid and of one wheel
-    name: str = ''            # of the wheel, '' for a single one or a mean
-    ahead: float = 0.0        # of a steered wheel, from the axle that does not steer; else 0
+    name: str = ''         # of the wheel, '' for a single one or a mean
+    ahead: float = 0.0     # m, of a steered wheel from the axle that does not steer; else 0
 
     def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""
@@ -48,6 +47,7 @@ class Travel:
         m = int(SMOOTHED / step)        # rows to each side
         if m < 2 or len(self.t) <= 2 * m:
             return self
+        # parabola by least squares at its middle (Savitzky and Golay 1964)
         weights = 3.0 * (3 * m**2 + 3 * m - 1 - 5 * np.arange(-m, m + 1)**2)
         even = self.t[2 * m:] - self.t[:-2 * m] < 3 * m * step      # longer by half: a gap
         t, s = (np.concatenate([x[:m], np.where(even, np.convolve(
@@ -162,25 +162,26 @@ def _find_resets(t: Floats, step: Floats, whole: bool) -> Bools:
     if len(step) < FEWEST_STEPS or not step.any():
         return np.zeros(len(step), bool)
     usual = np.median(dt)
-    size = np.abs(step) / np.maximum(dt, usual)    # for bursts of stamps
-    if not (size > 0).any():       # steps so small that their rates are zero
+    rate = np.abs(step) / np.maximum(dt, usual)    # for bursts of stamps
+    if not (rate > 0).any():       # steps so small that their rates are zero
         return np.zeros(len(step), bool)
-    limit = RESET_FACTOR * np.percentile(size[size > 0], 95)
-    far = size > (max(limit, 3 / usual) if whole else limit)
+    limit = RESET_FACTOR * np.percentile(rate[rate > 0], 95)
+    resets = rate > (max(limit, 3 / usual) if whole else limit)
     # motion has long runs, even if the vehicle is mostly at rest; a reset or a false row has not
-    for begin, end in runs(far):
+    for begin, end in runs(resets):
         if end - begin > 2:
-            far[begin:end] = False
-    return far
+            resets[begin:end] = False
+    return resets
 
 
 def _bridge_resets(t: Floats, step: Floats, resets: Bools) -> Floats:
+    """Return the steps with those of resets replaced by the speed beside them: (n - 1,)."""
     dt = np.diff(t)
     step = step.copy()
     good = np.flatnonzero(~resets & (dt > 0))
     if len(good):
         bad = np.flatnonzero(resets)
-        rate = step[good] / np.maximum(dt[good], np.median(dt))    # as in _resets
+        rate = step[good] / np.maximum(dt[good], np.median(dt))    # as in _find_resets
         step[bad] = np.interp(bad, good, rate) * dt[bad]
     else:
         step[resets] = 0.0

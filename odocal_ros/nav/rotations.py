@@ -130,12 +130,13 @@ def quat_conjugate(q: ArrayLike) -> Floats:
 
 
 def quat_at(t_new: Floats, t: Floats, q: Floats) -> Floats:
-    """Return attitudes (k, 4) at times by (m, 4) rows with small rotations; constant outside."""
-    sides = np.einsum('ki,ki->k', q[1:], q[:-1])
-    q = q * np.cumprod(np.append(1.0, np.where(sides < 0, -1.0, 1.0)))[:, None]
-    found: Floats = np.stack([np.interp(t_new, t, column) for column in q.T], -1)
-    found /= np.linalg.norm(found, axis=-1)[..., None]
-    return found
+    """Return attitudes (k, 4) at t_new, linear between rows t (m,), q (m, 4); constant outside."""
+    # q and -q are the same rotation: signs that are equal in adjacent rows
+    products = np.einsum('ki,ki->k', q[1:], q[:-1])
+    q = q * np.cumprod(np.append(1.0, np.where(products < 0, -1.0, 1.0)))[:, None]
+    out: Floats = np.stack([np.interp(t_new, t, column) for column in q.T], -1)
+    out /= np.linalg.norm(out, axis=-1)[..., None]
+    return out
 
 
 def matrix_from_quat(q: ArrayLike) -> Floats:

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Strapdown attitude: gyro rates to q_nb, as a blocked prefix product of quaternions.
+Strapdown attitude: turn rates of the gyro to attitudes q_nb.
 
 n is fixed to the Earth at the leg's start, so there is no transport rate; the Earth's rotation is
-one closed-form rotation per output epoch, and the product of body increments is a prefix scan
-without any per-sample loop.
+one closed-form rotation per epoch. The product of the body increments is a prefix scan: products
+of blocks in parallel, then of the ends of blocks, without a loop over samples.
 """
 
 import numpy as np
@@ -75,13 +75,13 @@ def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """
     safe = np.maximum(h, LEAST_INTERVAL)
     curve = np.diff(rise / safe) / (safe[:-1] + safe[1:])       # half the second derivative
-    before, own, after = safe[:-2], safe[1:-1], safe[2:]
-    even = ((EVEN_RATIO * before > own) & (before < EVEN_RATIO * own)
-            & (EVEN_RATIO * after > own) & (after < EVEN_RATIO * own))
-    weight = np.where(even, own**2 / 4 / (before + own + after), 0.0)
+    before, step, after = safe[:-2], safe[1:-1], safe[2:]
+    even = ((EVEN_RATIO * before > step) & (before < EVEN_RATIO * step)
+            & (EVEN_RATIO * after > step) & (after < EVEN_RATIO * step))
+    weight = np.where(even, step**2 / 4 / (before + step + after), 0.0)
     left, right = curve[:, :-1], curve[:, 1:]
-    bow = left * (weight * (own / 2 + after)) + right * (weight * (own / 2 + before))
-    return bow, (right - left) * (weight * own)
+    bow = left * (weight * (step / 2 + after)) + right * (weight * (step / 2 + before))
+    return bow, (right - left) * (weight * step)
 
 
 def _pairs_from_rotvec(phi: Floats) -> Pairs:
@@ -117,6 +117,7 @@ def prefix_product(q: Floats) -> Floats:
 
 
 def _scan(a: Complexes, b: Complexes) -> Pairs:
+    """Return the prefix products of n quaternions, by blocks; the ends of blocks recursively."""
     n = len(a)
     if n <= 2:
         if n == 2:
@@ -127,8 +128,7 @@ def _scan(a: Complexes, b: Complexes) -> Pairs:
     rows = -(-n // width)
     A, B = np.ones((rows * width), complex), np.zeros((rows * width), complex)
     A[:n], B[:n] = a, b
-    A, B = np.ascontiguousarray(A.reshape(rows, width).T), \
-        np.ascontiguousarray(B.reshape(rows, width).T)
+    A, B = (np.ascontiguousarray(x.reshape(rows, width).T) for x in (A, B))
     for k in range(1, width):
         A[k], B[k] = _times(A[k - 1], B[k - 1], A[k], B[k])
     if rows > 1:

@@ -65,6 +65,7 @@ def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Fl
 
 def _at(times: Sequence[Floats], t: Floats, x: Floats,
         over: Callable[[Floats, Floats], Floats]) -> list[Floats]:
+    """Return an integral of x at times; over : integral at the rows of consecutive pieces."""
     found = [np.empty((len(each), *x.shape[1:])) for each in times]
     for parts in zip(*(enclosing_slices(each, t) for each in times), strict=True):
         rows = parts[0][1]
@@ -105,12 +106,12 @@ def gaps_in_rhythm(t: Floats) -> Floats:
 
 
 def fit_robust_line(t: Floats, y: Floats) -> tuple[float, float]:
-    """Return value at the first time and slope of a line through points, by medians."""
+    """Return value at the first time and slope of a line through points, (n,), by medians."""
     if len(t) < 3:
         return float(np.median(y)), 0.0
     i, j = np.triu_indices(min(len(t), 400), 1)
     pick = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
     dt = t[pick][j] - t[pick][i]
-    far = dt > (t[-1] - t[0]) / 4
-    slope = float(np.median((y[pick][j] - y[pick][i])[far] / dt[far]))
+    is_long = dt > (t[-1] - t[0]) / 4
+    slope = float(np.median((y[pick][j] - y[pick][i])[is_long] / dt[is_long]))
     return float(np.median(y - slope * (t - t[0]))), slope
