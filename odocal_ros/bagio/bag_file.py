@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Base class of the files of a bag: their topics, and their messages as CDR in order of time.
-
-Subclasses read mcap (``mcap_file``), sqlite3 (``sqlite_file``) and rosbag1 (``rosbags_readers``).
-"""
+"""Base class of the files of a bag (mcap, sqlite3, rosbag1): topics, and messages as CDR."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -71,8 +67,7 @@ class Channel:
     definition: tuple[str, str] = ('', '')
 
 
-# topic -> bag times and messages, in order of time
-Batch = dict[str, tuple[Ints, RawMessages]]
+Batch = dict[str, tuple[Ints, RawMessages]]  # topic -> bag times and messages, in order of time
 
 
 class BagFile:
@@ -103,10 +98,9 @@ class BagFile:
         """Yield the same one by one in order of time, for merging; slower."""
         channels = {c.topic: c for c in self.channels}
         for batch in self.batches(topics):
-            lists = ([(time_ns, i, channels[topic], raw) for i, (time_ns, raw) in enumerate(
-                zip(times.tolist(), raws, strict=True))] for topic, (times, raws) in batch.items())
-            for time_ns, _, channel, raw in heapq.merge(*lists, key=itemgetter(0)):
-                yield channel, time_ns, raw
+            lists = ([(channels[topic], time_ns, raw) for time_ns, raw in zip(
+                times.tolist(), raws, strict=True)] for topic, (times, raws) in batch.items())
+            yield from heapq.merge(*lists, key=itemgetter(1))
 
     def _decompressed(self, raw: bytes) -> bytes:
         """Return a message decompressed, b'' if it is damaged: readers count it as unreadable."""

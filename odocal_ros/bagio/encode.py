@@ -20,8 +20,7 @@ from odocal_ros.data import samples as data
 from odocal_ros.data.arrays import Floats
 from odocal_ros.messages import cdr
 
-# types that are written, but not read as columns
-SCHEMAS = cdr.SCHEMAS | {
+SCHEMAS = cdr.SCHEMAS | {      # types that are written, but not read as columns
     'sensor_msgs/msg/FluidPressure': (
         *cdr.HEADER, 'float64 fluid_pressure', 'float64 variance')}
 # a column of all messages, or a function that returns the values of a slice of them

@@ -4,8 +4,7 @@
 """
 Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and synced to the disk.
 
-A ``PackedChunk`` has the bytes of the file, so that joining files copies chunks without packing
-them again.
+A ``PackedChunk`` has the bytes of the file: files are joined by copying chunks.
 """
 
 from collections import Counter

@@ -132,8 +132,7 @@ class Bag:
             if progress:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
-        # reading finds damaged chunks
-        _check_has_messages(self.name, self._source, self._parts)
+        _check_has_messages(self.name, self._source, self._parts)  # reading finds damaged chunks
         for topic, reader in readers.items():
             self._add_notes(topic, reader, used[topic])
 
@@ -268,12 +267,10 @@ def bag_sha256(bag: Bag) -> str:
 
     For one file it is that of sha256sum; for several files that of sha256sum's output for them.
     """
-    sums = [(_file_sha256(path), path.name) for path in bag.files]
+    sums = []
+    for path in bag.files:
+        with path.open('rb') as file:
+            sums.append((hashlib.file_digest(file, 'sha256').hexdigest(), path.name))
     if len(sums) == 1:
         return sums[0][0]
     return hashlib.sha256(''.join(f'{d}  {name}\n' for d, name in sums).encode()).hexdigest()
-
-
-def _file_sha256(path: Path) -> str:
-    with path.open('rb') as file:
-        return hashlib.file_digest(file, 'sha256').hexdigest()

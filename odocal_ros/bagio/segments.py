@@ -100,8 +100,7 @@ class SegmentedBag:
         """
         Join all segments into one file and write metadata.yaml; return the file.
 
-        If ``room``, in bytes, or the disk is too small for the copy, the segments remain the
-        files of the bag.
+        If ``room``, bytes, or the disk is too small for the copy, the segments remain.
         """
         if room is None or self.size <= room:
             try:

@@ -21,8 +21,7 @@ from odocal_ros.errors import BadBag
 from odocal_ros.safe_io.limits import Allowance, Damaged, limit_factor, MESSAGE_BYTES
 
 LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
-# format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
-COLUMNS = 4
+COLUMNS = 4      # format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
 # format: bytes of an integer, by the type code in a row
 INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}

@@ -51,9 +51,8 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     """
     Write topics as one bag, messages in order of bag time; return its path.
 
-    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` is called with
-    the share written. The bag gets its name only when it is complete; ``force`` replaces an
-    existing one.
+    storage : mcap or sqlite3, a rosbag2 folder; rosbag1, a file.   progress : called with the
+    share written.   force : replace an existing bag. Only a complete bag gets its name.
 
     Raises BadUsage: the path exists and ``force`` is not set; its folder cannot be written; an
     unknown storage or a compression the storage does not have.

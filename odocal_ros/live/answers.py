@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Texts for the operator: the hint (next action) of the status, and the answers of the services.
-
-Each function takes a ``SessionView``, the snapshot of the node, and only returns text or numbers.
-"""
+"""Texts for the operator, from a view: the hint (next action), and the answers of services."""
 
 from collections.abc import Iterable, Sequence
 
@@ -61,8 +57,7 @@ def provisional_answer(at_stop: SessionView) -> str:
     """
     Return the answer that a leg is being computed, with its running estimate.
 
-    at_stop : view just before the stop mark.   The word *provisional* takes the place of the
-    verdict in the final answer.
+    at_stop : view just before the stop mark. The answer has no verdict but *provisional*.
     """
     session, forecast = at_stop.session, at_stop.forecast
     known = forecast.estimates if forecast else {}

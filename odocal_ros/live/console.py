@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Console log of a node: missing inputs, readiness, problems of the leg, lost messages.
-
-Each text is logged when it is new; missing inputs are repeated at growing intervals.
-"""
+"""Console log of a node: missing inputs (repeated), readiness, problems of the leg, losses."""
 
 import re
 from typing import Any
@@ -17,8 +13,7 @@ from odocal_ros.safe_io.text_formats import brief_line
 
 # judgement: delay of the first log of missing inputs, and longest interval of its repetitions
 SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
-# judgement: growth of a count of lost messages after which it is reported again
-LOSS_FACTOR = 10
+LOSS_FACTOR = 10  # judgement: growth of a count of lost messages after which it is reported again
 NUMBER = re.compile(r'\d+')
 
 

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The node that drives a robot along a pattern for a calibration, from ``~/start`` to a stop.
-
-``pattern.py`` computes route, commands and stop conditions; this module receives poses and sends
-commands. At every stop it sends zero commands for a second.
-"""
+"""The node that drives a robot along a pattern (``pattern.py``) by velocity commands."""
 
 from functools import partial
 import math

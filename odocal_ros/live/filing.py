@@ -4,8 +4,7 @@
 """
 Result folders of a node: writing, the link ``latest``, and removal of old automatic results.
 
-``Filing`` writes in the worker's thread and answers by a future; ``ResultFolders`` decides which
-folder ``latest`` points to.
+``Filing`` writes in the worker's thread; ``ResultFolders`` decides where ``latest`` points to.
 """
 
 from collections.abc import Callable
@@ -39,8 +38,6 @@ RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # 
 
 @dataclass(frozen=True)
 class WrittenResult:
-    """A result folder that this node has written."""
-
     folder: Path
     last_ns: int     # start of its last leg
     before: str      # earlier target of ``latest``, empty without one
@@ -173,8 +170,7 @@ class Filing:
         """
         Write the result files in the worker; the future has (success, text).
 
-        by_operator : requested by the operator; ``latest`` moves to a worse result only at the
-        second request.
+        by_operator : requested by ~/save: the second request moves ``latest`` to a worse result.
         """
         future = Future()
         self._saves_running += 1

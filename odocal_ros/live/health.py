@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Health of one topic, from the stamps and sequence numbers of its messages; without ROS.
-
-Counts messages, gaps and losses, estimates rate and delay, and detects implausible stamps and a
-restart of time (a bag that is played again, a clock that was set).
-"""
+"""Health of one topic from stamps and sequence numbers: rate, losses, gaps, jumps of time."""
 
 from collections import deque
 from collections.abc import Sequence

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The journal of one leg: a bag that is written while the leg is driven, by the journal's thread.
-
-Old journals are deleted if all of them together would exceed the limit of the folder.
-"""
+"""The journal of one leg, a bag written while it is driven; the oldest journals are deleted."""
 
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The thread of the journal: packs received messages into chunks of mcap, and writes legs.
-
-Packed chunks of the last seconds are kept as the pre-roll of the next leg.
-"""
+"""The thread of the journal: packs messages into chunks of mcap, keeps pre-roll, writes legs."""
 
 from collections import deque
 from collections.abc import Callable

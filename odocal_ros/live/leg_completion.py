@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A leg from its start mark to the answer: record, close, compute, combine with others, save.
-
-``operation.py`` adds automatic legs and the commands of the operator.
-"""
+"""A leg from its start mark to the answer: record, close, compute, combine with others, save."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

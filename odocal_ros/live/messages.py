@@ -7,8 +7,7 @@ Message classes by name with their definitions, and queues of serialised message
 Waking the executor for every message is nine tenths of a node's CPU load at 1 kHz. Messages
 therefore stay in the middleware's queue: the executor skips the subscription, and ``take`` reads
 the queue by ``take_message`` of rclpy's handle, as the executor itself does. This method is
-undocumented: if it is missing or behaves differently, the executor takes the messages from then
-on, at a higher CPU load.
+undocumented: if it is missing or fails, the executor takes the messages, at a higher CPU load.
 """
 
 import importlib
@@ -57,8 +56,7 @@ def definition_of(kind: type) -> str:
     """
     Return the definition of a message class for a bag: its .msg text and those of its fields.
 
-    Constants and defaults are missing, as in the classes; serialised messages do not depend on
-    them.
+    Constants and defaults are missing: the classes have none, and no message depends on them.
     """
     texts: dict[str, str] = {}
     _collect(kind, '', texts)
@@ -105,8 +103,7 @@ class WaitingMessages:
     """
     The messages of one topic that were not taken yet, in order of arrival.
 
-    In simulated time the send time of a message is that of the node's clock on its arrival, so the
-    executor must take it at once.
+    In simulated time the node's clock gives the send time, so that the executor takes messages.
     """
 
     def __init__(self, node: Node) -> None:
@@ -150,8 +147,7 @@ class WaitingMessages:
                 [info['publication_sequence_number'] for info in infos])
 
     def _fetch(self, subscription: Subscription) -> None:
-        # all of the queue: the executor takes one message of a topic at a time, and under load
-        # the IMU would lag most
+        # all of the queue: one message at a time, as by the executor, would delay the IMU
         handle, kind = subscription.handle, subscription.msg_type
         with handle:
             for _ in range(self._queue_depth):

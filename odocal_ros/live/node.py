@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The calibration node: services, parameters and a timer around ``Operation``.
-
-Five times a second the timer decodes the received messages, handles finished computations and
-publishes the status. A leg is computed after ``~/stop_leg``.
-"""
+"""The calibration node: services, parameters, and a timer that runs everything."""
 
 from collections.abc import Callable
 from functools import partial

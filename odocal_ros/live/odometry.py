@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The node that applies a calibration: dead reckoning from odometer and IMU, published as odometry.
-
-``apply/odometry.py`` computes the poses. This module feeds it with messages, in the order that it
-needs, and publishes as soon as a pose can be computed.
-"""
+"""The node that applies a calibration: odometer and IMU in, odometry with covariance out."""
 
 from collections.abc import Callable
 from functools import partial

@@ -22,8 +22,7 @@ from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITH
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: standstill before a mark, s. Its positions extend WITHIN s before and after it; 0.5 s
-# more are for the odometer's delay
+# judgement: standstill before a mark, s: its positions extend WITHIN to both sides, delay 0.5 s
 MARK_STILL_S = 2 * WITHIN + 0.5
 
 
@@ -100,19 +99,17 @@ class AutomaticLegs(LegCompletion):
         """End the leg, by service or at its longest duration, as a leg of the operator."""
         self.session.is_automatic = False
         super().end_leg_now()
-        self._restart_search(self.session.stop_ns, at_rest=False)
+        if self._search is not None:
+            self._search.restart(self.session.stop_ns, at_rest=False)
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         super()._drop_leg(text, lost)
-        self._restart_search(self._recording.newest_ns, at_rest=True)
+        if self._search is not None:
+            self._search.restart(self._recording.newest_ns, at_rest=True)
 
     def _restart_after_jump(self) -> None:
         super()._restart_after_jump()
         self._search = LegSearch(self._config()) if self._search_settings else None
-
-    def _restart_search(self, stamp_ns: int, at_rest: bool) -> None:
-        if self._search is not None:
-            self._search.restart(stamp_ns, at_rest)
 
     def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
         super()._handle_leg_result(done)

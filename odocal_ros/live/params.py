@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Settings and results as ROS parameters.
-
-Settings are declared with range and description. The result is in the parameters ``result.*``,
-which only the node sets; given at the start (a calibration.yaml), they restore an earlier result.
-"""
+"""Settings as ROS parameters; the result as ``result.*``, which restore it at the next start."""
 
 from collections.abc import Callable, Iterable
 import difflib
@@ -33,8 +28,7 @@ SCALE = 'm/pulse, m/rad or 1'
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
-# those that dead reckoning uses
-APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {
+APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {      # those that dead reckoning uses
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'

@@ -30,12 +30,7 @@ NAMESAKE_PERIOD_S = 5.0      # judgement: s between searches for another node of
 
 
 class CheckedNode(Node):
-    """
-    Base of the nodes: a wrong parameter raises BadConfig with a text of one line.
-
-    A subclass has the name ``default_name``, creates its parts in ``_build``, and may replace
-    ``spin``.
-    """
+    """Base of the nodes, which create their parts in ``_build``; BadConfig: a wrong parameter."""
 
     default_name = ''
 

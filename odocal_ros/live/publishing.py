@@ -218,8 +218,6 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
 
 
 class Publishing:
-    """Publishers and result parameters of a node."""
-
     def __init__(self, node: Node) -> None:
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         publish = partial(node.create_publisher, event_callbacks=quiet)
@@ -279,7 +277,6 @@ class Publishing:
             publisher.publish(message)
 
     def show_diagnostics(self, recording: Recording, config: Config) -> None:
-        """Publish the health of each input."""
         node = self._node.get_fully_qualified_name()
         if not config.diagnostic_updater.use_fqn:
             node = node.lstrip('/')      # with its namespace, to separate vehicles

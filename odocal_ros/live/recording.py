@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Reception of the calibration node: from subscribed topics to samples of a leg.
-
-``Inputs`` are the topics that the settings use; ``Recording`` decodes their messages in blocks and
-hands each block to the recorder of legs, to the progress of the drive and to the journal.
-"""
+"""Reception of messages: the topics of the node, decoded to samples for recorder and journal."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The running estimate: values and problems of the leg that is being recorded, every few seconds.
-
-Samples are thinned, and an update estimates with them in the worker's thread what the result of
-the leg would be: values, predicted sigmas, and reasons for a rejection.
-"""
+"""Estimate of values and problems of the leg that is recorded, updated every few seconds."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,8 +23,7 @@ from odocal_ros.pipeline.planar_run import is_planar
 from odocal_ros.reasons import Code, most_severe_first, Reason
 from odocal_ros.settings.config import Config
 
-# judgement: in IMU time, so that a fast replay has as many updates
-UPDATE_PERIOD_NS = 5 * 10**9
+UPDATE_PERIOD_NS = 5 * 10**9  # judgement: in IMU time, so that a fast replay has as many updates
 # tuned by benchmarks/live_load.py: share of one core for updates in the long run; the whole node
 # then needs less than three fifths of the CPU of a typed subscriber of 455 messages a second
 UPDATE_CPU_SHARE = 1 / 60
@@ -95,7 +89,6 @@ class RunningEstimate:
         return combine_sections(self._earlier, self._current)
 
     def _start_section(self, start_ns: int, form: OdometerForm) -> None:
-        """Start a new section at a stamp."""
         self._stop_event, self._start_ns = threading.Event(), start_ns
         self._thinned, self._smoother = ThinnedLeg(form), leg_so_far.SmootherSoFar()
         self._due_ns = start_ns + UPDATE_PERIOD_NS

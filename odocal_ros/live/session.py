@@ -4,8 +4,7 @@
 """
 State of the calibration node: the open leg, the kept legs and their combined result.
 
-``Session`` changes with the services and refuses those that do not fit its state. ``SessionView``
-is a snapshot of session, inputs and files: status, hint and answers are texts made from it.
+Status, hint and answers are made from a ``SessionView``, a snapshot of session, inputs and files.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,9 +25,8 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: newest legs that keep their tracks, for plots; with leg.automatic, older legs are
-# released. Legs of the operator are released beyond the second number: a day of legs must not
-# fill the memory
+# judgement, to bound memory: newest legs that keep their tracks, for plots (with leg.automatic,
+# older ones are released); number of legs of the operator from which the oldest is released
 LEGS_HELD, MARKED_LEGS_HELD = 20, 50
 
 
@@ -82,8 +80,7 @@ class Session:
     The legs since the start or the last reset, and their combined result ``calibration``.
 
     ``leg_id``, ``start_ns``, ``stop_ns`` (0: open) and ``event`` belong to the leg that changed
-    last. Every status contains them, and replay finds the marks there. Times are stamps on the
-    sensors' clock, ns.
+    last. Every status contains them, and replay finds the marks there. Times are sensor stamps.
     """
 
     def __init__(self) -> None:

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-One input topic of a node: search for its publishers, subscription, decoding, and its health.
-
-Messages wait serialised in a queue, and are decoded in blocks by the same readers as bags.
-"""
+"""One input topic: search for publishers, subscription, decoding as of bags, health."""
 
 from collections.abc import Callable, Sequence
 import difflib

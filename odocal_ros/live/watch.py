@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-``odocal watch``: subscribes to the status of a calibration node, and shows it in the terminal.
-
-The panel shows state, next action and progress bars towards the limits. Text of a status is from
-the network: control characters are escaped, and its length is limited.
-"""
+"""odocal watch: subscribes to the status of a node (untrusted), and shows it in the terminal."""
 
 from collections.abc import Iterator
 import math

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Computations of the calibration node, and the thread that runs them one at a time.
-
-``compute`` makes a leg's result from the recorded samples. ``Worker`` is the thread; ``Computing``
-also answers the services that wait for the result.
-"""
+"""The computations of the node, the thread that runs them one at a time, and waiting callers."""
 
 from collections.abc import Callable
 import ctypes
@@ -38,16 +33,14 @@ from odocal_ros.settings.config import Config
 
 MOST_POSES = 2000    # judgement: of a published path
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
-# judgement: s that a stopping node waits, for a computation and for files: launch sends the next
-# signal after 5 s
+# judgement: s that a stopping node waits for a computation, and for files; launch kills after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
 # called with the result of a job and None, or with None and its error
 OnDone: TypeAlias = Callable[[Any, Exception | None], None]
 # By default glibc has an arena for every thread and, once one was freed, takes arrays of up to 32
 # MiB from it: a node kept 100 MiB unused after a leg of an hour at 1 kHz. judgement, of
-# mallopt(3): M_ARENA_MAX, number of arenas of all threads, and M_MMAP_THRESHOLD, bytes from which
-# a block is mapped separately
+# mallopt(3): M_ARENA_MAX, arenas of all threads; M_MMAP_THRESHOLD, bytes of a separate block
 MALLOC_OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
 # judgement: s after which ~/stop_leg answers without the result. Callers wait 5 s, of which 1 s is

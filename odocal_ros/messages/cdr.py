@@ -42,8 +42,7 @@ def _pose(prefix: str) -> tuple[str, ...]:
 
 
 HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
-# format: of gps_msgs; the status has its own header and lists of satellites
-_GPS_FIX = (
+_GPS_FIX = (      # format: of gps_msgs; the status has its own header and lists of satellites
     *HEADER, 'int32 status.header.stamp.sec', 'uint32 status.header.stamp.nanosec',
     'string status.header.frame_id', 'uint16 status.satellites_used',
     'int32[] status.satellite_used_prn', 'uint16 status.satellites_visible',

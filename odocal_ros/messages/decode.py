@@ -5,8 +5,7 @@
 Decoding of serialised messages to samples: the same readers for live topics and for bags.
 
 Messages of one layout (``messages/cdr.py``) are read as columns in numpy; others are deserialised
-one by one, with bitwise equal rows. A plan (``SensorPlan``, ``OdometerPlan``) states which fields
-are read and builds the samples.
+one by one, with bitwise equal rows. A plan states which fields are read, and builds the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,15 +40,13 @@ Feed = Callable[[str, Samples], None]
 
 
 class RowReader(Protocol):
-    """Reader of the messages of one topic into rows."""
+    """What a bag calls with the messages of a topic: a ``Reader``, or a collector."""
 
     unreadable: int
     trouble: str
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
-             deserialize: Deserialize) -> Pairs:
-        """Decode messages into (slot, rows)."""
-        raise NotImplementedError
+             deserialize: Deserialize) -> Pairs: ...
 
 
 class Reader:
@@ -93,12 +90,10 @@ class Reader:
         Decode messages.
 
         raws : serialised messages (CDR), in order of arrival.   received_ns : their arrival; the
-        stamp of messages without one.   deserialize : converts one of them to an object with its
-        fields; called only if needed.
+        stamp of messages without one.   deserialize : converts one to an object, if needed.
 
-        Returns (slot, block) pairs, one for each wheel of a message, none without a row.
-
-        Raises BadData: the message type cannot have the value: no such field, not a number.
+        Returns (slot, block) pairs, one for each wheel of a message, none without a row. Raises
+        BadData: the message type cannot have the value: no such field, not a number.
         """
         other, raws = None, raws if len(raws) <= FEW_ROWS else RawMessages.of(raws)
         if self.frames is not None and len(raws):
@@ -247,8 +242,7 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     """
     Return the reader of a slot for messages of a type.
 
-    Raises BadData, BadConfig: the type cannot be used for this slot, or not with these settings;
-    the text contains the remedy.
+    Raises BadData, BadConfig: the type cannot be used for this slot, or with these settings.
     """
     msgtype = full_type(msgtype)
     if slot == 'fix' and msgtype == TRANSFORMS:

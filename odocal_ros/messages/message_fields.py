@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import re
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +21,12 @@ from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats, Ints, reduce_columns
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadData
+from odocal_ros.messages.cdr import Layout
 from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config, OdometerConfig
 from odocal_ros.settings.levels import RAD_PER_DEG
 
 PATH_PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
-
-
-class View(Protocol):
-    """Message as seen by a column: its joint names and the lengths of its lists."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Return the list ``name`` (of joints), empty if there is none."""
-
-    def count(self, path: str) -> int:
-        """Return the length of a list, 0 if it is missing."""
 
 
 class MessageView:
@@ -46,7 +36,7 @@ class MessageView:
         self.message = message
 
     @property
-    def names(self) -> Sequence[str]:
+    def names(self) -> list[str]:
         """Return the list ``name`` (of joints), empty if there is none."""
         return list(getattr(self.message, 'name', ()))
 
@@ -87,6 +77,9 @@ class MessageView:
         if field_names is None and hasattr(self.message, 'get_fields_and_field_types'):
             field_names = self.message.get_fields_and_field_types()
         return [name for name in (field_names or ()) if not name.startswith('__')]
+
+
+View = Layout | MessageView
 
 
 @lru_cache
@@ -143,13 +136,11 @@ IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
 GPS_FIXES = ('gps_msgs/msg/GPSFix', 'gps_common/msg/GPSFix')    # of ROS 2 and ROS 1
 GEODETIC = (FIX, *GPS_FIXES)
-# format: status of a GPSFix with corrections of a satellite; other codes above 2 are those of a
-# base station (DGPS, RTK), as 2 is
+# format: status of a GPSFix with satellite corrections; others above 2: base station, as 2
 WAAS_FIX = 33
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
-# function of stamps, arrivals and the columns of a sensor
-Build = Callable[..., samples.Samples]
+Build = Callable[..., samples.Samples]  # function of stamps, arrivals and the columns of a sensor
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
 NOT_SENT_BITS = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Odometer messages: which field has the value, and whether it is a count, an angle or a speed.
-
-Any message type with a number can be an odometer. Settings, type and first message determine
-field, wheels and meaning.
-"""
+"""Odometer messages: which field has the value; whether it is a count, an angle or a speed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

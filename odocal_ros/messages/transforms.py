@@ -62,11 +62,6 @@ def _name(frame: str) -> str:
     return frame.removeprefix('/')
 
 
-def _quoted(frame: str) -> str:
-    """Return a frame of a message for texts, quoted and limited in length."""
-    return repr(frame[:MOST_LETTERS])
-
-
 class TransformReader(Reader):
     """Reads /tf; ``static`` reads /tf_static into the same frames."""
 
@@ -114,10 +109,10 @@ class TransformReader(Reader):
         chain = self._chain
         between_frames = f'from {chain.parent} to {chain.child}'
         if chain.top() != chain.parent:
-            names = ', '.join(_quoted(name) for name in chain.frames[:MOST_NAMES]) or 'none'
-            return (f'no transform {between_frames}: {_quoted(chain.top())} has no parent frame '
-                    f'(frames received: {names}); set reference.frames, or record the static '
-                    'transforms')
+            names = ', '.join(repr(name[:MOST_LETTERS]) for name in chain.frames[:MOST_NAMES])
+            return (f'no transform {between_frames}: {chain.top()[:MOST_LETTERS]!r} has no parent '
+                    f'frame (frames received: {names or "none"}); set reference.frames, or record '
+                    'the static transforms')
         if not chain.is_moving():
             return (f'all transforms {between_frames} are static; set reference.frames to a robot '
                     'that moves')

@@ -55,9 +55,8 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
     """
     Return each value with a known truth.
 
-    calibration : content of calibration.json.   truth : content of a truth.yaml: of odocal
-    simulate, with scale factor and ratio in ``scale``, or of a real drive, with the ratio to the
-    nominal scale as its value.
+    calibration : content of calibration.json.   truth : content of a truth.yaml, of odocal
+    simulate (``scale`` is the factor) or of a real drive (``scale`` is the ratio to nominal).
     """
     scale = 'scale_factor' if 'ratio' in truth.get('scale', ()) else 'scale_ratio'
     return [_row(name, calibration['result'], truth[key], factor) for name, key, factor in (

@@ -16,11 +16,9 @@ from typing import Any, NoReturn
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadTopics, BadUsage, OdocalError, unknown_name
-from odocal_ros.offline import cli
 from odocal_ros.safe_io.text_formats import brief_line, for_terminal
 
-# name: (its module, or the package that has it as an entry point; description)
-COMMANDS = {
+COMMANDS = {      # name: (its module, or the package that has it as an entry point; description)
     'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
     'fleet': ('odocal_ros.fleet.command', 'calibrate many vehicles from many bags in parallel'),
@@ -51,10 +49,10 @@ class OdocalCommand:
         parser.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND ...',
                             help=f'a command of odocal and its options; {cli_name} COMMAND --help')
         parser.epilog = 'commands:\n' + '\n'.join(
-            f'  {name:<10}{about}' for name, (_, about) in cli.COMMANDS.items())
+            f'  {name:<10}{about}' for name, (_, about) in COMMANDS.items())
 
     def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:
-        return cli.main(args.argv)
+        return main(args.argv)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -160,7 +158,6 @@ def trace_file(text: str) -> str:
 
 
 def print_text(text: str, end: str = '\n') -> None:
-    """Print lines on stdout."""
     print(for_terminal(text), end=end)
 
 
@@ -177,8 +174,7 @@ class Phase:
     """
     A phase of the work, as a context; called with the fraction done, if known.
 
-    title : of the work.   quiet : show nothing. Nothing is shown either if the error stream is no
-    terminal.
+    title : of the work.   quiet : show nothing, as without a terminal on stderr.
     """
 
     def __init__(self, title: str, quiet: bool = False) -> None:

@@ -6,18 +6,14 @@
 import argparse
 from pathlib import Path
 
+from odocal_ros.offline import replay
 from odocal_ros.offline.cli import print_json, print_text
-from odocal_ros.offline.replay import (
-    add_input_arguments,
-    settings_from_arguments,
-    topics_from_arguments,
-)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', metavar='BAG', help='bag folder or file')
     parser.add_argument('--json', action='store_true', help='print everything as JSON')
-    add_input_arguments(parser, 'the most likely one')
+    replay.add_input_arguments(parser, 'the most likely one')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -25,9 +21,9 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text
     from odocal_ros.settings.config import Config, with_settings
-    config = with_settings(Config(), settings_from_arguments(args))
+    config = with_settings(Config(), replay.settings_from_arguments(args))
     with open_bag(Path(args.bag)) as bag:
-        found = inspect(bag, args.bag, config, topics_from_arguments(args))
+        found = inspect(bag, args.bag, config, replay.topics_from_arguments(args))
     if args.json:
         print_json(found)
     else:

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Content of ``odocal inspect``: facts of each topic, the likely inputs, findings, replay command.
-
-A bag is read once with the readers of all possible inputs; a second time, only the odometer, if
-another field or another meaning of its values turns out to follow the path of the fixes.
-"""
+"""Content of odocal inspect: facts of topics, likely inputs, findings, replay command."""
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
@@ -125,8 +120,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     found['open'] = replay_refusal(bag.topics, initial_config, overrides)
     found['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping,
                                       options)
-    content: dict[str, Any] = plain(found)
-    return content
+    return dict(plain(found))
 
 
 def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:

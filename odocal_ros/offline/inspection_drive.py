@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Findings of ``odocal inspect`` from IMU, odometer and fixes of a bag together.
-
-Units and axes of the IMU, direction of the odometer, path length, standstills and legs; each
-problem is a ``Reason``, and its remedy is a setting for the replay if there is one.
-"""
+"""Findings of odocal inspect from all inputs together: units, axes, standstills, legs."""
 
 from dataclasses import replace
 import math
@@ -30,14 +25,10 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data_reasons
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.clocks import SYNCHRONISE_REMEDY
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
-from odocal_ros.screening.imu_orientation import (
-    estimate_orientation,
-    MAX_RATE,
-    unit_and_axis_reasons,
-)
 from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen_aligned
@@ -118,8 +109,8 @@ def _unit_options(inputs: Inputs, config: Config,
                   findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
-        gravity_turn_reasons(inputs)
-        or unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
+        gravity_turn_reasons(inputs) or imu_orientation.unit_and_axis_reasons(
+            inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
         or unit_change_reasons(inputs), inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
@@ -127,7 +118,7 @@ def _unit_options(inputs: Inputs, config: Config,
     options = []
     if 0.85 < np.linalg.norm(medians(f_i)) < 1.15:      # in g
         options.append(f'imu.accel_scale={9.80665 * config.imu.accel_scale:.10g}')
-    if np.percentile(lengths(w_i - medians(w_i)), 99.9) > MAX_RATE:
+    if np.percentile(lengths(w_i - medians(w_i)), 99.9) > imu_orientation.MAX_RATE:
         options.append(f'imu.gyro_scale={RAD_PER_DEG * config.imu.gyro_scale!r}')
         w_i = w_i * RAD_PER_DEG
     return options, w_i, f_i
@@ -162,7 +153,7 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not is_configured}
-    orientation = estimate_orientation(inputs, located.rough) \
+    orientation = imu_orientation.estimate_orientation(inputs, located.rough) \
         if inputs.has_accelerometer and located.rough else None
     ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
                                  config.imu.gyro_scale)

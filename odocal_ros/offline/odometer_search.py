@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Search for the odometer of a bag among topics whose type does not define a meaning.
-
-Every number of a message may be a count, an increment or a speed: it is one if the travel that it
-gives follows the path of the fixes (``survey.FixPath``).
-"""
+"""Search for an odometer among topics without a defined meaning, by the path of the fixes."""
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -37,8 +32,7 @@ MOST_BYTES = 2**14       # judgement: of a message; images and point clouds are 
 # fields that are not searched: stamps, and positions, whose axis may grow with distance
 NOT_SEARCHED = ('header', 'stamp', 'seq', 'pose', 'latitude', 'longitude', 'altitude')
 INCREMENT_WORDS = ('delta', 'diff', 'increment', 'since')
-# format: of counters of 8, 16 and 32 bits
-ROLLOVERS = (2**8, 2**16, 2**32)
+ROLLOVERS = (2**8, 2**16, 2**32)      # format: of counters of 8, 16 and 32 bits
 MOST_TOPICS = 20       # judgement: topics of unknown types that are searched
 RECEIVER_WORDS = (*GNSS, 'navsat', 'nmea', 'ubx')      # topics of GNSS receivers
 STANDARD_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
@@ -111,12 +105,10 @@ class Fields:
         """
         Return the settings for left and right wheels, or for the best field.
 
-        found : fields of ``facts``.   turn_rate : times, ns, and turn rate to the left, rad/s;
-        None without an IMU.
+        found : of ``facts``.   turn_rate : times, ns, and rate to the left, rad/s, if known.
         """
         best, t_ns = found[0], self._t_ns
-        # judgement: scales of the wheels of a vehicle differ less, relative
-        scale_tolerance = 0.3
+        scale_tolerance = 0.3  # judgement: scales of the wheels of a vehicle differ less, relative
         wheels = [field for field in found if all(
             field[key] == best[key] for key in ('quantity', 'wrap', 'whole'))
             and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]

@@ -86,7 +86,6 @@ def _methods(plan: Plan) -> list[str]:
 
 
 def _result(plan: Plan) -> str:
-    """Return the line that names the method of each value."""
     by: dict[str | None, list[str]] = {}
     for parameter in MAIN_VALUES:
         by.setdefault(plan.method_of(parameter), []).append(MAIN_VALUES[parameter])

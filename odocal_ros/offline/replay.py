@@ -76,7 +76,7 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
 
 def run(args: argparse.Namespace) -> int:
     """Replay bags; return 0 accepted or caution (with --accept: pass), else 1."""
-    config = config_from_arguments(args)
+    config, listener = config_from_arguments(args), _TerminalListener(args)
     if args.marks:
         config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
@@ -89,14 +89,14 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
     calibration = calibrate_bag(args.bags, topics_from_arguments(args), config, args.leg,
-                                holdout=args.holdout, listener=_TerminalListener(args))
+                                holdout=args.holdout, listener=listener)
     for name, trace in traces(calibration.result.legs):
         warn(f'odocal: method {name} failed with an internal error; please report it with '
              f'{trace_file(trace)}')
-    code = _report(calibration, output, args)
+    code = _report(calibration, output, args, listener)
     if exports:
         exported = calibration.export(*(output / name for name in exports))
-        _TerminalListener(args).note(f'exported: {", ".join(map(str, exported))}')
+        listener.note(f'exported: {", ".join(map(str, exported))}')
     return code
 
 
@@ -150,7 +150,6 @@ def settings_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def topics_from_arguments(args: argparse.Namespace) -> dict[str, str]:
-    """Return the requested topics by slot."""
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
@@ -162,12 +161,12 @@ def _terminal_size(stream: Any) -> tuple[int, int | None]:
     return max(40, min(98, columns)), rows
 
 
-def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
+def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace,
+            listener: Listener) -> int:
     """Write and print the result; return the exit code."""
     from odocal_ros.output.files import Results
     from odocal_ros.output.stored import objection_to_folder, stored_in
     from odocal_ros.output.summary import sentence
-    listener = _TerminalListener(args)
     existing = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
                       calibration.created)

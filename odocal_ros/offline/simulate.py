@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from odocal_ros.sim.scenarios import Drive
 
 MANIFEST = 'manifest.csv'
-# options that are fields of SimOptions: (metavar, help); below, help of angles
-NUMBERS = {
+NUMBERS = {      # options that are fields of SimOptions: (metavar, help); below, help of angles
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
     'odometer_rate': ('HZ', 'rate of the odometer (default 50)'),

@@ -25,8 +25,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     """
     Return slot -> most likely topic, and the settings that this mapping needs.
 
-    not_following : odometer topics that do not grow with the path of the fixes, while another
-    does.
+    not_following : odometer topics that do not follow the path of the fixes, while another does.
     """
     chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
@@ -106,8 +105,7 @@ def replay_command(path: str, topics: dict[str, TopicInfo], config: Config,
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
         found = candidates(topics, slot, config, {s: t for s, t in mapping.items() if s != slot})
-        # stated, as it is unusual
-        local = slot == 'fix' and topics[topic].msgtype not in GEODETIC
+        local = slot == 'fix' and topics[topic].msgtype not in GEODETIC  # stated, as it is unusual
         if slot in overrides or len(found) > 1 or topic not in found or local:
             words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Facts of the topics of a bag (timing, units, quality) and of its drive (path, standstills, speeds).
-
-``FixPath`` compares any signal with the path of the fixes: an odometer is proportional to it.
-"""
+"""Facts of the topics of a bag (timing, units, quality) and of its drive (path, standstills)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -162,8 +158,7 @@ class Match:
     follows: bool        # the travel is proportional to the distance, within the fix errors
 
 
-# definition: result without a comparison
-NO_MATCH = Match(0.0, 0.0, False)
+NO_MATCH = Match(0.0, 0.0, False)      # definition: result without a comparison
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
     from odocal_ros.settings.config import Config
 
-# why the inspection suggests a setting; imu.mounting_rpy has its own text
-SETTING_REASONS = {
+SETTING_REASONS = {      # why the inspection suggests a setting; imu.mounting_rpy has its own text
     'imu.accel_scale': 'the mean specific force is about 1, so its unit is g',
     'imu.gyro_scale': 'turn rates exceed those of a vehicle in rad/s, so their unit is deg/s',
     'gnss.max_sigma': 'the stated sigma of most fixes exceeds the limit',
@@ -203,7 +202,6 @@ def _setting_reason(setting: str, found: dict[str, Any], own_settings: Collectio
 
 
 def _mounting_reason(mounting: dict[str, Any]) -> str:
-    """Return the source of the IMU orientation."""
     from odocal_ros.offline.inspection_text import whole_degrees
     if mounting['assumed_forward']:
         return 'up is measured from gravity; x is assumed to be forward'

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Motion of each value of a list (joints, an array of counters), to find the wheels among them.
-
-A wheel turns without limit and follows the path of the fixes; in turns, the outer one is faster.
-"""
+"""Motion of each value of a list (joints, counters): which are wheels, and on which side."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -102,8 +98,7 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
     """
     Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther.
 
-    t, s : (n,) s and (n, k) travel.   rolls : (k,) values that are wheels.   imu : times, s, and
-    turn rates to the left, rad/s.
+    t, s : (n,) s and (n, k) travel.   rolls : (k,) wheels.   imu : s, and rad/s to the left.
     """
     k = len(rolls)
     sides_found = [''] * k

@@ -36,15 +36,9 @@ ASIDE = '.old'                # suffix of the earlier folder while two folders a
 LEFTOVER = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?')
 
 
-class Disk:
-    """Caller of operations that the disk can fail."""
-
-    def __call__(self, step: Callable[..., Any], *values: Any) -> Any:
-        """Return the result of an operation of the operating system."""
-        return step(*values)
-
-
-disk = Disk()
+def disk(step: Callable[..., Any], *values: Any) -> Any:
+    """Return the result of an operation that the disk can fail."""
+    return step(*values)
 
 
 class WholeFile:

@@ -21,8 +21,7 @@ DEFINITION_CHARACTERS = 2**16     # judgement: of a message definition
 MESSAGE_BYTES = 2**26             # judgement: of one requested message
 MESSAGE_VALUES = 100_000          # judgement: in the fixed arrays of one message
 PARSE_SECONDS = 20                # judgement: to parse a message definition
-# judgement: bytes first given to a decompressor. It copies the rest of them after each frame, and
-# a frame may have 9 bytes
+# judgement: bytes first given to a decompressor, which copies the rest after each (short) frame
 FIRST_PIECE = 2**10
 LATEST_NS = 2**62            # judgement: the year 2116: a later time is invalid
 

@@ -32,7 +32,7 @@ NODES = 30_000            # judgement: mappings, lists and values of a YAML text
 
 def one_line(text: object) -> str:
     """Return text as one line, invisible characters as escape sequences."""
-    return _escaped(str(text))
+    return UNSEEN.sub(lambda match: match[0].encode('unicode_escape').decode(), str(text))
 
 
 def indented_list(names: Sequence[str]) -> str:
@@ -44,7 +44,7 @@ def indented_list(names: Sequence[str]) -> str:
 def brief_line(text: object) -> str:
     """Return ``one_line`` of a text, cut at LONGEST_LINE, for a log, a panel or an error."""
     # cut first: an escape sequence is up to ten times as long as its character
-    line = _escaped(str(text)[:LONGEST_LINE + 1])
+    line = one_line(str(text)[:LONGEST_LINE + 1])
     return line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]} ...'
 
 
@@ -56,12 +56,8 @@ def error_text(error: BaseException) -> str:
 def for_terminal(text: str) -> str:
     """Return lines for a terminal that neither move its cursor nor set its state."""
     parts = VERDICT_STYLE.split(text)
-    parts[::2] = ['\n'.join(map(_escaped, part.split('\n'))) for part in parts[::2]]
+    parts[::2] = ['\n'.join(map(one_line, part.split('\n'))) for part in parts[::2]]
     return ''.join(parts)
-
-
-def _escaped(text: str) -> str:
-    return UNSEEN.sub(lambda match: match[0].encode('unicode_escape').decode(), text)
 
 
 def is_frame(name: str) -> bool:
