@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and synced to the disk.
-
-A ``PackedChunk`` has the bytes of the file: files are joined by copying chunks.
-"""
+"""Write mcap files chunk by chunk (mcap.dev/spec), without rosbags, synced to the disk."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

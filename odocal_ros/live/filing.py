@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Result folders of a node: writing, the link ``latest``, and removal of old automatic results.
-
-``Filing`` writes in the worker's thread; ``ResultFolders`` decides where ``latest`` points to.
-"""
+"""Result folders of a node: written by its worker; the link ``latest``; removal of old ones."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -80,13 +76,14 @@ class ResultFolders:
         """
         root = newest.parent
         with locked(root):
-            matches = filter(None, (RESULT_NAME.fullmatch(p.name) for p in root.iterdir()))
+            matches = filter(None, (RESULT_NAME.fullmatch(path.name) for path in root.iterdir()))
             # by the time, and the count within that second
-            names = [m[0] for m in sorted(matches, key=lambda m: (m[1], int(m[2] or 1)))]
+            by_age = sorted(matches, key=lambda match: (match[1], int(match[2] or 1)))
+            names = [match[0] for match in by_age]
             outdated = names[:-kept] if kept else []
             linked = _link_target(root / LATEST)
-            kept_names = {newest.name, linked,
-                          *(f.before for f in self._written if f.folder.name == linked)}
+            kept_names = {newest.name, linked, *(
+                entry.before for entry in self._written if entry.folder.name == linked)}
             for name in reversed(names if outdated else []):
                 found = stored_in(root / name)
                 if found and found.usable:
@@ -103,8 +100,8 @@ class ResultFolders:
 
         Returns the newest folder of this session that is not withdrawn, None without one.
         """
-        dropped = [f for f in self._written if f.last_ns >= since_ns]
-        self._written = [f for f in self._written if f.last_ns < since_ns]
+        dropped = [entry for entry in self._written if entry.last_ns >= since_ns]
+        self._written = [entry for entry in self._written if entry.last_ns < since_ns]
         for entry in reversed(dropped):
             root = entry.folder.parent
             link = root / LATEST

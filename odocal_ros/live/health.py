@@ -145,7 +145,7 @@ class Health:
         """Return rows per second by their stamps over the last seconds, 0 when silent."""
         if not self.is_flowing(now_ns):
             return 0.0
-        recent = [e for e in self._block_ends if e[1] >= self.newest_ns - RATE_SPAN_NS]
+        recent = [end for end in self._block_ends if end[1] >= self.newest_ns - RATE_SPAN_NS]
         if len(recent) < 2:
             recent = list(self._block_ends)[-2:]
         if len(recent) < 2 or recent[-1][1] <= recent[0][1]:

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The journal: each leg is written to disk as a bag while it is driven, to survive a crash.
-
-This module runs in the thread of the callbacks: it collects messages and hands them about once a
-second to ``JournalWriter``, which packs and writes them in a thread of its own.
-"""
+"""The journal: each leg is written to disk as a bag while it is driven, to survive a crash."""
 
 from datetime import datetime, UTC
 import time

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-State of the calibration node: the open leg, the kept legs and their combined result.
-
-Status, hint and answers are made from a ``SessionView``, a snapshot of session, inputs and files.
-"""
+"""State of the calibration node: open leg, kept legs, combined result; a snapshot for texts."""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum

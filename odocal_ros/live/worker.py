@@ -33,7 +33,7 @@ from odocal_ros.settings.config import Config
 
 MOST_POSES = 2000    # judgement: of a published path
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
-# judgement: s that a stopping node waits for a computation, and for files; launch kills after 5 s
+# judgement: s that a stopping node waits for a job, and for files; launch terminates it after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
 # called with the result of a job and None, or with None and its error
@@ -89,15 +89,14 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
     released = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
-    carried_before, carried = carried, add_to_carried([result for leg in kept[:released]
-                                                       for result in leg],
-                                                      config, carried)
+    oldest = [result for leg in kept[:released] for result in leg]
+    new_carried = add_to_carried(oldest, config, carried)
     # results of the two-point method cannot be added to ``carried``: all legs are kept
-    if carried is carried_before and not is_automatic:
+    if new_carried is carried and not is_automatic:
         released = 0
     current = [result for leg in kept[released:] for result in leg]
-    calibration = combine([*current, *results], config, carried, known_imu(config))
-    return Computed(results, paths, calibration, carried, released)
+    calibration = combine([*current, *results], config, new_carried, known_imu(config))
+    return Computed(results, paths, calibration, new_carried, released)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,

@@ -82,16 +82,13 @@ def key_on_side(choice: Choice, side: str) -> str:
 
 def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     """Return the pair selected by name, otherwise all possible wheels."""
-    lower_case = {name: name.lower() for name in names}
-    not_excluded = [name for name in names
-                    if not any(w in lower_case[name] for w in EXCLUDED_WORDS)]
-    candidates = [name for name in not_excluded
-                  if any(w in lower_case[name] for w in WHEEL_WORDS_IN_NAME)]
+    not_excluded = [name for name in names if not _contains(name, EXCLUDED_WORDS)]
+    candidates = [name for name in not_excluded if _contains(name, WHEEL_WORDS_IN_NAME)]
     if not candidates:
         not_excluded = [name for name in not_excluded
                         if not set(_words(name)) & set(EXCLUDED_WHOLE_WORDS)]
         candidates = [name for name in not_excluded
-                      if any(w in lower_case[name] for w in DRIVE_WORDS_IN_NAME)] or not_excluded
+                      if _contains(name, DRIVE_WORDS_IN_NAME)] or not_excluded
     places = {name: _side_and_rest(name) for name in candidates}
     left, right = ([name for name in candidates if places[name][0] == side]
                    for side in ('left', 'right'))
@@ -103,9 +100,9 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     if len(pairs) == 1:
         return Choice(pairs[0], True, _selection_text(names, pairs[0], ''))
     steered = {_axle(_side_and_rest(name)[1]) for name in names
-               if any(w in lower_case[name] for w in STEERING_WORDS)} - {''}
-    fixed = [p for p in pairs if steered and _axle(places[p[0]][1]) not in steered]
-    rear = [p for p in pairs if _axle(places[p[0]][1]) == 'rear']
+               if _contains(name, STEERING_WORDS)} - {''}
+    fixed = [pair for pair in pairs if steered and _axle(places[pair[0]][1]) not in steered]
+    rear = [pair for pair in pairs if _axle(places[pair[0]][1]) == 'rear']
     for axle_pairs, reason in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
         if len(axle_pairs) == 1:
             all_names = ', '.join(name for pair in pairs for name in pair)
@@ -162,9 +159,12 @@ def _axle_and_side(word: str) -> tuple[str, str]:
 
 
 def _axle(rest: Sequence[str]) -> str:
-    whole = ' '.join(rest)
-    return 'rear' if any(w in whole for w in REAR) else 'front' if any(
-        w in whole for w in FRONT) else ''
+    text = ' '.join(rest)
+    return 'rear' if _contains(text, REAR) else 'front' if _contains(text, FRONT) else ''
+
+
+def _contains(name: str, words: Sequence[str]) -> bool:
+    return any(word in name.lower() for word in words)
 
 
 def _list_text(keys: Sequence[str]) -> str:

@@ -27,14 +27,14 @@ def screen(planned: Planned) -> str:
 
 
 def indoor_screen(runs: list[PlannedRun]) -> str:
-    robot, by = runs[0].robot, runs[0].method
-    names = [name for name in SHOWN if name in by.estimates
-             and not (name == 'yaw_mounting_angle' and by.name == 'planar')]
+    robot, method = runs[0].robot, runs[0].method
+    names = [name for name in SHOWN if name in method.estimates
+             and not (name == 'yaw_mounting_angle' and method.name == 'planar')]
     drift = (f', correlated errors {1000 * robot.drift:.2g} mm over {robot.drift_length:g} m'
              if robot.drift else '')
     where = ' at standstills' if robot.at_rests else f' at {robot.rate:g} Hz'
     lines = [f'{robot.drive}, {robot.wheels} wheels, {"with" if robot.imu else "without"} an IMU; '
-             f'method {by.name}',
+             f'method {method.name}',
              f'positions {1000 * robot.white:.2g} mm{where}{drift}; wheel slip '
              f'{1000 * robot.slip:.2g} mm/√s', '']
     heads = ['scale', 'right / left', *(SHOWN[name] for name in names[1:])]
@@ -59,19 +59,19 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
 
 
 def _head(plan: Planned) -> list[str]:
-    sigmas, two_point, a = plan.sigmas, plan.two_point, plan.two_point.alignment
+    sigmas, two_point = plan.sigmas, plan.two_point
+    alignment, tau = two_point.alignment, sigmas.correlation_time
     stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
-    tau = sigmas.correlation_time
     noise = f'correlation time {tau:g} s' if tau else 'white'
     lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
              f'the start mark, {stands[1]} at the end mark; marks {length(two_point.chord)} apart',
-             f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
-             f'(sigma {math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m at '
-             f'{sigmas.fix_rate:.3g} Hz, {noise}']
+             f'IMU grade {sigmas.config.imu.grade}, heading from {alignment.heading_source} '
+             f'(sigma {math.degrees(alignment.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m '
+             f'at {sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in plan.methods:
         slip = 1000 * sigmas.slip
-        no_heading_text = ' needs no heading;' if a.heading_source in ('course',
-                                                                       'gyrocompass') else ''
+        is_estimated = alignment.heading_source in ('course', 'gyrocompass')
+        no_heading_text = ' needs no heading;' * is_estimated
         white = f'; white part of the fix errors {100 * WHITE_SHARE:.0f} %' if tau else ''
         lines.append(f'smoother:{no_heading_text} wheel slip {slip:.2g} mm/√s, sway '
                      f'{sigmas.sway:.2g} m/s (white at {SWAY_RATE:g} Hz){white}')
@@ -86,12 +86,12 @@ def _methods(plan: Plan) -> list[str]:
 
 
 def _result(plan: Plan) -> str:
-    by: dict[str | None, list[str]] = {}
-    for parameter in MAIN_VALUES:
-        by.setdefault(plan.method_of(parameter), []).append(MAIN_VALUES[parameter])
-    return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all values"} '
+    by_method: dict[str | None, list[str]] = {}
+    for parameter, label in MAIN_VALUES.items():
+        by_method.setdefault(plan.method_of(parameter), []).append(label)
+    return ', '.join(f'{" and ".join(labels) if len(by_method) > 1 else "all values"} '
                      f'{"from " + method if method else "unknown"}'
-                     for method, names in by.items())
+                     for method, labels in by_method.items())
 
 
 def _shown(parameter: str, sigma: float | None) -> str:
@@ -106,7 +106,7 @@ def _shown(parameter: str, sigma: float | None) -> str:
 
 def _budgets(plan: Plan) -> list[str]:
     """Return the main error sources of each method that will provide a value."""
-    out = []
+    budgets = []
     shown = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
         method = plan.methods[name]
@@ -114,8 +114,8 @@ def _budgets(plan: Plan) -> list[str]:
         lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
         if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
-        out += [*lines, ''] if lines else []
-    return out
+        budgets += [*lines, ''] if lines else []
+    return budgets
 
 
 def _improvements(plan: Planned) -> list[str]:

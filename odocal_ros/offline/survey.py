@@ -236,9 +236,9 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
         return []
     most_fixes = 600    # fixes tested for straight sections, evenly selected
     selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, most_fixes).astype(int))
-    t, p = inputs.t_fix[selected], located.fixes_n[selected, :2]
+    t, position = inputs.t_fix[selected], located.fixes_n[selected, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
-    chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
+    chord = np.hypot(*(position[None] - position[:, None]).transpose(2, 0, 1))
     is_long = chord >= shortest
     # the rough scale is too small with curves, where chords are shorter than the path: the
     # straightest sections determine it best

@@ -69,18 +69,18 @@ class Values:
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
         unlimited = 4 * np.pi    # rad: a joint with a larger range turns without limit
         least_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
-        rolls = (span > (unlimited if self.msgtype == JOINTS
-                         else 0)) & (span > least_share * span.max())
+        least_span = unlimited if self.msgtype == JOINTS else 0
+        rolls = (span > least_span) & (span > least_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
         matches = [path.match(received_ns, x) for x in s.T] if path else []
         if any(match.follows for match in matches):
             rolls = np.array([match.follows for match in matches])
         scales = [m.scale if m.follows else None for m in matches] or [None] * len(keys)
-        found = find_sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
+        sides = find_sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
-        return [{'key': key, 'field': field, 'unit': unit, 'distance': float(w), 'span': float(d),
-                 'rolls': bool(r), 'side': side, 'scale': scale} for key, w, d, r, side, scale in
-                zip(keys, path_length, span, rolls, found, scales, strict=True)]
+        return [{'key': key, 'field': field, 'unit': unit, 'distance': float(path_length[k]),
+                 'span': float(span[k]), 'rolls': bool(rolls[k]), 'side': sides[k],
+                 'scale': scales[k]} for k, key in enumerate(keys)]
 
 
 def _travelled(t: Floats, value: Floats, field: str) -> Floats:
@@ -148,10 +148,11 @@ def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
 
 def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
     """Return the motion of each value as a line of text."""
-    def one(f: dict[str, Any]) -> str:
-        side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
-        grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''
-        kind = f'a wheel{grows}{side}' if f['rolls'] else 'no wheel'
-        return (f'{f["key"]} travels {f["distance"]:.5g} {f["unit"]} in total, range '
-                f'{f["span"]:.5g} {f["unit"]}: {kind}')
-    return [one(f) for f in facts]
+    lines = []
+    for one in facts:
+        side = f'; {one["side"]} side (matches gyro)' if one['side'] else ''
+        scale = f', {one["scale"]:.3g} m/{one["unit"].rstrip("s")}' if one['scale'] else ''
+        kind = f'a wheel{scale}{side}' if one['rolls'] else 'no wheel'
+        lines.append(f'{one["key"]} travels {one["distance"]:.5g} {one["unit"]} in total, range '
+                     f'{one["span"]:.5g} {one["unit"]}: {kind}')
+    return lines

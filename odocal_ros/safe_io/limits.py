@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Limits of reading untrusted files, so that a small file cannot fill memory or disk.
-
-Each limit is multiplied by the number in the environment variable ODOCAL_LIMITS, if it is set.
-"""
+"""Limits of reading untrusted files; the user multiplies them by ODOCAL_LIMITS."""
 
 from functools import cache
 import os
