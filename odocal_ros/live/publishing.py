@@ -218,6 +218,8 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
 
 
 class Publishing:
+    """The publishers of the node, and its parameters ``result.*``."""
+
     def __init__(self, node: Node) -> None:
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         publish = partial(node.create_publisher, event_callbacks=quiet)
