@@ -151,8 +151,7 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
         2 * END_STEPS * SPIN_GRID)
     difference = difference[END_STEPS:-END_STEPS]
     by_line = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * SPIN_GRID
-    excess: Floats = difference[span:] - difference[:-span] - by_line
-    return excess
+    return difference[span:] - difference[:-span] - by_line
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:

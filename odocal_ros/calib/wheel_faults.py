@@ -17,28 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.slip import (
-    acceleration,
-    END_STEPS,
-    excess_path,
-    make_wheel_slips,
-    NO_SLIPS,
-    SLIP_GRID,
-    SPIN_GRID,
-    SPIN_TURN,
-    wheel_slip_reason,
-    WheelSlips,
-)
-from odocal_ros.calib.wheel_pair_regression import (
-    counter_reasons,
-    find_ratio_change,
-    fit_signals,
-    MEAN_STEPS,
-    regressors,
-    side_reasons,
-    WHOLE_DRIVE_SIGMAS,
-    without_gyro_drift,
-)
+from odocal_ros.calib import slip, wheel_pair_regression as regression
 from odocal_ros.data.arrays import Bools, Floats, running_sum, runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
@@ -60,7 +39,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                  metres_per_unit: float, track_width: float = 0.0,
                  uncertain_t: Floats | None = None,
                  max_deviation: float = 0.35,
-                 count: int = 2) -> tuple[tuple[Reason, ...], WheelSlips]:
+                 count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
     """
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
@@ -71,25 +50,25 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
     count : number of wheels in the mean.
     """
-    pair = wheels_on_grid(axle, imu, between, SLIP_GRID,
+    pair = wheels_on_grid(axle, imu, between, slip.SLIP_GRID,
                          np.empty(0) if uncertain_t is None else uncertain_t)
     if pair is None or not metres_per_unit:
-        return (), NO_SLIPS
-    pair = without_gyro_drift(pair)
-    signals = regressors(pair, metres_per_unit)
-    x, covariance = fit_signals(pair, signals, metres_per_unit)
+        return (), slip.NO_SLIPS
+    pair = regression.without_gyro_drift(pair)
+    signals = regression.regressors(pair, metres_per_unit)
+    x, covariance = regression.fit_signals(pair, signals, metres_per_unit)
     if x is None or covariance is None or x[0] <= 0:
-        return (), NO_SLIPS
+        return (), slip.NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
     width = track_width or abs(x[1]) * per_right
-    reasons = side_reasons(pair, x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
-                           track_width)
-    reasons += counter_reasons(pair, ratio, width, max_deviation)
+    reasons = regression.side_reasons(pair, x[1] * per_right,
+                                      np.sqrt(covariance[1, 1]) * per_right, track_width)
+    reasons += regression.counter_reasons(pair, ratio, width, max_deviation)
     residual = (pair.right - signals @ x) * per_right
     events, slow_events = _find_events(pair, residual, per_right * (1 + ratio) / 2, width)
-    found, change = find_ratio_change(_without_slips(pair, events), signals, metres_per_unit,
-                                      count)
+    found, change = regression.find_ratio_change(
+        _without_slips(pair, events), signals, metres_per_unit, count)
     reasons += found
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + slow_events)
@@ -97,11 +76,11 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
         steep = 2 * abs(change) * metres_per_unit
         events = [e for e in events if abs(_slope(pair, e)) > steep]
     if not events:
-        return reasons, replace(NO_SLIPS, change=change)
+        return reasons, replace(slip.NO_SLIPS, change=change)
     mean = (pair.left * ratio + pair.right) / 2 * per_right
     wheel = [_find_wheel(pair, mean, imu, track, latitude, e) for e in events]
-    slips = replace(make_wheel_slips(events, wheel), change=change)
-    return reasons + wheel_slip_reason(slips, pair.names), slips
+    slips = replace(slip.make_wheel_slips(events, wheel), change=change)
+    return reasons + slip.wheel_slip_reason(slips, pair.names), slips
 
 
 def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Floats:
@@ -135,19 +114,19 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
     """
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
-    mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
+    mean = (total[regression.MEAN_STEPS:] - total[:-regression.MEAN_STEPS]) / regression.MEAN_STEPS
     unknown = running_sum(~pair.known)
     significant = np.zeros(len(pair.t), bool)
     windows = []
-    for span in (gap + MEAN_STEPS for gap in SLIP_SPANS):
+    for span in (gap + regression.MEAN_STEPS for gap in SLIP_SPANS):
         jump = mean[span:] - mean[:-span]
         if len(jump) < span:
             continue
         limit = _jump_limits(pair, jump, span, quantum_m * (pair.quantum > 0), width)
         far = np.abs(jump) > limit
-        far &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
+        far &= unknown[span + regression.MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
         for k in np.flatnonzero(far):
-            significant[k + MEAN_STEPS:k + span] = True
+            significant[k + regression.MEAN_STEPS:k + span] = True
         windows.append((span, jump, limit, far))
     finished: list[Event] = []
     slow: list[Event] = []
@@ -187,7 +166,7 @@ def _mean_path(pair: WheelPair) -> Floats:
 def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
                  width: float) -> Floats:
     """Return the limit of jumps between two means that occur by chance, m: (n,)."""
-    n, ends = len(jump), span + MEAN_STEPS - 1
+    n, ends = len(jump), span + regression.MEAN_STEPS - 1
     path = _mean_path(pair)
     total_turn = running_sum(np.abs(np.diff(pair.turn)))
     distance = path[ends:][:n] - path[:n]
@@ -196,14 +175,14 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
         usual = robust_sigma(jump[distance > 0])
         scatter = usual * np.maximum(1.0, distance / np.median(distance[distance > 0]))
     turn = TURN_SHARE * width * (total_turn[ends:][:n] - total_turn[:n])
-    counts = (path[MEAN_STEPS - 1:] - path[:len(path) - MEAN_STEPS + 1]) / max(pair.quantum, 1e-9)
-    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
+    n_mean = regression.MEAN_STEPS
+    counts = (path[n_mean - 1:] - path[:len(path) - n_mean + 1]) / max(pair.quantum, 1e-9)
+    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, n_mean)
     # rounding is bounded: at most one count at both ends of both wheels
-    rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
+    rounding = np.minimum(regression.WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
                           (2 * quantum_m)**2)
-    out: Floats = np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (scatter**2 + GROUND_SIGMA**2 + turn**2)
-                          + rounding)
-    return out
+    return np.sqrt(regression.WHOLE_DRIVE_SIGMAS**2 * (scatter**2 + GROUND_SIGMA**2 + turn**2)
+                   + rounding)
 
 
 def _measure_jump(pair: WheelPair, residual: Floats,
@@ -215,19 +194,20 @@ def _measure_jump(pair: WheelPair, residual: Floats,
     """
     found = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
     for span, jump, limit, far in windows:
-        low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
+        low, high = max(0, a - regression.MEAN_STEPS), max(0, b - span + 1)
         at = low + np.flatnonzero(far[low:high])
         if len(at):
             k = int(at[np.argmax(np.abs(jump[at]))])
             # a longer window is better only if its jump is larger by more than its noise
-            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / WHOLE_DRIVE_SIGMAS:
+            noise = limit[k] / regression.WHOLE_DRIVE_SIGMAS
+            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * noise:
                 found = (float(jump[k]), float(limit[k]), k, span)
     size, _, k, span = found
-    inner = residual[k:k + span + MEAN_STEPS]
-    share = (inner - inner[:MEAN_STEPS].mean()) / size if size else inner
+    inner = residual[k:k + span + regression.MEAN_STEPS]
+    share = (inner - inner[:regression.MEAN_STEPS].mean()) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
     late = np.flatnonzero(share >= 0.9)
-    late = late[late >= MEAN_STEPS // 2]
+    late = late[late >= regression.MEAN_STEPS // 2]
     end = int(late[0]) if len(late) else len(inner) - 1
     return float(pair.t[k + min(begin, end)]), float(pair.t[k + max(begin, end)]), size
 
@@ -238,16 +218,16 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats
     # a slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left
     # by -x moves it by -x / 2; the noise is the difference of mean and IMU elsewhere
     begin, end, size = event
-    grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), SPIN_GRID)
+    grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.SPIN_GRID)
     beside = 1.0        # s each side of a slip, in which speeds are set equal
-    span = max(round((end - begin + 2 * beside) / SPIN_GRID), 4 * END_STEPS)
+    span = max(round((end - begin + 2 * beside) / slip.SPIN_GRID), 4 * slip.END_STEPS)
     if len(grid) < 3 * span:
         return 0
-    a = acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
-    excess = excess_path(span, a, np.interp(grid, pair.t, mean))
-    turn = np.interp(grid, pair.t, pair.turn)[END_STEPS:-END_STEPS]
-    straight = np.abs(turn[span:] - turn[:-span]) < SPIN_TURN
-    at = int(np.searchsorted(grid, (begin + end) / 2)) - END_STEPS - span // 2
+    a = slip.acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
+    excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean))
+    turn = np.interp(grid, pair.t, pair.turn)[slip.END_STEPS:-slip.END_STEPS]
+    straight = np.abs(turn[span:] - turn[:-span]) < slip.SPIN_TURN
+    at = int(np.searchsorted(grid, (begin + end) / 2)) - slip.END_STEPS - span // 2
     if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
         return 0
     sigma = robust_sigma(excess[straight]) + 1e-3

@@ -98,8 +98,7 @@ class CoarseSpeed:
         # before and after a motion the speed is within a step of zero, for an unknown time
         moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
         unseen = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
-        variance: Floats = np.diff(total) + unseen**2 / 3
-        return variance
+        return np.diff(total) + unseen**2 / 3
 
     @cached_property
     def instants(self) -> SpeedInstants:

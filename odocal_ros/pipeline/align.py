@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav import rotations
 from odocal_ros.nav.alignment import (
     Alignment,
     COMPASS_LIMIT,
@@ -26,26 +27,12 @@ from odocal_ros.nav.alignment import (
 )
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
 from odocal_ros.nav.geodesy import C_en
-from odocal_ros.nav.rotations import (
-    matrix_from_quat,
-    quat_at,
-    quat_from_matrix,
-    transpose,
-    wrap,
-    yaw_from_heading,
-)
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import TILT_SIGMA
+from odocal_ros.settings import nominal
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.nominal import (
-    G,
-    Grade,
-    grade_of,
-    grade_with_turn_on_bias,
-    with_grade_by_noise,
-)
 
 FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
@@ -58,14 +45,14 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """Return the alignment of a leg, and reasons; spans: (k, 2) s, fixes_n: (n, 3) m."""
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
-    grade = grade_with_turn_on_bias(with_grade_by_noise(config.imu, {
+    grade = nominal.grade_with_turn_on_bias(nominal.with_grade_by_noise(config.imu, {
         name: sigma**2 for name, sigma in noise.items() if sigma}))
     if not inputs.has_accelerometer:
-        grade = replace(grade, accel_bias=TILT_SIGMA * G)
+        grade = replace(grade, accel_bias=TILT_SIGMA * nominal.G)
     gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))
     level, reasons = _estimate_level(inputs, span, metres_per_unit, origin.latitude, grade,
                                      gyro_noise)
-    reasons += _noise_reasons(noise.get('gyro', 0.0), grade_of(config.imu))
+    reasons += _noise_reasons(noise.get('gyro', 0.0), nominal.grade_of(config.imu))
     level = replace(level, C_np=_place_rotation(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, refusals = _select_heading(inputs, level, origin.latitude, grade,
                                                            config)
@@ -90,7 +77,7 @@ def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
         t = inputs.t_imu[rows]
         if len(t) < FEWEST_AT_REST:
             continue
-        C_nb = matrix_from_quat(quat_at(np.mean(t, keepdims=True), *epochs))[0]
+        C_nb = rotations.matrix_from_quat(rotations.quat_at(np.mean(t, keepdims=True), *epochs))[0]
         residual_rate = inputs.w_b[rows].mean(axis=0) - earth_rate_n @ C_nb - alignment.gyro_bias
         variance = alignment.gyro_noise**2 / (t[-1] - t[0]) + alignment.gyro_bias_sigma**2
         walk_variances.append((residual_rate**2 - variance).mean() / (t.mean() - alignment.t))
@@ -114,11 +101,11 @@ def _place_rotation(inputs: Inputs, span: Floats | tuple[float, float] | None, f
         selected = np.argmin(np.abs(inputs.t_fix - span[1]), keepdims=True)
     place_n = np.nan_to_num(np.median(fixes_n[selected], axis=0))
     latitude, longitude, _ = origin.to_geodetic(place_n)
-    return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
+    return rotations.transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
 def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
-                    grade: Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
+                    grade: nominal.Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
     if span is not None:
         return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
     t = inputs.t_imu
@@ -139,7 +126,7 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
     return level, (found,)
 
 
-def _noise_reasons(noise: float, grade: Grade) -> tuple[Reason, ...]:
+def _noise_reasons(noise: float, grade: nominal.Grade) -> tuple[Reason, ...]:
     """Return a caution if the gyro noise at rest far exceeds that of its grade."""
     times = noise / max(grade.gyro_noise, 1e-12)
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
@@ -161,7 +148,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
             for name, x in signals.items() if inputs.has_accelerometer or name == 'gyro'}
 
 
-def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                     config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
     setting = config.alignment.source
@@ -177,15 +164,15 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
 
 
-def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                         config: Config) -> HeadingOrRefusal:
+def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float,
+                         grade: nominal.Grade, config: Config) -> HeadingOrRefusal:
     if source == 'heading_topic':
         sent, t = inputs.external['heading']
         return _heading_from_orientations(t, sent.q_ni, sent.yaw_variance, np.eye(3), level,
                                           config, config.alignment.heading_offset)
     if source == 'imu_orientation':
         return _heading_from_orientations(inputs.t_imu, inputs.q_ni, inputs.yaw_variance,
-                                          transpose(inputs.C_bi), level, config)
+                                          rotations.transpose(inputs.C_bi), level, config)
     return _configured_heading(inputs, level,
                                config) if source == 'fixed' else _heading_by_gyrocompass(
         inputs, level, latitude, grade, config)
@@ -194,12 +181,12 @@ def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: fl
 def _configured_heading(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
-    mark_yaw = float(yaw_from_heading(config.alignment.heading))
+    mark_yaw = float(rotations.yaw_from_heading(config.alignment.heading))
     # the heading holds at the mark: subtract the turn since the standstill, and the direction of
     # north there
     turned = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
     turned += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
-    return (float(wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
+    return (float(rotations.wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
 
 
 def _turn_since(inputs: Inputs, level: Level) -> float:
@@ -207,8 +194,8 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
     if pick.sum() < 2:
         return 0.0
     rate = (inputs.w_b[pick] - level.mean_rate_b)
-    _, q = attitude(inputs.t_imu[pick], rate, quat_from_matrix(level.C_Lb), np.zeros(3))
-    C = matrix_from_quat(q[-1])
+    _, q = attitude(inputs.t_imu[pick], rate, rotations.quat_from_matrix(level.C_Lb), np.zeros(3))
+    C = rotations.matrix_from_quat(q[-1])
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
 
@@ -226,17 +213,17 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
         pick = (away <= heading_reach) & (away == away.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation at the start (covariance[0] = -1, or no message)'
-    C = matrix_from_quat(q[pick]) @ C_ib
+    C = rotations.matrix_from_quat(q[pick]) @ C_ib
     yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
         return None, (f'its sigma is {np.rad2deg(sigma):.3g} deg; the limit is '
                       f'{np.rad2deg(HEADING_LIMIT):.3g} deg')
-    return (float(wrap(yaw)), float(sigma)), ''
+    return (float(rotations.wrap(yaw)), float(sigma)), ''
 
 
-def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                             config: Config) -> HeadingOrRefusal:
     if inputs.local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
@@ -257,7 +244,8 @@ def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade
 
 
 def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats,
-                       origin: Origin, grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
+                       origin: Origin, grade: nominal.Grade,
+                       ) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = make_alignment(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
@@ -276,7 +264,7 @@ def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fix
         if long_enough.any():
             k = int(np.argmax(long_enough))
             yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
-            return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
+            return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
         what = f'less than {least:.0f} m from the start within {course_time:.0f} s'
     else:
         what = f'fewer than 2 fixes within {course_time:.0f} s of the start'

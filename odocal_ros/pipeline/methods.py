@@ -10,24 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.choice import (
-    choose,
-    deciding_methods,
-    disagreements,
-    rejected_method_reasons,
-)
+from odocal_ros.calib import choice
 from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.pipeline.beyond_model import (
-    delay_notes,
-    with_hills,
-    with_truncation,
-    with_wheel_change,
-)
+from odocal_ros.pipeline import beyond_model
 from odocal_ros.pipeline.prepare import checked_with_scale
 from odocal_ros.pipeline.prepared_leg import (
     MethodRun,
@@ -91,7 +81,7 @@ def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[R
         found += run.found
         scale = run.result.estimates['scale_factor'].value
         if run.delays is not None and scale is not None:
-            notes = delay_notes(prepared, run.delays, scale)
+            notes = beyond_model.delay_notes(prepared, run.delays, scale)
         is_usable = odometer is None or run.result.verdict is not Verdict.REJECTED
         if run.odometer is not None and is_usable:
             odometer = run.odometer
@@ -100,7 +90,8 @@ def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[R
 
 def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
     result = run.result
-    for add in (with_wheel_change, with_truncation, with_hills):
+    for add in (beyond_model.with_wheel_change, beyond_model.with_truncation,
+                beyond_model.with_hills):
         result = add(result, prepared)
     if result.name == 'two_point':
         result = replace(result, reasons=(
@@ -144,15 +135,15 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
-    computed = deciding_methods(selected_method, shown=True)
+    computed = choice.deciding_methods(selected_method, shown=True)
     names = [name for name in METHODS if name in computed]      # in the order of the output
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
-    found = [*reasons_on_data(runs, prepared), *disagreements(methods)]
-    found += rejected_method_reasons(methods, selected_method,
+    found = [*reasons_on_data(runs, prepared), *choice.disagreements(methods)]
+    found += choice.rejected_method_reasons(methods, selected_method,
                                      {r.code for r in (*prepared.reasons, *found)})
-    estimates, _ = choose(methods, selected_method)
+    estimates, _ = choice.choose(methods, selected_method)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
     track_fields: dict[str, Any] = {}
@@ -173,8 +164,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     of_outliers = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
     found = [r for k, r in enumerate(found) if k not in of_outliers[1:]]
     return leg_result(leg, inputs, (*prepared.reasons, *found), methods,
-                      distance=prepared.distance, deciding=deciding_methods(selected_method),
-                      path_ratio=prepared.path_ratio, **track_fields)
+                      deciding=choice.deciding_methods(selected_method),
+                      distance=prepared.distance, path_ratio=prepared.path_ratio, **track_fields)
 
 
 def _effort(names: Iterable[str]) -> int:

@@ -9,12 +9,7 @@ from itertools import chain
 
 import numpy as np
 
-from odocal_ros.calib.drive import (
-    check_drive,
-    check_path_and_speed,
-    motion_reasons,
-    odometer_span_reasons,
-)
+from odocal_ros.calib import drive
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
@@ -55,7 +50,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     accelerations = (imu_orientation.accelerations(inputs, located.rough)
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
-    reasons = (*reasons, *odometer_span_reasons(inputs.travel, inputs.t_stop))
+    reasons = (*reasons, *drive.odometer_span_reasons(inputs.travel, inputs.t_stop))
     axis_faults = forward_turn_reasons(accelerations) or turning(inputs, located, orientation,
                                                          config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
@@ -86,7 +81,7 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
                                        located.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
     wheel_reasons, wheel_slips = _compare_wheels(inputs, config, located, track, reasons)
-    distance, drive_reasons = check_drive(track, inputs.t_stop, located.rough, config.leg)
+    distance, drive_reasons = drive.check_drive(track, inputs.t_stop, located.rough, config.leg)
     # only methods by end points need straight legs
     end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
@@ -102,15 +97,15 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
 
 def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg with distance and speed checked by a more accurate scale."""
-    distance, drive_reasons = check_path_and_speed(prepared.track, prepared.inputs.t_stop, scale,
-                                                   prepared.config.leg)
+    distance, drive_reasons = drive.check_path_and_speed(
+        prepared.track, prepared.inputs.t_stop, scale, prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
         *(r for r in prepared.reasons if r.code not in SCALE_LIMIT_CODES), *drive_reasons))
 
 
 def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    refusal_reasons = motion_reasons(inputs.travel, inputs.t_fix, located.fixes_n,
+    refusal_reasons = drive.motion_reasons(inputs.travel, inputs.t_fix, located.fixes_n,
                                      located.fix_sigma, inputs.t_stop, inputs.least_motion)
     if refusal_reasons or not located.rough:
         return refusal_reasons or (Reason(

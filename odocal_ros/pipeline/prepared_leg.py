@@ -12,28 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib import track_check
 from odocal_ros.calib.evidence import KEPT_ROWS, make_evidence
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.scale_variation import counter_change_reasons
 from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW, WheelSlips
-from odocal_ros.calib.track_check import (
-    errors_per_distance,
-    track_residuals,
-    track_statistics,
-    worse_check_reasons,
-)
 from odocal_ros.data.arrays import Bools, by_row, Floats, running_sum
 from odocal_ros.data.leg import Leg
+from odocal_ros.nav import dead_reckoning
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import (
-    forward_b,
-    level_track,
-    mounting_from_forward,
-    Origin,
-    section_ratio,
-    Track,
-)
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
@@ -102,7 +90,7 @@ class PreparedLeg(LocatedFixes):
     alignment: Alignment
     alignment_reasons: tuple[Reason, ...]
     epochs: tuple[Floats, Floats]        # attitude after alignment, t (m,) s and q_nb (m, 4)
-    track: Track                         # dead reckoned from these and the mean of the wheels
+    track: dead_reckoning.Track          # from these and the mean of the wheels
     wheel_slips: WheelSlips              # of one wheel relative to the other
     metres_per_unit: float               # approximate, until a method estimates a better one
     distance: float                      # m, by it
@@ -111,7 +99,7 @@ class PreparedLeg(LocatedFixes):
     reasons: tuple[Reason, ...]          # of the leg
     end_reasons: tuple[Reason, ...]          # those that only concern methods by its ends
 
-    def path(self, f: Floats, track: Track | None = None) -> Path:
+    def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
         """Return the path of the antenna, t (n,) to (n, 3) m up to a constant, for f = K d."""
         track = self.track if track is None else track
 
@@ -125,7 +113,7 @@ class PreparedLeg(LocatedFixes):
         inputs, epochs = self.inputs, self.track.t
         turned = integral_at(epochs, inputs.t_imu, by_row(
             lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
-        path = level_track(self.track.s, turned)
+        path = dead_reckoning.level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
     @property
@@ -139,8 +127,9 @@ class PreparedLeg(LocatedFixes):
         """Return metres per unit of travel by fixes along ``level_path``, None if they stand."""
         t, travel = self.inputs.t_fix, self.inputs.travel
         k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
-        return section_ratio(travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
-                             max(self.inputs.least_motion, 8 * self.fix_sigma))
+        return dead_reckoning.section_ratio(
+            travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
+            max(self.inputs.least_motion, 8 * self.fix_sigma))
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """Return the antenna's position at t by fixes or surveyed mark, None without either."""
@@ -169,7 +158,7 @@ class PreparedLeg(LocatedFixes):
         return ()
 
 
-def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
+def attitude_of(inputs: Inputs, origin: dead_reckoning.Origin, t_begin: float, q_nb: Floats,
                 gyro_bias: Floats) -> tuple[Floats, Floats]:
     """Return the attitude from ``t_begin``, s, to the end: t (m,) s, q_nb (m, 4)."""
     rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
@@ -188,11 +177,12 @@ def configured_forward(prepared: PreparedLeg, f: Floats,
 
     f : as estimated; its angles are kept if ``estimates`` has no value of them.
     """
-    found = mounting_from_forward(f)
+    found = dead_reckoning.mounting_from_forward(f)
     determined = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in determined else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
-    return (prepared.nominal or prepared.path_ratio or prepared.rough) * forward_b(*angles)
+    scale = prepared.nominal or prepared.path_ratio or prepared.rough
+    return scale * dead_reckoning.forward_b(*angles)
 
 
 def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
@@ -200,7 +190,7 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
     """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
     if not between.any():
         return between, ()
-    residuals = track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
+    residuals = track_check.track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
     distances = np.hypot(*residuals[:, :2].T)
     usual_m = max(float(np.median(distances[between])), prepared.fix_sigma)
     track_outlier = 20.0    # times the usual distance from the track: a certain outlier
@@ -230,14 +220,14 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return fields, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
-    fields |= {'before': track_statistics(off_before, path_length),
-               'after': track_statistics(off_after, path_length)}
+    off_before, off_after = (track_check.track_residuals(path, pin, fixes) for path in paths)
+    fields |= {'before': track_check.track_statistics(off_before, path_length),
+               'after': track_check.track_statistics(off_after, path_length)}
     path_at = np.interp(fixes[0], *path_length_over_time(prepared))
-    fields['per_distance'] = errors_per_distance(path_at, off_before, off_after)
+    fields['per_distance'] = track_check.errors_per_distance(path_at, off_before, off_after)
     kept, outlier_reasons = without_outliers(prepared, after, start, between)
-    found += (*worse_check_reasons(path_at, off_before, off_after, bool(prepared.nominal)),
-              *outlier_reasons)
+    found += (*track_check.worse_check_reasons(
+        path_at, off_before, off_after, bool(prepared.nominal)), *outlier_reasons)
     leg_evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n,
                                  kept,
                                  start, paths, prepared.config, prepared.t_fit, prepared.covered)
@@ -255,8 +245,8 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    return {'check': asdict(track_statistics(track_residuals(path, pin, fixes),
-                                             path_length))}, found
+    residuals = track_check.track_residuals(path, pin, fixes)
+    return {'check': asdict(track_check.track_statistics(residuals, path_length))}, found
 
 
 def _start_position(prepared: PreparedLeg, path: Path) -> MarkFix | None:
@@ -287,7 +277,7 @@ def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
     return prepared.track.t, path_length * prepared.metres_per_unit
 
 
-def slip_check(prepared: PreparedLeg, track: Track, f: Floats,
+def slip_check(prepared: PreparedLeg, track: dead_reckoning.Track, f: Floats,
                between: tuple[float, float]) -> Slips:
     """Return the slips of the mean wheel between two times, s, except those of one wheel."""
     if not prepared.inputs.has_accelerometer:
