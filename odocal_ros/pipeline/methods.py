@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The methods, each a pure function of a leg, and the leg result from their results."""
+"""
+The methods, each a pure function of a prepared leg, and the result of the leg from theirs.
+
+``run_leg`` runs the methods that the settings select, and compares their tracks with the fixes.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -33,7 +37,7 @@ from odocal_ros.screening.inputs import Inputs, median_origin
 
 # judgement: relative computing time of the methods, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'smoother': 20}
-TRACKS = 2
+TRACKS_EFFORT = 2
 
 
 def _smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
@@ -51,8 +55,8 @@ METHODS: dict[str, Callable[[PreparedLeg, PassCallback], MethodRun]] = {
     'two_point': two_point, 'smoother': _smoother}
 # the result of a method that cannot estimate: (inputs, reason) to MethodResult
 REFUSED_RESULTS: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
-           'two_point': lambda inputs, reason: refused_result((reason,), inputs.scale_unit),
-           'smoother': _no_smoother}
+    'two_point': lambda inputs, reason: refused_result((reason,), inputs.scale_unit),
+    'smoother': _no_smoother}
 
 
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
@@ -75,20 +79,21 @@ def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[R
     of the odometer are from the last one that checks them and is not rejected, else the first.
     """
     found: list[Reason] = []
-    notes: list[Reason] = []
+    delay_reasons: list[Reason] = []
     odometer: tuple[Reason, ...] | None = None
     for run in (runs[name] for name in METHODS if name in runs):
-        found += run.found
+        found += run.data_reasons
         scale = run.result.estimates['scale_factor'].value
         if run.delays is not None and scale is not None:
-            notes = beyond_model.delay_notes(prepared, run.delays, scale)
+            delay_reasons = beyond_model.delay_notes(prepared, run.delays, scale)
         is_usable = odometer is None or run.result.verdict is not Verdict.REJECTED
-        if run.odometer is not None and is_usable:
-            odometer = run.odometer
-    return [*found, *(odometer or ()), *notes]
+        if run.odometer_reasons is not None and is_usable:
+            odometer = run.odometer_reasons
+    return [*found, *(odometer or ()), *delay_reasons]
 
 
 def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
+    """Return a run whose sigmas include errors that no method models."""
     result = run.result
     for add in (beyond_model.with_wheel_change, beyond_model.with_truncation,
                 beyond_model.with_hills):
@@ -100,6 +105,7 @@ def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
 
 
 def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) -> MethodRun:
+    """Return the result of ``work``; if it raises, a run without estimates."""
     inputs = prepared.inputs
     try:
         # divergence is detected by non-finite numbers, not by warnings
@@ -136,9 +142,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
     computed = choice.deciding_methods(selected_method, shown=True)
-    names = [name for name in METHODS if name in computed]      # in the order of the output
+    names = [name for name in METHODS if name in computed]
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
-    progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
+    progress(Stage('tracks', 1.0 - TRACKS_EFFORT / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
     found = [*reasons_on_data(runs, prepared), *choice.disagreements(methods)]
     found += choice.rejected_method_reasons(methods, selected_method,
@@ -169,7 +175,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
 
 
 def _effort(names: Iterable[str]) -> int:
-    return sum(METHOD_EFFORT[name] for name in names) + TRACKS
+    return sum(METHOD_EFFORT[name] for name in names) + TRACKS_EFFORT
 
 
 def _progress_reporter(names: Iterable[str],

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg for the planar estimator: wheels without an IMU, skid steering, mecanum wheels."""
+"""
+The planar estimator on one leg: wheels without an IMU, skid steering, mecanum and omni wheels.
+
+Input is the raw leg; wheels and positions are put on common times, nodes.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,16 +14,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
+from odocal_ros.calib.planar import run as planar
 from odocal_ros.calib.planar.result import make_planar_result, refused_planar_result
-from odocal_ros.calib.planar.run import (
-    Fit,
-    make_side_wheels,
-    MECANUM_ROWS,
-    PriorKnowledge,
-    Run,
-    wheel_rows,
-    Wheels,
-)
 from odocal_ros.calib.result import failed, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
@@ -33,7 +29,8 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
 from odocal_ros.settings.nominal import grade_of, nominal_scale
 
-LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
+# judgement: s between nodes, 0.1 rad of a turn; number of nodes
+NODE_INTERVAL, MOST_NODES = 0.1, 20_000
 FEWEST_POSITIONS = 10       # judgement: as for other methods
 # least distance for a slope, m and in sigmas of a height, judgement: longer than a room is high
 SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
@@ -41,7 +38,7 @@ SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
 GYRO_LEAST = 1e-3
 BY_AXLE = 'left before right of each axle from front to rear.'
 # reasons about the IMU, which the planar estimator does not need
-OF_IMU = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
+IMU_CODES = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
 
 
 def is_planar(leg: Leg, config: settings.Config) -> bool:
@@ -54,19 +51,19 @@ def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
                progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     inputs, found = screen(leg, config, check_faults=False)
-    reasons = [*notes, *(r for r in found if r.code not in OF_IMU)]
+    reasons = [*notes, *(r for r in found if r.code not in IMU_CODES)]
     progress(Stage(PLANAR))
-    run, lacking = _make_run(inputs, config)
+    run, missing = _make_run(inputs, config)
     if run is None:
-        methods = {PLANAR: refused_planar_result(lacking, inputs.scale_unit)}
-        return leg_result(leg, inputs, (*reasons, *lacking), methods, deciding=(PLANAR,))
-    method, more = _fit_guarded(run, inputs, config, progress)
-    return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
+        methods = {PLANAR: refused_planar_result(missing, inputs.scale_unit)}
+        return leg_result(leg, inputs, (*reasons, *missing), methods, deciding=(PLANAR,))
+    method, tracks = _fit_guarded(run, inputs, config, progress)
+    return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **tracks)
 
 
-def _fit_guarded(run: Run, inputs: Inputs, config: settings.Config,
-                 progress: Callable[[Stage], None], ) -> tuple[MethodResult, dict[str, Any]]:
-    """Return the method's result and plot data; an error only rejects the method."""
+def _fit_guarded(run: planar.Run, inputs: Inputs, config: settings.Config,
+                 progress: Callable[[Stage], None]) -> tuple[MethodResult, dict[str, Any]]:
+    """Return the method's result, and tracks as fields of LegResult; an error rejects both."""
     from odocal_ros.calib.planar.fit import fit_run
     unit = inputs.scale_unit
 
@@ -90,10 +87,11 @@ def _fit_guarded(run: Run, inputs: Inputs, config: settings.Config,
         return failed(unknown, PLANAR, error), {}
 
 
-def _make_run(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[Reason]]:
+def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | None, list[Reason]]:
+    """Return wheels, positions and gyro of a leg on common nodes; None and reasons if missing."""
     travels, kind = inputs.travels, config.odometer.drive
-    if lacking := _wheel_count_reason(kind, len(travels)):
-        return None, [lacking]
+    if wrong_count := _wheel_count_reason(kind, len(travels)):
+        return None, [wrong_count]
     low = max(0.0, *(one.t[0] for one in travels))
     high = min(inputs.t_stop, *(one.t[-1] for one in travels))
     inside = np.flatnonzero((inputs.t_fix >= low) & (inputs.t_fix <= high))
@@ -107,18 +105,20 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list
     covariance = inputs.covariance_n[used]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(one.at(t)) for one in travels])
-    wheels = (Wheels(steps.T, wheel_rows(kind, len(steps), config.odometer.wheel_offset), kind)
-              if kind in settings.HOLONOMIC else
-              make_side_wheels(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
+    if kind in settings.HOLONOMIC:
+        rows = planar.wheel_rows(kind, len(steps), config.odometer.wheel_offset)
+        wheels = planar.Wheels(steps.T, rows, kind)
+    else:
+        wheels = planar.make_side_wheels(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind)
     if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
-    return Run(t, wheels, node, position, sigma, _gyro_turns(inputs, t)), []
+    return planar.Run(t, wheels, node, position, sigma, _gyro_turns(inputs, t)), []
 
 
 def _wheel_count_reason(kind: str, count: int) -> Reason | None:
     """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
-        settings.MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
+        settings.MECANUM: ('4', count == len(planar.MECANUM_ROWS), BY_AXLE),
         settings.OMNI: (f'{settings.FEWEST_OMNI} or more', count >= settings.FEWEST_OMNI,
                         'counter-clockwise, the first at odometer.wheel_offset.')}.get(
         kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
@@ -129,11 +129,12 @@ def _wheel_count_reason(kind: str, count: int) -> Reason | None:
 
 def shortened_by_slopes(inputs: Inputs) -> float:
     """Return the relative shortening of the path by slopes: mean slope^2 / 2, minus its noise."""
-    have = ~np.isnan(inputs.geodetic[:, 2])
-    if have.sum() < FEWEST_POSITIONS:
+    has_height = ~np.isnan(inputs.geodetic[:, 2])
+    if has_height.sum() < FEWEST_POSITIONS:
         return 0.0
-    place = median_origin(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
-    variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
+    geodetic = inputs.geodetic[has_height]
+    place = median_origin(inputs.t_fix[has_height], geodetic).to_n(geodetic)
+    variance = np.median(np.einsum('kii->ki', inputs.covariance_n[has_height]), axis=0)
     path = running_sum(np.hypot(*np.diff(place[:, :2], axis=0).T))
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
     ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
@@ -146,10 +147,11 @@ def shortened_by_slopes(inputs: Inputs) -> float:
 
 def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
     """Return times of nodes, nodes with a position, and rows of positions, one per 0.1 s."""
-    gap = max(LEAST_NODE, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
-    used = np.flatnonzero(np.diff(np.floor((t_fix - t_fix[0]) / gap + 1e-6), prepend=-1.0) > 0)
+    interval = max(NODE_INTERVAL, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
+    number = np.floor((t_fix - t_fix[0]) / interval + 1e-6)
+    used = np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
     kept = t_fix[used]
-    parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * gap)), 1).astype(np.int64)
+    parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * interval)), 1).astype(np.int64)
     node = running_sum(parts)
     share = (np.arange(parts.sum()) - np.repeat(node[:-1], parts)) / np.repeat(parts, parts)
     t = np.append(np.repeat(kept[:-1], parts) + share * np.repeat(np.diff(kept), parts), kept[-1])
@@ -165,10 +167,11 @@ def _gyro_turns(inputs: Inputs, t: Floats) -> Floats:
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
-def known_values(run: Run, config: settings.Config) -> PriorKnowledge:
+def known_values(run: planar.Run, config: settings.Config) -> planar.PriorKnowledge:
+    """Return the prior knowledge of a run from the settings."""
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     grade = grade_of(config.imu)
-    known = PriorKnowledge(
+    known = planar.PriorKnowledge(
         width=config.odometer.track_width * (run.wheels.kind not in settings.HOLONOMIC),
         offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
         offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,
@@ -182,7 +185,8 @@ def known_values(run: Run, config: settings.Config) -> PriorKnowledge:
         run.t[-1] - run.t[0]))
 
 
-def _tracks(run: Run, found: Fit) -> dict[str, Any]:
+def _tracks(run: planar.Run, found: planar.Fit) -> dict[str, Any]:
+    """Return path length, track and positions as fields of LegResult."""
     pose = found.pose
     flat = np.column_stack([pose[:, :2], np.zeros(len(pose))])
     step = np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1)

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg prepared for the methods, its tracks before and after calibration, and their checks."""
+"""
+A leg prepared for the methods, and what is common to them.
+
+``PreparedLeg`` is the input of each method, ``MethodRun`` its output. The rest compares the tracks
+before and after calibration with the fixes.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -37,7 +42,7 @@ FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 class Paths(NamedTuple):
     """
-    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, up to a constant.
+    The antenna's path with the configured and with the calibrated values.
 
     Both have the same attitude and undetermined mounting angles: they only differ in the
     calibrated values.
@@ -51,25 +56,26 @@ class MethodRun(NamedTuple):
     """A method's result and its other findings."""
 
     result: MethodResult
-    paths: Paths | None = None         # None if it refuses
-    found: tuple[Reason, ...] = ()     # of the leg
+    paths: Paths | None = None                # None: no estimates
+    data_reasons: tuple[Reason, ...] = ()     # on the data, independent of the method
     # 'gnss' or 'odometer' to delay, s, and sigma; None from a method that estimates none
     delays: dict[str, tuple[float, float]] | None = None
-    # on slip or delay of its track relative to the IMU, used unless a better method has checked;
-    # None: not checked
-    odometer: tuple[Reason, ...] | None = None
+    # on slip or delay of the odometer relative to the IMU, used unless a better method has
+    # checked; None: not checked
+    odometer_reasons: tuple[Reason, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Stage:
     """A stage of the work on a leg."""
 
-    name: str = ''         # the running method, or ``track_results``; empty before the first
+    name: str = ''         # the running method, or 'tracks'; empty before the first
     done: float = 0.0      # share of the work in the stages before; a fit cannot be predicted
-    passes: int = 0        # of its fit so far
+    passes: int = 0        # passes of its fit so far
     change: float = nan    # largest one of a constant in the last pass, sigmas; NaN: none yet
 
     def words(self) -> str:
+        """Return the stage as text."""
         if not self.passes:
             return self.name
         change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'
@@ -84,7 +90,7 @@ class PreparedLeg(LocatedFixes):
     leg: Leg                             # raw
     inputs: Inputs                       # screened
     config: Config
-    imu_orientation: ImuOrientation | None                # IMU orientation, None if not determined
+    imu_orientation: ImuOrientation | None    # None: not determined
     lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
     spans: NDArray[np.float64]           # (s, 2) s, standstills
     alignment: Alignment
@@ -93,14 +99,14 @@ class PreparedLeg(LocatedFixes):
     track: dead_reckoning.Track          # from these and the mean of the wheels
     wheel_slips: WheelSlips              # of one wheel relative to the other
     metres_per_unit: float               # approximate, until a method estimates a better one
-    distance: float                      # m, by it
+    distance: float                      # m, path length by ``metres_per_unit``
     t_fit: float                         # s; if ``holdout``, later fixes are held out
     holdout: bool
     reasons: tuple[Reason, ...]          # of the leg
-    end_reasons: tuple[Reason, ...]          # those that only concern methods by its ends
+    end_reasons: tuple[Reason, ...]      # those that only concern methods by its ends
 
     def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
-        """Return the path of the antenna, t (n,) to (n, 3) m up to a constant, for f = K d."""
+        """Return the path of the antenna for f, (3,) scale times forward axis in b."""
         track = self.track if track is None else track
 
         def at(t: Floats) -> Floats:
@@ -173,14 +179,15 @@ def attitude_of(inputs: Inputs, origin: dead_reckoning.Origin, t_begin: float, q
 def configured_forward(prepared: PreparedLeg, f: Floats,
                        estimates: Mapping[str, Estimate]) -> Floats:
     """
-    Return f = K0 d0 of the settings, (3,) m per unit of travel; without K0 the path ratio's.
+    Return f of the settings, scale times forward axis in b: (3,) m per unit of travel.
 
-    f : as estimated; its angles are kept if ``estimates`` has no value of them.
+    Without a nominal scale it has the path ratio.   f : as estimated; its angles are kept if
+    ``estimates`` has no value of them.
     """
-    found = dead_reckoning.mounting_from_forward(f)
     determined = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in determined else angle for name, angle in zip(
-        ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
+        ('yaw_mounting_angle', 'pitch_mounting_angle'),
+        dead_reckoning.mounting_from_forward(f), strict=True)]
     scale = prepared.nominal or prepared.path_ratio or prepared.rough
     return scale * dead_reckoning.forward_b(*angles)
 
@@ -192,13 +199,13 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
         return between, ()
     residuals = track_check.track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
     distances = np.hypot(*residuals[:, :2].T)
-    usual_m = max(float(np.median(distances[between])), prepared.fix_sigma)
-    track_outlier = 20.0    # times the usual distance from the track: a certain outlier
-    is_far = distances > track_outlier * usual_m
-    found = (Reason(
-        Code.BAD_ROWS_DROPPED, f'{int((is_far & between).sum())} of {int(between.sum())} fixes '
-        f'are more than {track_outlier * usual_m:.0f} m from the track; not used in the check'),)
-    return ~is_far, found if (is_far & between).any() else ()
+    # 20 times the usual distance from the track: a certain outlier
+    limit_m = 20.0 * max(float(np.median(distances[between])), prepared.fix_sigma)
+    is_outlier = distances > limit_m
+    count = int((is_outlier & between).sum())
+    return ~is_outlier, (Reason(
+        Code.BAD_ROWS_DROPPED, f'{count} of {int(between.sum())} fixes are more than '
+        f'{limit_m:.0f} m from the track; not used in the check'),) * bool(count)
 
 
 def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
@@ -220,20 +227,19 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return fields, found
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    off_before, off_after = (track_check.track_residuals(path, pin, fixes) for path in paths)
-    fields |= {'before': track_check.track_statistics(off_before, path_length),
-               'after': track_check.track_statistics(off_after, path_length)}
-    path_at = np.interp(fixes[0], *path_length_over_time(prepared))
-    fields['per_distance'] = track_check.errors_per_distance(path_at, off_before, off_after)
+    residual_before, residual_after = (
+        track_check.track_residuals(path, pin, fixes) for path in paths)
+    fields |= {'before': track_check.track_statistics(residual_before, path_length),
+               'after': track_check.track_statistics(residual_after, path_length)}
+    errors = np.interp(fixes[0], *path_length_over_time(prepared)), residual_before, residual_after
+    fields['per_distance'] = track_check.errors_per_distance(*errors)
     kept, outlier_reasons = without_outliers(prepared, after, start, between)
-    found += (*track_check.worse_check_reasons(
-        path_at, off_before, off_after, bool(prepared.nominal)), *outlier_reasons)
-    leg_evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n,
-                                 kept,
-                                 start, paths, prepared.config, prepared.t_fit, prepared.covered)
-    found += counter_change_reasons(leg_evidence.sections, leg_evidence.t_fix,
-                                    leg_evidence.fix_distance)
-    return fields | {'evidence': leg_evidence}, found
+    evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
+                             start, paths, prepared.config, prepared.t_fit, prepared.covered)
+    return fields | {'evidence': evidence}, (
+        *found, *track_check.worse_check_reasons(*errors, bool(prepared.nominal)),
+        *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
+                                                  evidence.fix_distance))
 
 
 def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
@@ -250,6 +256,7 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
 
 
 def _start_position(prepared: PreparedLeg, path: Path) -> MarkFix | None:
+    """Return the antenna's position at the begin of the track, None without fixes there."""
     return prepared.mark(prepared.covered[0], path, 'start')
 
 
@@ -260,8 +267,8 @@ def _compared_section(prepared: PreparedLeg, path: Path,
     begin, end = start.t, prepared.t_fit
     found: tuple[Reason, ...] = ()
     if prepared.holdout:
-        pin, begin, end = prepared.mark(prepared.t_fit,
-                                        path), prepared.t_fit, prepared.inputs.t_stop
+        pin = prepared.mark(prepared.t_fit, path)
+        begin, end = prepared.t_fit, prepared.inputs.t_stop
     end = min(end, prepared.covered[1])
     between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
     if pin is not None:
@@ -284,7 +291,7 @@ def slip_check(prepared: PreparedLeg, track: dead_reckoning.Track, f: Floats,
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
                        prepared.origin.latitude, count_size(prepared.inputs.travel))
-    known = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
-    held = (slips.t >= between[0]) & (slips.t <= between[1]) & ~known
-    return slips._replace(t=slips.t[held], size=slips.size[held],
-                          unforced_sign=slips.unforced_sign[held])
+    of_one_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
+    kept = (slips.t >= between[0]) & (slips.t <= between[1]) & ~of_one_wheel
+    return slips._replace(t=slips.t[kept], size=slips.size[kept],
+                          unforced_sign=slips.unforced_sign[kept])

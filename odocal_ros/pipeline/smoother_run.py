@@ -65,7 +65,7 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     odometer = slip_reasons(slip_check(prepared, track, f, (0.0, prepared.t_fit)),
                             prepared.config.odometer.time_offset) if leg.uses_speed_steps else ()
     return MethodRun(method, Paths(before, _delayed_path(track, f, lever_b, delays_s['gnss'])),
-                     delays=observed_delays, odometer=odometer)
+                     delays=observed_delays, odometer_reasons=odometer)
 
 
 def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:

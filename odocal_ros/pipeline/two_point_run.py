@@ -13,7 +13,6 @@ from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.track_check import cut_pieces, reversal_reasons
 from odocal_ros.calib.two_point import (
     Chord,
     fit,
@@ -35,8 +34,6 @@ from odocal_ros.pipeline.prepared_leg import (
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import corrected_forward_axis
 
-NAMES = ('start', 'end')
-
 
 def two_point(prepared: PreparedLeg, report_pass: PassCallback | None = None) -> MethodRun:
     """Run the two-point method on a leg; it is not iterative."""
@@ -44,30 +41,30 @@ def two_point(prepared: PreparedLeg, report_pass: PassCallback | None = None) ->
 
 
 class TwoPointRun:
-    """One run of the method over a leg."""
+    """One run of the method on a leg; collects its reasons."""
 
     def __init__(self, prepared: PreparedLeg) -> None:
         self.prepared, self.inputs = prepared, prepared.inputs
         self.config, self.track = prepared.config, prepared.track
-        self.reasons: list[Reason] = []     # of the method
-        self.found: list[Reason] = []       # of the data
-        self.slip: tuple[Reason, ...] = ()
+        self.reasons: list[Reason] = []            # on the method
+        self.data_reasons: list[Reason] = []
+        self.slip_reasons: tuple[Reason, ...] = ()
 
     def result(self) -> MethodRun:
-        """Return the method's result and the path."""
+        """Return the method's result, the paths before and after, and the reasons."""
         chord = self._chord()
         refused = tuple(self.reasons) if chord is None else refusal_reasons(
             chord, self.prepared.rough)
         if chord is None or refused:
             return MethodRun(refused_result(refused, self.inputs.scale_unit),
-                             found=tuple(self.found))
+                             data_reasons=tuple(self.data_reasons))
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
         inside, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
                                                    chord.start, between)
         between &= inside
-        self.found += outlier_reasons
+        self.data_reasons += outlier_reasons
         factor = np.ones(3)
         if between.sum() >= 3:
             chord, factor = self._fit_noise(chord, f, between)
@@ -80,30 +77,30 @@ class TwoPointRun:
         f = method.details['f']
         paths = Paths(*map(self.prepared.path,
                            (configured_forward(self.prepared, f, method.estimates), f)))
-        return MethodRun(method, paths, tuple(self.found), odometer=self.slip)
+        return MethodRun(method, paths, tuple(self.data_reasons),
+                         odometer_reasons=self.slip_reasons)
 
     def _find_slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
-        """Return slips of the mean between the marks, s and m; set ``slip`` to their reasons."""
+        """Return times, s, and sizes, m, of slips of the mean wheel; set ``slip_reasons``."""
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
         forward = corrected_forward_axis(self.prepared.imu_orientation, f)
         slips = slip_check(self.prepared, self.track, forward, ends)
-        self.slip = slip_reasons(slips, self.config.odometer.time_offset)
-        one = self.prepared.wheel_slips      # of one wheel: its share in the mean
+        self.slip_reasons = slip_reasons(slips, self.config.odometer.time_offset)
+        one = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
         inside = (one.t >= ends[0]) & (one.t <= ends[1])
-        in_mean = one.size[inside] / one.count
-        return np.append(slips.t, one.t[inside]), np.append(slips.size, in_mean)
+        return (np.append(slips.t, one.t[inside]),
+                np.append(slips.size, one.size[inside] / one.count))
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks; None, with a reason, without fixes."""
         prepared, track = self.prepared, self.track
-        ends = (prepared.covered[0], min(prepared.t_fit, prepared.covered[1]))
         path = prepared.path(np.array([prepared.rough, 0.0, 0.0]))
-        start, end = (prepared.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True))
-        for mark, name in zip((start, end), NAMES, strict=True):
-            if mark is None:
-                self.reasons.append(Reason(Code.NO_FIX, f'no usable fix at the {name} mark'))
+        start = prepared.mark(prepared.covered[0], path, 'start')
+        end = prepared.mark(min(prepared.t_fit, prepared.covered[1]), path, 'end')
+        self.reasons += [Reason(Code.NO_FIX, f'no usable fix at the {name} mark')
+                         for name, mark in (('start', start), ('end', end)) if mark is None]
         if start is None or end is None:
             return None
         chord = Chord(track, prepared.origin, start, end, prepared.lever_b,
@@ -167,13 +164,14 @@ class TwoPointRun:
 
     def _check_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:
+        """Collect the reasons against the track: reversing, distance from the fixes, bend."""
         prepared, (t, p) = self.prepared, fixes
         # track errors count as noise
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
         sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
-        pieces = cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
-        found = reversal_reasons(pieces, self.config.odometer.signed)
-        self.found += found
+        pieces = track_check.cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
+        found = track_check.reversal_reasons(pieces, self.config.odometer.signed)
+        self.data_reasons += found
         if not found:
             residuals = track_check.track_residuals(prepared.path(f), chord.start, fixes)
             statistics = track_check.track_statistics(residuals, prepared.distance)
@@ -187,6 +185,6 @@ class TwoPointRun:
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
         if (backwards and self.prepared.imu_orientation is None
                 and not chord.alignment.heading_separable):
-            self.found.append(Reason(
+            self.data_reasons.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
                 'mean backwards, or the vehicle reversed during the whole leg'))

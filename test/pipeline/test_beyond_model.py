@@ -94,7 +94,7 @@ SPEED = {'scenario': 'town', 'odometer': 'speed', 'scale': 1.01, 'nominal_scale'
 
 def run(name, odometer, reasons=()):
     method = MethodResult(name, reasons, {'scale_factor': Estimate(1.0, 0.01, '1')}, (), (), {})
-    return MethodRun(method, odometer=odometer)
+    return MethodRun(method, odometer_reasons=odometer)
 
 
 @pytest.mark.parametrize(('smoother', 'delay_texts'), [
