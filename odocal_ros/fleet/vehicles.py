@@ -216,7 +216,7 @@ def _current_state(calibration: Calibration, config: Config, driven: Sequence[Dr
         'verdict': calibration.verdict.value,
         'decision': acceptance.decision.value if acceptance else '',
         'why': acceptance.why if acceptance else '',
-        'remedy': acceptance.do if acceptance else '',
+        'remedy': acceptance.remedy if acceptance else '',
         'line': accept_line(calibration, acceptance, config) if acceptance else '',
         'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
 

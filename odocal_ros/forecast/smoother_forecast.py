@@ -29,7 +29,7 @@ from odocal_ros.forecast.forecast import (
     WheelsForecast,
 )
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
-from odocal_ros.pipeline.calibrate import NOT_YET
+from odocal_ros.pipeline.calibrate import PROVISIONAL_CODES
 from odocal_ros.pipeline.planar_run import planar_leg
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Verdict
@@ -44,7 +44,8 @@ STOP_ACCELERATION, STOP_SPEED = 1.5, 5.0
 # of the fixes
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
-TEMPORARY_CODES = NOT_YET | {Code.ODOMETER_STILL}     # codes that disappear with more driving
+# codes that disappear with more driving
+TEMPORARY_CODES = PROVISIONAL_CODES | {Code.ODOMETER_STILL}
 DRIVE_ON = 'drive straights, and turn on the spot in both directions'
 
 

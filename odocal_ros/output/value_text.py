@@ -229,7 +229,7 @@ def accept_words(acceptance: Acceptance) -> list[str]:
     lines = [acceptance.decision.value, *(f'  {_value(entry)}' for entry in acceptance.values)]
     if acceptance.why:
         lines.append(f'  {acceptance.why}')
-    return lines + ([f'  -> {acceptance.do}'] if acceptance.do else [])
+    return lines + ([f'  -> {acceptance.remedy}'] if acceptance.remedy else [])
 
 
 def _value(entry: ValueDecision) -> str:

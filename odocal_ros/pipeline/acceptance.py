@@ -37,16 +37,17 @@ class Decision(Enum):
 
 @dataclass(frozen=True)
 class ValueDecision:
-    """A value compared with its limits; required_sigma: the sigma with which it would pass."""
+    """A value compared with its limits."""
 
     name: str
     estimate: Estimate
-    low: float
+    low: float        # limits, in the unit of the estimate; infinite: none
     high: float
     decision: Decision
-    required_sigma: float | None = None
+    required_sigma: float | None = None    # with which it would pass; None: with no sigma
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json."""
         return {'decision': self.decision.value, **self.estimate.as_dict(),
                 'low': self.low if math.isfinite(self.low) else None,
                 'high': self.high if math.isfinite(self.high) else None,
@@ -60,11 +61,12 @@ class Acceptance:
     decision: Decision
     values: tuple[ValueDecision, ...]
     why: str = ''
-    do: str = ''
+    remedy: str = ''
 
     def as_dict(self) -> dict[str, Any]:
-        return {'decision': self.decision.value, 'why': self.why, 'remedy': self.do,
-                'values': {held.name: held.as_dict() for held in self.values}}
+        """Return the entry of calibration.json."""
+        return {'decision': self.decision.value, 'why': self.why, 'remedy': self.remedy,
+                'values': {one.name: one.as_dict() for one in self.values}}
 
 
 def decide(value: float, sigma: float, low: float, high: float) -> Decision:
@@ -87,51 +89,52 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
                    for name, (low, high) in config.accept.limits.items())
     if not values:
         return None
-    worst = max((held.decision for held in values), key=list(Decision).index)
+    worst = max((one.decision for one in values), key=list(Decision).index)
     is_withheld = calibration.verdict is Verdict.REJECTED or (
         config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
     if calibration.verdict is Verdict.REJECTED or (is_withheld and worst is Decision.PASS):
         why = next(r for r in calibration.reasons if r.code.severity is calibration.verdict)
         return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: {why}',
                           why.remedy)
-    undecided = [held for held in values if held.decision is Decision.UNDECIDED]
     if worst is not Decision.UNDECIDED:
         return Acceptance(worst, values)
-    explanations = [_explain_undecided(held, calibration.reasons) for held in undecided]
+    explanations = [_explain_undecided(one, calibration.reasons) for one in values
+                    if one.decision is Decision.UNDECIDED]
     return Acceptance(worst, values, '; '.join(why for why, _ in explanations),
-                      ' '.join(dict.fromkeys(do for _, do in explanations)))
+                      ' '.join(dict.fromkeys(remedy for _, remedy in explanations)))
 
 
 def decide_value(name: str, found: Estimate, low: float, high: float) -> ValueDecision:
+    """Return the decision on an estimate; an angle is compared modulo one turn."""
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
         return ValueDecision(name, found, low, high, Decision.UNDECIDED)
     if found.unit == 'rad':      # wrapped to within half a turn of the limits
         middle = low if math.isinf(high) else high if math.isinf(low) else (low + high) / 2
         value = middle + float(wrap(value - middle))
-    room = min(value - low, high - value)
+    margin = min(value - low, high - value)
     return ValueDecision(name, found, low, high, decide(value, sigma, low, high),
-                         room / LIMIT_SIGMAS if room > 0 else None)
+                         margin / LIMIT_SIGMAS if margin > 0 else None)
 
 
-def _explain_undecided(held: ValueDecision, reasons: tuple[Reason, ...]) -> tuple[str, str]:
+def _explain_undecided(undecided: ValueDecision, reasons: tuple[Reason, ...]) -> tuple[str, str]:
     """Return the explanation why a value is undecided, and the remedy."""
-    name, found = held.name.replace('_', ' '), held.estimate
+    name, found = undecided.name.replace('_', ' '), undecided.estimate
     if found.value is None or found.sigma is None:
-        about = 'scale_factor' if held.name == 'scale_ratio' else held.name
+        about = 'scale_factor' if undecided.name == 'scale_ratio' else undecided.name
         reason = next((r for r in reasons if REASON_ESTIMATES.get(r.code) == about), None)
-        if held.name == 'scale_ratio' and reason is None:
+        if undecided.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
-        return f'{name} is not determined', (reason or DRIVE_MORE[held.name]).remedy
-    of, unit = (math.degrees(1.0), ' deg') if found.unit == 'rad' else (1.0, '')
-    if held.required_sigma is None:
+        return f'{name} is not determined', (reason or DRIVE_MORE[undecided.name]).remedy
+    factor, unit = (math.degrees(1.0), ' deg') if found.unit == 'rad' else (1.0, '')
+    if undecided.required_sigma is None:
         turn = math.tau if unit else math.inf
         excess, limit = min(((math.remainder(found.value - x, turn), x) for x in (
-            held.low, held.high) if math.isfinite(x)), key=lambda pair: abs(pair[0]))
-        return (f'{name} is {of * (limit + excess):.5g}{unit}, beyond its limit of '
-                f'{of * limit:.5g}{unit} by less than {LIMIT_SIGMAS:g} sigma (sigma '
-                f'{of * found.sigma:.2g}{unit})', DRIVE_MORE[held.name].remedy)
-    factor = (found.sigma / held.required_sigma)**2
-    return (f'{name} is within its limits, but its sigma is {of * found.sigma:.2g}{unit}; the '
-            f'limit is {of * held.required_sigma:.2g}{unit} (needs about {math.ceil(factor)} '
-            'times as many such legs)', DRIVE_MORE[held.name].remedy)
+            undecided.low, undecided.high) if math.isfinite(x)), key=lambda pair: abs(pair[0]))
+        return (f'{name} is {factor * (limit + excess):.5g}{unit}, beyond its limit of '
+                f'{factor * limit:.5g}{unit} by less than {LIMIT_SIGMAS:g} sigma (sigma '
+                f'{factor * found.sigma:.2g}{unit})', DRIVE_MORE[undecided.name].remedy)
+    legs = math.ceil((found.sigma / undecided.required_sigma)**2)
+    return (f'{name} is within its limits, but its sigma is {factor * found.sigma:.2g}{unit}; the '
+            f'limit is {factor * undecided.required_sigma:.2g}{unit} (needs about {legs} '
+            'times as many such legs)', DRIVE_MORE[undecided.name].remedy)

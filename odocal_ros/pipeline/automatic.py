@@ -40,27 +40,33 @@ class Span:
 
 
 class LegSearch:
-    """Search for legs in rows, in blocks of any size; ``spans`` are found, the open one last."""
+    """
+    Search for legs in rows of IMU, odometer and fixes, fed in blocks of any size.
+
+    The legs found are ``spans``, the open one last.
+    """
 
     def __init__(self, config: Config) -> None:
         self._steps: StepReader | None = None
-        self._still = 0.0
+        self._still = 0.0      # scale units, travel that is no motion
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(LEG_END_REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)
         self._max_gap_ns = round(config.leg.max_gap * 1e9)
         surveyed = config.reference.start and config.reference.end
+        # first stamp of each topic that a leg needs, 0 before it
         self._first_ns = dict.fromkeys(('imu', 'odometer') + (() if surveyed else ('fix',)), 0)
         self.spans: deque[Span] = deque()
         most_waiting = 200_000    # odometer rows that wait for the IMU
         # stamp and travel of odometer rows
         self._waiting: deque[tuple[int, float]] = deque(maxlen=most_waiting)
         self._gaps: deque[tuple[int, int]] = deque()         # of the IMU: both edges
-        self._imu_ns = 0
+        self._imu_ns = 0              # newest stamp of the IMU
         self._travel = 0.0
-        self._anchor: tuple[int, float] | None = None        # of the last motion
-        self._newest_ns = self._from_ns = 0
-        self._needs_rest = False
+        self._anchor: tuple[int, float] | None = None        # stamp, travel of the last motion
+        self._newest_ns = 0           # newest odometer row evaluated
+        self._from_ns = 0             # no leg begins before
+        self._needs_rest = False      # the next leg begins after a standstill
 
     @property
     def open_span(self) -> Span | None:
@@ -107,6 +113,7 @@ class LegSearch:
                 self._evaluate_row(t, s)
 
     def _evaluate_row(self, t: int, s: float) -> None:
+        """Begin or end a leg by an odometer row: stamp, ns, and travel."""
         while self._gaps and self._gaps[0][0] < t:
             last, resumed = self._gaps.popleft()
             self._end_leg(last)
@@ -121,11 +128,12 @@ class LegSearch:
         else:
             self._handle_standstill(t, self._anchor[0])
 
-    def _handle_motion(self, t: int, stood_ns: int) -> None:
-        self._handle_standstill(t - START_REST_NS, stood_ns)
-        rested = t - stood_ns >= self._standstill_ns
-        leg, motion_ns = self.open_span, max(t - START_REST_NS, stood_ns, self._from_ns)
-        if leg is not None and rested and self._long_enough(leg, stood_ns):
+    def _handle_motion(self, t: int, since_ns: int) -> None:
+        """Begin or end a leg at motion at t after a standstill since ``since_ns``."""
+        self._handle_standstill(t - START_REST_NS, since_ns)
+        rested = t - since_ns >= self._standstill_ns
+        leg, motion_ns = self.open_span, max(t - START_REST_NS, since_ns, self._from_ns)
+        if leg is not None and rested and self._long_enough(leg, since_ns):
             self._end_leg(motion_ns)
         elif leg is not None and t - leg.start_ns >= self._longest_ns:
             self._end_leg(t)
@@ -134,10 +142,11 @@ class LegSearch:
             self.spans.append(Span(motion_ns))
 
     def _handle_standstill(self, t: int, since_ns: int) -> None:
-        stood_ns = t - since_ns
-        self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
+        """End a leg at a standstill from ``since_ns`` to t that is long enough."""
+        duration_ns = t - since_ns
+        self._needs_rest = self._needs_rest and duration_ns < self._standstill_ns
         leg = self.open_span
-        if leg is not None and (stood_ns >= PARKED_NS or stood_ns >= self._rest_ns
+        if leg is not None and (duration_ns >= PARKED_NS or duration_ns >= self._rest_ns
                                 and self._long_enough(leg, since_ns)):
             self._end_leg(since_ns + self._rest_ns)
 

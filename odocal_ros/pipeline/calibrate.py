@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The pipeline: one pure function from a leg to its result, one from results to a calibration.
+The pipeline: ``calibrate`` from a leg to its result, ``combine`` from results to a calibration.
 
-No state, no clock, no files: the live node and the replay only call these. A leg is cut at gaps of
-the IMU, and at sections where the vehicle was carried; its parts are legs of the same vehicle.
+Pure functions without state, clock or files, called by the node and the replay. A leg is cut at
+gaps of the IMU, and at sections where the vehicle was carried (``calibrate_parts``); its parts are
+legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +38,7 @@ from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'screen_leg', 'Screened']
 # reasons that disappear with more driving
-NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
+PROVISIONAL_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
 
 class Screened(NamedTuple):
@@ -64,53 +65,55 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     if is_planar(leg, config):
         return planar_leg(leg, config, notes, progress)
-    seen = screen_leg(leg, config, notes)
-    leg, inputs = seen.leg, seen.inputs
+    screened = screen_leg(leg, config, notes)
+    leg, inputs = screened.leg, screened.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
         return leg_result(leg, inputs, found) if prepared is None else run_leg(prepared, progress)
 
-    if not seen.usable:
-        return leg_result(leg, inputs, seen.reasons)
-    result = result_of(inputs, seen.reasons)
+    if not screened.usable:
+        return leg_result(leg, inputs, screened.reasons)
+    result = result_of(inputs, screened.reasons)
     back, scale = _reversed_sections(result, inputs)
     if not len(back):
         return result
     found = reversing_reasons(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
-    return result_of(inputs.mirrored(back), (*seen.reasons, *found))
+    return result_of(inputs.mirrored(back), (*screened.reasons, *found))
 
 
-def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
-    """Return reasons as in ``calibrate``, but of methods and what more driving removes."""
-    reasons = seen.reasons
-    if seen.usable:
-        config = settings_by_frame(seen.leg.fix, config)
-        _, reasons = prepare(seen.leg, seen.inputs, config, reasons)
+def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:
+    """Return the faults of a leg's data, without reasons that disappear with more driving."""
+    reasons = screened.reasons
+    if screened.usable:
+        config = settings_by_frame(screened.leg.fix, config)
+        _, reasons = prepare(screened.leg, screened.inputs, config, reasons)
     return tuple(r for r in reasons
-                 if r.code.severity is not Verdict.ACCEPTED and r.code not in NOT_YET)
+                 if r.code.severity is not Verdict.ACCEPTED and r.code not in PROVISIONAL_CODES)
 
 
 def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
-    """Return the inputs of a leg, z up."""
+    """Return a leg with its usable inputs, z of b up, and the reasons of the screening."""
     config = settings_by_frame(leg.fix, config)
     leg, inputs, found = screen_aligned(leg, config)
     reasons = (*notes, *found)
     missing = missing_data_reasons(leg, inputs)
     if missing or not len(inputs.t_fix):
-        seen = {r.code for r in reasons}
-        return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in seen)),
+        known = {r.code for r in reasons}
+        return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in known)),
                         False)
-    sanity, z_down = unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
+    imu_reasons, z_down = unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
+                                                config.imu)
     # takes precedence: the mean gravity of the other test is then meaningless
-    moved = gravity_turn_reasons(inputs)
-    sanity, z_down = (moved, False) if moved else (sanity or unit_change_reasons(inputs), z_down)
-    reasons += tuple(with_axes(sanity, inputs))
+    if moved := gravity_turn_reasons(inputs):
+        imu_reasons, z_down = moved, False
+    imu_reasons = imu_reasons or unit_change_reasons(inputs)
+    reasons += tuple(with_axes(imu_reasons, inputs))
     release_mapped_memory()
     if z_down:      # forward-right-down: rotated to forward-left-up
         C = matrix_from_rpy([np.pi, 0.0, 0.0])
         inputs = replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
-    return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in sanity})
+    return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in imu_reasons})
 
 
 def _reversed_sections(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
@@ -159,19 +162,19 @@ def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
 def _imu_gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
     near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
-    near, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
-    if by_step(lambda stamps: np.diff(stamps) > 0, near).all():      # a view of them
-        near = near[slice(*np.searchsorted(near, [first_ns, leg.stop_ns + 1]))]
+    stamps, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
+    if by_step(lambda x: np.diff(x) > 0, stamps).all():      # a view of them
+        stamps = stamps[slice(*np.searchsorted(stamps, [first_ns, leg.stop_ns + 1]))]
     else:
-        near = np.unique(near[(near >= first_ns) & (near <= leg.stop_ns)])
-    if len(near) < 2:
+        stamps = np.unique(stamps[(stamps >= first_ns) & (stamps <= leg.stop_ns)])
+    if len(stamps) < 2:
         return np.empty((0, 2), np.int64)
     gap_margin_ns = 1000    # below the limit: larger than the rounding of seconds
     least_ns = round(limit_s * 1e9) - gap_margin_ns
-    k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
-    begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
+    k = np.flatnonzero(by_step(lambda x: np.diff(x) > least_ns, stamps))
+    begin, end = np.append(stamps[k], stamps[-1]), np.append(stamps[k + 1], leg.stop_ns)
     if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
-        begin, end = (np.sort(np.append(stamps, leg.start_ns)) for stamps in (begin, end))
+        begin, end = (np.sort(np.append(x, leg.start_ns)) for x in (begin, end))
     t = (np.stack([begin, end], -1) - leg.start_ns) * 1e-9
     return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
 
@@ -201,9 +204,8 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     if not good:
         whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
         carried_reason = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
-        good = usable_results(_between_gaps(leg,
-                                            _carried_sections(leg,
-                                                              config))) if carried_reason else []
+        if carried_reason:
+            good = usable_results(_between_gaps(leg, _carried_sections(leg, config)))
         if not good:
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:

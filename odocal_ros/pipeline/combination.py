@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Combination of legs to a calibration: selection, legs of other vehicles, reasons."""
+"""
+Combination of the results of legs to the calibration of a vehicle.
+
+Selects the usable legs, combines each method, chooses the method of each value, and collects the
+reasons, including those against legs of different vehicles.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,7 +33,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD
 from odocal_ros.settings.nominal import nominal_scale
 
-# reasons of one leg that do not hold for several
+# reasons of a single leg that do not hold for several
 SINGLE_LEG_CODES = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE,
                     Code.SCALE_FAR_FROM_NOMINAL}
 # the same for legs combined by marginal information: together they may determine more
@@ -58,17 +63,17 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     if carried and (min(leg.start_ns for leg in used) <= carried.last_ns or any(
             m.estimates['scale_factor'].unit != carried.unit for m in smoother_results)):
         carried = None
-    # of other legs than those that determined the IMU constants
-    before = carried or (imu if imu and not any(
+    # the IMU constants must be by other legs than these
+    earlier = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
     methods = {name: _combine_method(name, [
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
-        if leg in used and name in leg.methods], config, before, has_local_positions(used))
+        if leg in used and name in leg.methods], config, earlier, has_local_positions(used))
         for name in method_names}
     with_marginal = {name for leg in used for name, m in leg.methods.items() if m.marginal}
     estimates, estimating_methods = choose(methods, config.method)
     reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
-                           before is not None)
+                           earlier is not None)
     if estimating_methods:
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.severity is Verdict.REJECTED}
@@ -92,34 +97,38 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
 
 
 def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],
-                                before: CarriedInformation | None) -> CarriedInformation | None:
-    """Return the marginal information of legs for later ones, None without any."""
+                                carried: CarriedInformation | None) -> CarriedInformation | None:
+    """Return the information of earlier and these legs for later ones, None without any."""
     combined = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
     if combined is None or combined.marginal is None or not times:
         return None
     return CarriedInformation(combined.marginal, combined.estimates['scale_factor'].unit,
-                              before.first_ns if before else min(times), max(times),
-                              len(times) + (before.legs if before else 0))
+                              carried.first_ns if carried else min(times), max(times),
+                              len(times) + (carried.legs if carried else 0))
 
 
 def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
     """Return legs that share over a tenth of their time with an earlier one: not independent."""
     start, stop = (np.array([getattr(leg, at) for leg in legs], np.int64)
                    for at in ('start_ns', 'stop_ns'))
-    overlapping = np.zeros(len(legs), bool)
+    overlaps = np.zeros(len(legs), bool)
     for i in range(len(legs)):
         shared = np.minimum(stop[i], stop[:i]) - np.maximum(start[i], start[:i])
-        overlapping[i] = (~overlapping[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
-    return [leg for leg, again in zip(legs, overlapping.tolist(), strict=True) if again]
+        overlaps[i] = (~overlaps[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
+    return [leg for leg, is_excluded in zip(legs, overlaps.tolist(), strict=True) if is_excluded]
 
 
 def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequence[int],
                     config: Config, numbers: Sequence[int] | None = None,
                     carried: CarriedInformation | None = None,
                     local: bool = False) -> MethodResult:
-    """Return the result of a method for several legs, including carried ones if possible."""
+    """
+    Return the result of a method for several legs, including carried ones if possible.
+
+    times_ns, numbers : of each result, when it was driven, and its number in reasons.
+    """
     if carried and all(r.marginal for r in results):
         unknown = {parameter: Estimate(None, None, e.unit)
                    for parameter, e in results[0].estimates.items()}
@@ -136,7 +145,11 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
 
 def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
                     carried: CarriedInformation | None, local: bool) -> MethodResult:
-    """Return a method's combination of the legs without rejection; of all if all have one."""
+    """
+    Return a method's combination of the legs without rejection; of all if all have one.
+
+    driven : (result, time, ns, number) of each leg.
+    """
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,
@@ -187,19 +200,18 @@ def _additional_reasons(method: MethodResult, leg: LegResult) -> list[Reason]:
 
 
 def _rejection_text(reasons: Sequence[Reason]) -> str:
+    """Return the texts of the rejecting reasons."""
     return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.severity is Verdict.REJECTED))
 
 
-def _imu_rotation(estimates: Mapping[str, Estimate],
-                  C_bi: Floats | None) -> tuple[
-        tuple[float, ...] | None, tuple[float, ...] | None]:
+def _imu_rotation(estimates: Mapping[str, Estimate], C_bi: Floats | None,
+                  ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
     """Return the static rotation base_link <- imu frame, x y z w and rpy, None without a yaw."""
-    yaw = estimates.get('yaw_mounting_angle')
-    pitch = estimates.get('pitch_mounting_angle')
-    if C_bi is None or yaw is None or yaw.value is None:
+    yaw, pitch = (None if (e := estimates.get(f'{name}_mounting_angle')) is None else e.value
+                  for name in ('yaw', 'pitch'))
+    if C_bi is None or yaw is None:
         return None, None
-    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0, yaw.value]
-    C_vi = matrix_from_rpy(small) @ C_bi
+    C_vi = matrix_from_rpy([0.0, pitch or 0.0, yaw]) @ C_bi
     return (tuple(float(x) for x in quat_from_matrix(C_vi)),
             tuple(float(x) for x in rpy_from_matrix(C_vi)))
 
@@ -211,11 +223,10 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
     scales = [scale for scale in _values_by_leg('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
-        which = '; '.join(f'{unit} in leg '
-                          + ', '.join(str(s.leg) for s in scales if s.unit == unit)
-                          for unit in units)
+        legs_by_unit = '; '.join(f'{unit} in leg ' + ', '.join(
+            str(s.leg) for s in scales if s.unit == unit) for unit in units)
         return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
-                       f'cannot be combined: {which}'),)
+                       f'cannot be combined: {legs_by_unit}'),)
     extremes = _significant_extremes(scales)
     if extremes and (more := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
         low, high = extremes
@@ -237,7 +248,7 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
 class _LegValue(NamedTuple):
     """The estimate of one value by one leg."""
 
-    leg: int
+    leg: int    # its number
     value: float
     sigma: float
     unit: str
@@ -245,16 +256,15 @@ class _LegValue(NamedTuple):
 
 def _values_by_leg(name: str,
                    estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
-    of_legs = ((leg, of_leg.get(name)) for leg, of_leg in estimates)
-    return [_LegValue(leg, e.value, e.sigma, e.unit) for leg, e in of_legs
-            if e is not None and e.value is not None and e.sigma is not None]
+    """Return the estimates of a value by the legs that determine it."""
+    return [_LegValue(leg, e.value, e.sigma, e.unit) for leg, of_leg in estimates
+            if (e := of_leg.get(name)) is not None and e.value is not None and e.sigma is not None]
 
 
 def _significant_extremes(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
     """Return the lowest and the highest value if they differ significantly."""
     if len(values) < 2:
         return None
-    order = sorted(values, key=lambda one: one.value)
-    low, high = order[0], order[-1]
-    noise = (high.sigma**2 + low.sigma**2)**0.5
-    return (low, high) if high.value - low.value > FAULT_SIGMAS * noise else None
+    low, *_, high = sorted(values, key=lambda one: one.value)
+    sigma = (high.sigma**2 + low.sigma**2)**0.5
+    return (low, high) if high.value - low.value > FAULT_SIGMAS * sigma else None

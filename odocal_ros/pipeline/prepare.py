@@ -28,7 +28,7 @@ from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
-SCALE_LIMIT_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # limits in metres
+SCALE_LIMIT_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # of limits in metres
 WHEEL_FAULT_CODES = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -51,8 +51,8 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *drive.odometer_span_reasons(inputs.travel, inputs.t_stop))
-    axis_faults = forward_turn_reasons(accelerations) or turning(inputs, located, orientation,
-                                                         config.imu.gyro_scale)[1]
+    axis_faults = forward_turn_reasons(accelerations) or turning(
+        inputs, located, orientation, config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
     axes = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
@@ -67,6 +67,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
 def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFixes,
                    orientation: imu_orientation.ImuOrientation | None, reasons: Sequence[Reason],
                    alignment: Alignment | None, holdout: bool) -> PreparedLeg:
+    """Return a leg aligned and dead-reckoned, with the checks of its track; as ``prepare``."""
     spans = inputs.standstills(located.rough, config)
     alignment_reasons: tuple[Reason, ...] = ()
     is_own_alignment = alignment is None
@@ -105,8 +106,9 @@ def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
 
 def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    refusal_reasons = drive.motion_reasons(inputs.travel, inputs.t_fix, located.fixes_n,
-                                     located.fix_sigma, inputs.t_stop, inputs.least_motion)
+    refusal_reasons = drive.motion_reasons(
+        inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
+        inputs.least_motion)
     if refusal_reasons or not located.rough:
         return refusal_reasons or (Reason(
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',

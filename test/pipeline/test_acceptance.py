@@ -46,7 +46,7 @@ def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
     assert found.decision is Decision.UNDECIDED
     assert found.values[0].required_sigma == pytest.approx(0.0005)
     assert 'about 2 times as many' in found.why      # (6 / 5)^2 = 1.44
-    assert found.do == Code.SCALE_SIGMA_TOO_LARGE.remedy
+    assert found.remedy == Code.SCALE_SIGMA_TOO_LARGE.remedy
     assert decided(1.0055, 0.0003).why == (
         'scale ratio is 1.0055, beyond its limit of 1.005 by less than 2 sigma (sigma 0.0003)')
     assert decided(1.0055, 0.0002).decision is Decision.FAIL
@@ -92,8 +92,8 @@ def test_a_value_that_is_not_determined_says_what_to_drive():
     why = Reason(Code.YAW_NOT_DETERMINED, 'too little')
     found = decided(None, None, [why], name='yaw_mounting_angle', unit='rad',
                     **{'accept.yaw_mounting_angle_max': 0.01})
-    assert (found.decision, found.do) == (Decision.UNDECIDED, why.remedy)
-    assert 'nominal_scale' in decided(None, None).do
+    assert (found.decision, found.remedy) == (Decision.UNDECIDED, why.remedy)
+    assert 'nominal_scale' in decided(None, None).remedy
 
 
 def test_limits_on_the_command_line_take_degrees():
