@@ -24,10 +24,10 @@ from odocal_ros.messages.transforms import add_static_readers
 from odocal_ros.pipeline.floor_marks import (
     check_points,
     FloorMark,
+    HALF_MARK,
     mark_positions,
     marks_at,
     settings_with_marks,
-    WITHIN,
 )
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.limits import is_file
@@ -214,15 +214,16 @@ def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_
         value = np.cumsum(value)
 
     def travel_around(times: Floats) -> Floats:
-        travel: Floats = np.interp(times + WITHIN, t, value) - np.interp(times - WITHIN, t, value)
+        begin, end = times - HALF_MARK, times + HALF_MARK
+        travel: Floats = np.interp(end, t, value) - np.interp(begin, t, value)
         return np.abs(travel)
     times = np.array([(mark.stamp_ns - start_ns) * 1e-9 for mark in marks])
     for time in times.tolist():
-        if not (len(t) and t[0] <= time - WITHIN and time + WITHIN <= t[-1]):
+        if not (len(t) and t[0] <= time - HALF_MARK and time + HALF_MARK <= t[-1]):
             raise BadUsage(f'--mark {time:g}: the odometer has no data there; required: seconds '
                            'from the first message of the bag')
-    largest = float(travel_around(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
+    largest = float(travel_around(np.arange(t[0] + HALF_MARK, t[-1], HALF_MARK)).max())
     for time, distance in zip(times.tolist(), travel_around(times).tolist(), strict=True):
         if distance > STILL_SHARE * largest:
-            raise BadUsage(f'--mark {time:g}: the wheels turn within {WITHIN:g} s of it; '
+            raise BadUsage(f'--mark {time:g}: the wheels turn within {HALF_MARK:g} s of it; '
                            'required: a time at which the robot stands on a point')

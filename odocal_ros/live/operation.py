@@ -18,12 +18,12 @@ from odocal_ros.live.session import Refused, State
 from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.output.value_text import counted, iso
 from odocal_ros.pipeline.automatic import LegSearch
-from odocal_ros.pipeline.floor_marks import mark_positions, point_position, WITHIN
+from odocal_ros.pipeline.floor_marks import HALF_MARK, mark_positions, point_position
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: standstill before a mark, s: its positions extend WITHIN to both sides, delay 0.5 s
-MARK_STILL_S = 2 * WITHIN + 0.5
+# judgement: standstill before a mark, s: its positions extend HALF_MARK to both sides, delay 0.5 s
+MARK_STILL_S = 2 * HALF_MARK + 0.5
 
 
 class AutomaticLegs(LegCompletion):
@@ -157,7 +157,7 @@ class Operation(AutomaticLegs):
             raise Refused(f'the wheels have stood for {still_s:.1f} s, required: '
                           f'{MARK_STILL_S:g} s; stand on the point and call again')
         delay_s = self._recording.inputs.leading.health.delay_s
-        mark = session.mark(newest_ns - round(WITHIN * 1e9), newest_ns + round(delay_s * 1e9))
+        mark = session.mark(newest_ns - round(HALF_MARK * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
         self.show_status()
         x, y = point_position(session.config, mark.point)

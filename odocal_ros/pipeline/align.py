@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Alignment of a leg: choice of the standstill and of the heading source."""
+"""
+Alignment of a leg at its start: choice of the standstill and of the heading source.
+
+The computations are those of ``nav/alignment.py``.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -35,14 +39,14 @@ from odocal_ros.settings import nominal
 from odocal_ros.settings.config import Config
 
 FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
-Span = TypeVar('Span', Floats, tuple[float, float])
+Span = TypeVar('Span', Floats, tuple[float, float])      # begin and end, s
 # (yaw, sigma) rad, or None and the reason
 HeadingOrRefusal = tuple[tuple[float, float] | None, str]
 
 
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
           config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
-    """Return the alignment of a leg, and reasons; spans: (k, 2) s, fixes_n: (n, 3) m."""
+    """Return the alignment of a leg, and reasons; spans: (k, 2) standstills, s."""
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
     grade = nominal.grade_with_turn_on_bias(nominal.with_grade_by_noise(config.imu, {
@@ -106,6 +110,7 @@ def _place_rotation(inputs: Inputs, span: Floats | tuple[float, float] | None, f
 
 def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
                     grade: nominal.Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
+    """Return the level at a standstill, or at the start of the drive without one, and reasons."""
     if span is not None:
         return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
     t = inputs.t_imu
@@ -128,13 +133,13 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
 
 def _noise_reasons(noise: float, grade: nominal.Grade) -> tuple[Reason, ...]:
     """Return a caution if the gyro noise at rest far exceeds that of its grade."""
-    times = noise / max(grade.gyro_noise, 1e-12)
-    noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
-    if times <= noisier_at_rest:
+    ratio = noise / max(grade.gyro_noise, 1e-12)
+    limit = 10.0    # larger: another gyro, or another unit
+    if ratio <= limit:
         return ()
-    unit = ', so its unit is probably deg/s' if 30 < times < 120 else ''
-    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {times:.0f} times that of '
-                   f'its grade (limit {noisier_at_rest:.0f}){unit}'),)
+    unit = ', so its unit is probably deg/s' if 30 < ratio < 120 else ''
+    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {ratio:.0f} times that of '
+                   f'its grade (limit {limit:.0f}){unit}'),)
 
 
 def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
@@ -150,7 +155,11 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                     config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
+    """
+    Return yaw of the x axis of L and sigma, rad, its source, True if shared by legs, and reasons.
+
+    The source ``course`` has the yaw 0 and the sigma pi: it is estimated later.
+    """
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
@@ -166,6 +175,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nomina
 
 def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float,
                          grade: nominal.Grade, config: Config) -> HeadingOrRefusal:
+    """Return yaw and sigma of the x axis of L by one source."""
     if source == 'heading_topic':
         sent, t = inputs.external['heading']
         return _heading_from_orientations(t, sent.q_ni, sent.yaw_variance, np.eye(3), level,
@@ -173,9 +183,9 @@ def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: fl
     if source == 'imu_orientation':
         return _heading_from_orientations(inputs.t_imu, inputs.q_ni, inputs.yaw_variance,
                                           rotations.transpose(inputs.C_bi), level, config)
-    return _configured_heading(inputs, level,
-                               config) if source == 'fixed' else _heading_by_gyrocompass(
-        inputs, level, latitude, grade, config)
+    if source == 'fixed':
+        return _configured_heading(inputs, level, config)
+    return _heading_by_gyrocompass(inputs, level, latitude, grade, config)
 
 
 def _configured_heading(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
@@ -184,12 +194,13 @@ def _configured_heading(inputs: Inputs, level: Level, config: Config) -> Heading
     mark_yaw = float(rotations.yaw_from_heading(config.alignment.heading))
     # the heading holds at the mark: subtract the turn since the standstill, and the direction of
     # north there
-    turned = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
-    turned += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
-    return (float(rotations.wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
+    turn = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
+    turn += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
+    return (float(rotations.wrap(mark_yaw - turn)), config.alignment.heading_sigma), ''
 
 
 def _turn_since(inputs: Inputs, level: Level) -> float:
+    """Return the turn from the epoch of a level to the start mark, rad."""
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
     if pick.sum() < 2:
         return 0.0
@@ -209,8 +220,8 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
     t, q, variance = t[selected], q[selected], variance[selected]
     pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     if not level.standstill:
-        away = np.where(pick, np.abs(t - level.t), np.inf)
-        pick = (away <= heading_reach) & (away == away.min(initial=np.inf))
+        distance = np.where(pick, np.abs(t - level.t), np.inf)
+        pick = (distance <= heading_reach) & (distance == distance.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation at the start (covariance[0] = -1, or no message)'
     C = rotations.matrix_from_quat(q[pick]) @ C_ib
@@ -255,18 +266,18 @@ def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fix
     track = dead_reckon(t, q_nb, inputs.travel)
     selected = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
     if selected.sum() >= 2:
-        true = fixes_n[selected, :2] - fixes_n[selected][0, :2]
-        dr = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
-        dr = dr - dr[0]
+        fixed = fixes_n[selected, :2] - fixes_n[selected][0, :2]
+        reckoned = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
+        reckoned = reckoned - reckoned[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
         least = max(COURSE_DISTANCE, 8 * sigma_fix)
-        long_enough = np.hypot(*dr.T) >= least
-        if long_enough.any():
-            k = int(np.argmax(long_enough))
-            yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
-            return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
-        what = f'less than {least:.0f} m from the start within {course_time:.0f} s'
+        distance = np.hypot(*reckoned.T)
+        if (distance >= least).any():
+            k = int(np.argmax(distance >= least))
+            yaw = np.arctan2(*fixed[k, ::-1]) - np.arctan2(*reckoned[k, ::-1])
+            return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / distance[k]), ()
+        cause = f'less than {least:.0f} m from the start within {course_time:.0f} s'
     else:
-        what = f'fewer than 2 fixes within {course_time:.0f} s of the start'
-    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {what}',
+        cause = f'fewer than 2 fixes within {course_time:.0f} s of the start'
+    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {cause}',
                                'Drive straight on right after the start mark, under open sky.'),)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors that no method models (coarse speeds, slow wheel slip, unknown slopes), and delays.
+Errors of the scale that no method models (truncated speeds, slow wheel slip, unknown slopes).
 
-Errors of the scale are added to the sigmas and the budget of a method; delays are reported with
-the setting that corrects them.
+They are added to the sigmas and the budget of a method's result. Coarse odometers and delays are
+reported, delays with the setting that corrects them.
 """
 
 from collections.abc import Mapping
@@ -34,17 +34,16 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     1 sigma of each of SCALES; for a wheel by default that of the scale factor.   shared : the same
     in every leg of the vehicle.
     """
+    if not method.estimates['scale_factor'].value:
+        return method
     relative = dict.fromkeys(wheel_factors(method.estimates),
                              relative['scale_factor']) | dict(relative)
-    K = method.estimates['scale_factor'].value
-    if not K:
-        return method
-    effects = np.array([[relative.get(name_, 0.0)] for name_ in method.parameters])
-    estimates = {name_: replace(e, sigma=float(np.hypot(e.sigma, relative[name_] * e.value)))
-                 if name_ in relative and e.value is not None and e.sigma is not None else e
-                 for name_, e in method.estimates.items()}
-    row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
-           for name_ in method.parameters} | {'shared': shared}
+    effects = np.array([[relative.get(p, 0.0)] for p in method.parameters])
+    estimates = {p: replace(e, sigma=float(np.hypot(e.sigma, relative[p] * e.value)))
+                 if p in relative and e.value is not None and e.sigma is not None else e
+                 for p, e in method.estimates.items()}
+    row = {p: relative.get(p, 0.0) * (method.estimates[p].value or 0.0)
+           for p in method.parameters} | {'shared': shared}
     sigma_reasons = [r for r in check_limits(estimates, prepared.nominal, prepared.config)
                      if r.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
@@ -61,10 +60,10 @@ def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResu
     change = abs(prepared.wheel_slips.change)
     if not change:
         return method
-    # the mean of ``count`` wheels changes by change / count: the estimate is off by half of it
-    mean, own = change / 2 / prepared.wheel_slips.count, change / 2
-    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, mean)
-                            | dict.fromkeys(wheel_factors(method.estimates), own))
+    # the mean of ``count`` wheels changes by change / count: the error is half of it
+    of_mean, of_wheel = change / 2 / prepared.wheel_slips.count, change / 2
+    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, of_mean)
+                            | dict.fromkeys(wheel_factors(method.estimates), of_wheel))
 
 
 def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
@@ -114,12 +113,12 @@ def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
-    sent = _speed_text(coarse.step, located.rough, inputs.scale_unit)
+    step = _speed_text(coarse.step, located.rough, inputs.scale_unit)
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
-                       f'{sent}; half a step is added in the direction of the last change')]
+                       f'{step}; half a step is added in the direction of the last change')]
     between = ', with interpolated values between' if coarse.interpolated else ''
-    return [Reason(Code.SPEED_COARSE, f'odometer resolution is {sent}{between}; if truncated, '
+    return [Reason(Code.SPEED_COARSE, f'odometer resolution is {step}{between}; if truncated, '
                    f'the distance is {100 * size:.2g} % too short')]
 
 
@@ -139,16 +138,16 @@ def _speed_grid(inputs: Inputs) -> CoarseSpeed | None:
 def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]],
                 scale: float) -> list[Reason]:
     """Return DELAY_SEEN for each (delay, sigma), s, that is significant and has an effect."""
-    speed = _speed(prepared) * scale
+    speed = _high_speed(prepared) * scale
     notes = []
-    least_delay_path = 0.1    # m, as the required accuracy of a lever arm
-    hidden_by_fix = 0.25    # of a fix's sigma: smaller effects of a delay are not observable
+    # m, the required accuracy of a lever arm; smaller effects than a quarter of a fix's sigma are
+    # not observable
+    observable_m = max(0.1, 0.25 * prepared.fix_sigma)
     for name, (delay, sigma) in delays.items():
         metres = abs(delay) * speed
-        observable_m = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
         if name in prepared.inputs.aligned or not (
                 abs(delay) > REMARK_SIGMAS * sigma and metres > observable_m):
-            continue        # the first is reported: this is the rest of it
+            continue        # of an aligned clock the delay is reported already: this is the rest
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
             Code.DELAY_SEEN, f'{SENSOR_LABEL[name]} stamps are {abs(delay):.3f} s '
@@ -159,7 +158,7 @@ def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]]
     return notes
 
 
-def _speed(prepared: PreparedLeg) -> float:
+def _high_speed(prepared: PreparedLeg) -> float:
     """Return the 90th percentile of the speed, scale units per s."""
     travel = prepared.inputs.travel
     grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)

@@ -15,10 +15,10 @@ from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config
 
 # s before and after a mark, and positions in between. Judgement: a fit needs ten positions
-WITHIN, ROWS = 0.5, 5
-# s at the mean motion of the wheels, correlation time of errors: the errors of two marks are
-# independent, those of the positions of one mark are equal. Judgement
-FORGOTTEN = 5.0
+HALF_MARK, MARK_POSITIONS = 0.5, 5
+# s, correlation time of position errors, at the mean motion of the wheels: the errors of two marks
+# are independent, those of the positions of one mark are equal. Judgement
+MARK_ERROR_TIME = 5.0
 
 
 @dataclass(frozen=True, order=True)
@@ -42,7 +42,7 @@ class FloorMark:
 
 def marks_at(config: Config, stamps_ns: Sequence[int]) -> list[FloorMark]:
     """Return marks in order of time, from stamps in the order of the points."""
-    late_ns = round(WITHIN * 1e9)
+    late_ns = round(HALF_MARK * 1e9)
     return sorted(FloorMark(t, next_point(config, k), t + late_ns)
                   for k, t in enumerate(stamps_ns))
 
@@ -71,7 +71,7 @@ def settings_with_marks(config: Config) -> Config:
     gnss, sigma = config.gnss, config.reference.points_sigma
     return replace(config, gnss=replace(
         gnss, lever_arm_sigma=min(gnss.lever_arm_sigma, sigma),
-        correlation_time=FORGOTTEN if math.isnan(gnss.correlation_time)
+        correlation_time=MARK_ERROR_TIME if math.isnan(gnss.correlation_time)
         else gnss.correlation_time))
 
 
@@ -79,8 +79,8 @@ def mark_positions(config: Config, marks: Sequence[FloorMark]) -> FixSamples:
     """Return the positions of marks as samples, as those of SLAM."""
     places = np.array([(*point_position(config, mark.point), 0.0) for mark in marks])
     stamps = np.array([mark.stamp_ns for mark in marks])[:, None] + np.round(
-        1e9 * np.linspace(-WITHIN, WITHIN, ROWS)).astype(np.int64)
+        1e9 * np.linspace(-HALF_MARK, HALF_MARK, MARK_POSITIONS)).astype(np.int64)
     covariance = np.tile((config.reference.points_sigma**2 * np.eye(3)).ravel(), (stamps.size, 1))
-    received = np.repeat([mark.received_ns for mark in marks], ROWS)
+    received = np.repeat([mark.received_ns for mark in marks], MARK_POSITIONS)
     return local_fixes(config.reference.latitude_deg)(
-        stamps.ravel(), received, np.repeat(places, ROWS, axis=0), covariance)
+        stamps.ravel(), received, np.repeat(places, MARK_POSITIONS, axis=0), covariance)

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother on one leg: all samples, no external heading; the search of patent CN104359492A."""
+"""
+The smoother on one leg, with the paths by its estimates.
+
+It uses all samples and needs no external heading. With the method ``patent`` the search of two
+wheels of CN104359492A is added.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -69,6 +74,7 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
 
 
 def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """Return the smoother's result with that of the patent's search in its details."""
     search_result = run_wheel_search(prepared, method.estimates['pitch_mounting_angle'].value
                                      or 0.0)
     if search_result is None:
@@ -99,9 +105,9 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
         before = track.at(inside - np.copysign(onward, beyond))
         P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
         release_mapped_memory()        # releases the sums before the attitudes are read
-        at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
+        position: Floats = P @ f + track.C_nb_at(inside) @ lever_b
         release_mapped_memory()
-        return at
+        return position
     return path
 
 
@@ -116,7 +122,7 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
 
 
 def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
-    """Return a leg as input of the patent's search, None without two wheels or a first fix."""
+    """Return a leg as input of the search, None without two wheels or a first fix; pitch: rad."""
     inputs = prepared.inputs
     if len(inputs.travels) != 2:
         return None
@@ -136,7 +142,7 @@ def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
 
 
 def run_wheel_search(prepared: PreparedLeg, pitch: float) -> SearchResult | None:
-    """Return the result of the search, None with too few fixes; arguments as in planar_of."""
+    """Return the result of the search, None with too few fixes; pitch: mounting angle, rad."""
     leg = planar_input(prepared, pitch)
     if leg is None:
         return None
