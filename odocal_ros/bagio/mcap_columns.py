@@ -117,29 +117,31 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
     """Return the messages of chunks; None if any of them has an unexpected layout."""
     chunks = _concatenated(chunks)
     starts = [_record_offsets(chunk) for chunk in chunks]
-    counts = np.array([len(s) for s in starts])
+    counts = np.array([len(offsets) for offsets in starts])
     if not chunks or not counts.all():
         return None
     data = chunks[0].data
     start = np.sort(np.concatenate(starts))
     if start[0] < 0 or start[-1] > len(data) - HEAD.itemsize:
         return None
+    # a view with a head at every offset of the buffer; only those of records are read
     head = np.ndarray((len(data) - HEAD.itemsize + 1,), f'V{HEAD.itemsize}', data, 0, (1,))[
         start].view(HEAD)
-    end = counts.cumsum()
+    end = counts.cumsum()       # row after the last message of each chunk
     first = end - counts
     stop = np.append(start[1:], 0)
     stop[end - 1] = [chunk.stop for chunk in chunks]
-    size = stop - start - 9
+    size = stop - start - RECORD.size
     is_chain = (
         (head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
         and start[first].tolist() == [chunk.begin for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
     if not is_chain or not known_channels[channel].all():
         return None
-    least, most = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
-    for chunk, a, b in zip(chunks, least.tolist(), most.tolist(), strict=True):
-        if not chunk.start_ns <= a <= b <= max(chunk.end_ns, chunk.start_ns) or b >= LATEST_NS:
+    earliest, latest = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
+    for chunk, low, high in zip(chunks, earliest.tolist(), latest.tolist(), strict=True):
+        if high >= LATEST_NS or not (
+                chunk.start_ns <= low <= high <= max(chunk.end_ns, chunk.start_ns)):
             return None
     return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - BODY))
 
@@ -159,14 +161,15 @@ def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
 def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
     found, offset, index = [np.empty(0, np.int64)], 0, chunk.message_index
-    while offset + 15 <= len(index):
-        op, size = RECORD.unpack_from(index, offset)
-        (length,) = struct.unpack_from('<I', index, offset + 11)
+    head = struct.Struct('<BQHI')      # opcode, size, channel, bytes of (time, offset) pairs
+    while offset + head.size <= len(index):
+        op, size, _, length = head.unpack_from(index, offset)
+        pairs = offset + head.size
         if op != MESSAGE_INDEX or size != length + 6 or length % 16 or (
-                offset + 15 + length > len(index)):
+                pairs + length > len(index)):
             break
-        found.append(np.frombuffer(index, '<i8', length // 8, offset + 15)[1::2])
-        offset += 9 + size
+        found.append(np.frombuffer(index, '<i8', length // 8, pairs)[1::2])
+        offset = pairs + length
     return np.concatenate(found) + chunk.begin
 
 

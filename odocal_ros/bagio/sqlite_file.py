@@ -96,6 +96,7 @@ class LeafPages:
             yield row, key, time_ns, partial(self._payload, data, offset, size, skip)
 
     def _payload(self, data: bytes, offset: int, size: int, skip: int) -> bytes:
+        """Return a row of ``size`` bytes at an offset of a page, without the first ``skip``."""
         if size > min(len(self._map), MESSAGE_BYTES * limit_factor()):
             raise ValueError('larger than the file')
         # the part of a row in its page (fileformat2, 1.6); the rest is in a chain of other pages
@@ -123,24 +124,25 @@ class LeafPages:
 
 def _record(data: bytes, offset: int) -> tuple[int, int, int]:
     """Return topic, time and offset of the data in a row of messages; ValueError if not one."""
-    length, pos = _varint(data, offset)
+    # a row is a header, which has its length and a type code for each column, then the values
+    length, position = _varint(data, offset)
     if length > 10 * COLUMNS:      # a varint has nine bytes at most
         raise ValueError('not a message')
-    kinds = []
-    while pos < offset + length:
-        kind, pos = _varint(data, pos)
-        kinds.append(kind)
-    if (len(kinds) != COLUMNS or kinds[0] or kinds[1] not in INTEGERS or kinds[2] not in INTEGERS
-            or kinds[3] < 12 or kinds[3] % 2):
+    codes = []
+    while position < offset + length:
+        code, position = _varint(data, position)
+        codes.append(code)
+    is_blob = len(codes) == COLUMNS and codes[3] >= 12 and codes[3] % 2 == 0
+    if not is_blob or codes[0] or codes[1] not in INTEGERS or codes[2] not in INTEGERS:
         raise ValueError('not a message')
     values = []
-    pos = offset + length
-    for kind in kinds[1:3]:
-        size = INTEGERS[kind]
-        values.append(int.from_bytes(data[pos:pos + size], 'big', signed=True)
-                      if size else kind - 8)
-        pos += size
-    return values[0], values[1], pos - offset
+    position = offset + length
+    for code in codes[1:3]:
+        size = INTEGERS[code]
+        values.append(int.from_bytes(data[position:position + size], 'big', signed=True)
+                      if size else code - 8)      # codes 8 and 9 are the values 0 and 1
+        position += size
+    return values[0], values[1], position - offset
 
 
 def _varint(data: bytes, offset: int) -> tuple[int, int]:

@@ -141,18 +141,18 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
     if not is_configured and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
-    m = mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
+    axes = mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
     if not inputs.has_accelerometer:
-        m = replace(m, C_bi=None)      # gravity is assumed
-    agrees = m.C_bi is not None and np.allclose(
-        m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
+        axes = replace(axes, C_bi=None)      # gravity is assumed
+    agrees = axes.C_bi is not None and np.allclose(
+        axes.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
-        'accelerometer': inputs.has_accelerometer, 'rpy': m.rpy, 'assumed_forward': m.assumed,
-        'off': m.deviation,
-        'unclear': m.unclear + '; imu.mounting_rpy is used as set' * is_configured,
-        'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
-        'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
-        'needed': m.rpy is not None and not agrees and not is_configured}
+        'accelerometer': inputs.has_accelerometer, 'rpy': axes.rpy,
+        'assumed_forward': axes.assumed, 'off': axes.deviation,
+        'unclear': axes.unclear + '; imu.mounting_rpy is used as set' * is_configured,
+        'forward_i': None if axes.forward_i is None else axes.forward_i.tolist(),
+        'forward_sigma': axes.forward_sigma if axes.forward_i is not None else None,
+        'needed': axes.rpy is not None and not agrees and not is_configured}
     orientation = imu_orientation.estimate_orientation(inputs, located.rough) \
         if inputs.has_accelerometer and located.rough else None
     ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
@@ -160,9 +160,9 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
     found['drive']['gyro_over_course'] = ratio
     findings += axis_faults
     # no rotation corrects a mirrored axis
-    if axis_faults or m.rpy is None or not found['mounting']['needed']:
+    if axis_faults or axes.rpy is None or not found['mounting']['needed']:
         return options
-    return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
+    return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in axes.rpy)}]']
 
 
 def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: LocatedFixes,

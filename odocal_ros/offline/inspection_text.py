@@ -50,11 +50,11 @@ def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     """Return the description of one input, one statement per line."""
-    points = [point for key, statements in STATEMENTS.items() if topic.get(key)
-              for point in statements(topic, topic[key])]
-    if topic['name'] not in roles and not any('warning:' in p for p in points):
-        points = points[:2 + len(topic.get('moves', ()))]     # unused topics: short
-    return [one_line(topic['name']), *(line for point in points for line in wrapped(point))]
+    texts = [text for key, statements in STATEMENTS.items() if topic.get(key)
+             for text in statements(topic, topic[key])]
+    if topic['name'] not in roles and not any('warning:' in text for text in texts):
+        texts = texts[:2 + len(topic.get('moves', ()))]     # of a topic that is not used
+    return [one_line(topic['name']), *(line for text in texts for line in wrapped(text))]
 
 
 def _of_fields(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
@@ -188,8 +188,7 @@ def _legs(legs: list[dict[str, Any]]) -> list[str]:
     if not legs:
         return []
     origin = 'marked by the node' if legs[0]['marked'] else 'used by replay'
-    few = 3    # legs listed in a line each
-    if len(legs) <= few:
+    if len(legs) <= 3:
         return [f'  leg {origin}: {_leg(leg)}' for leg in legs]
     return [f'  {len(legs)} legs {origin}, s and m', '    '
             f'{"leg":>3}{"from":>10}{"to":>10}{"length":>8}{"start to end":>14}'] + [

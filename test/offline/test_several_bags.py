@@ -138,7 +138,8 @@ def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
     worse = result.Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
     # the second time a rejected one goes: nothing is lost
     for is_stated in (not quiet, False):
-        assert replay._report(Calibration(worse), tmp_path, args) == 1
+        assert replay._report(Calibration(worse), tmp_path, args,
+                              replay._TerminalListener(args)) == 1
         err = capsys.readouterr().err
         assert ('--force replaced a better calibration: the new result is rejected (NO_FIX), the '
                 'old one is accepted' in err) == is_stated
