@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stamps of a stream: selection of usable ones, and row times without arrival jitter."""
+"""Stamps of a stream: selection of usable ones, and sampling times without arrival jitter."""
 
 from bisect import bisect_left
 from collections import deque
@@ -29,13 +29,13 @@ ROUGHNESS_ROWS = 100       # judgement: rows in motion of the mean roughness
 # above the first, and used again below the second
 ROUGHNESS_LIMIT, ROUGHNESS_REUSE_LIMIT = 1.0, 0.8
 LATE_SIGMA = 1.5           # judgement: sigma over mean of delays, 1 if exponential
-LATE_ROWS = 50             # judgement: rows of the mean deviation
+LATE_ROWS = 50             # judgement: rows of the mean delay
 # judgement: least counts per interval, and least speed, m/s, to detect lost rows by the travel
-SURE_STEP, SURE_SPEED = 4.0, 0.5
+RELIABLE_COUNTS, RELIABLE_SPEED = 4.0, 0.5
 LATE_INTERVALS = 0.5       # judgement: least lateness of lost rows, intervals
-# judgement: consecutive rows at rest that are late by LATE_INTERVALS: rows before them are lost;
-# rows after which this is no longer questioned
-LATE_REST_ROWS, SURE_LOST = 25, 100
+# judgement: consecutive rows at rest that are late by LATE_INTERVALS, after which rows are assumed
+# to be lost; rows after which this is no longer tested
+LATE_REST_ROWS, TESTED_LOST_ROWS = 25, 100
 LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
 MOST_LOST = 5              # judgement: largest gap, intervals, without a new line
 
@@ -44,23 +44,23 @@ class StampScreen:
     """
     Test of the stamps of one topic against their arrival.
 
-    Lag is arrival minus stamp. No usable stamp has a lag far below the least lag so far: it is
-    false, or the clock was set. ``clock_jumped`` is True after CLOCK_SET_ROWS consecutive stamps
-    beyond a limit; ``jump_row`` is then the first of them in the last block.
+    Lag is arrival minus stamp. A stamp whose lag is far below the least lag so far is false, or
+    the clock was set. ``clock_jumped`` is True after CLOCK_SET_ROWS consecutive stamps beyond a
+    limit; ``jump_row`` is then the first of them in the last block.
     """
 
     def __init__(self) -> None:
         self.clock_jumped = False
         self.jump_row = 0
-        self.excess_s = 0.0           # of the last refused stamp; negative: behind
+        self.excess_s = 0.0           # how far the last refused stamp is ahead; negative: behind
         self.dropped = 0              # rows of the last block
-        self._refused_rows = 0
-        self._newest_ns = 0
-        self._first: tuple[int, int] | None = None      # stamp and arrival, ns
         self.rate = 1.0               # stamps over arrival time; 1 below FAST_PLAY
         self.lag_ns: float | None = None      # the least one
-        self._real_time = True
-        self._median_lag_ns = 0.0             # running median of the lags
+        self._refused_rows = 0        # consecutive ones
+        self._newest_ns = 0           # newest usable stamp
+        self._first: tuple[int, int] | None = None      # stamp and arrival, ns
+        self._real_time = True        # False: a bag is played faster or slower
+        self._median_lag_ns = 0.0     # running median of the lags
         self._lags: deque[int] = deque(maxlen=PERMANENT_ROWS)
 
     def clock_step_s(self, rows: int) -> float:
@@ -124,7 +124,7 @@ class StampScreen:
 
 class RowTimes:
     """
-    Row times of a counter without arrival jitter.
+    Sampling times of a counter, without arrival jitter.
 
     A counter is sampled evenly, and no row arrives before it is sampled: the highest line below
     all arrivals (row number to time) gives better times if the travel on it is smoother. It is an
@@ -139,15 +139,20 @@ class RowTimes:
         self._rows: deque[tuple[float, float, float]] = deque(maxlen=3)  # arrival, line, travel
         self._roughness = [0.0, 0.0]               # m^2, roughness at arrival, on the line
         self._rounding = self._moved = 0.0      # m^2, of a count; (m/s)^2, mean square speed
-        self._tested = 0
+        self._tested = 0                        # number of rows in the means
         self._restart()
 
     def _restart(self) -> None:
-        self._count = self._row = self._assumed = 0
-        self._line = self._interval = self._late = self._step = 0.0
+        """Forget the line; the next row begins another one."""
+        self._count = self._row = 0     # number of rows, without and with lost ones
+        self._assumed = 0               # lost rows at rest, which may only have been late
+        self._line = 0.0                # s, time of the row on the line
+        self._interval = 0.0            # s between rows, slope of the line
+        self._late = 0.0                # s, mean delay
+        self._step = 0.0                # m, travel in the last interval
         self._hull: list[tuple[int, float]] = []      # rows and arrivals below all others
         self._late_at_rest: list[float] = []     # s, lateness of consecutive rows at rest
-        self._before = (0, 0.0, 1.0)    # row, time, interval
+        self._before = (0, 0.0, 1.0)    # row, time, interval before the assumed lost rows
 
     def next_time(self, t: float, travel: float, speed: float, quantum: float) -> float:
         """
@@ -157,14 +162,14 @@ class RowTimes:
         """
         expected = max(abs(speed) * self._interval, self._step) if speed else 0.0
         step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
-        is_reliable = expected > max(SURE_STEP * quantum, SURE_SPEED * self._interval)
-        moves = 0 < step <= 2 * SURE_STEP * quantum
+        is_reliable = expected > max(RELIABLE_COUNTS * quantum, RELIABLE_SPEED * self._interval)
+        moves = 0 < step <= 2 * RELIABLE_COUNTS * quantum
         if not is_reliable and t - self._line > LONG_GAP and not moves:
             self._restart()      # lost rows; late ones arrive one after the other
         self._advance_line(t, step, expected if is_reliable else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
-            self._test(quantum)
+            self._compare_roughness(quantum)
         row_time = self._rows[-1][1] if self._in_use() else t
         self._t = max(row_time, self._t + LEAST_STEP, math.nextafter(self._t, math.inf))
         return self._t
@@ -201,7 +206,7 @@ class RowTimes:
         intervals += self._lost_at_rest(t, lateness, expected > 0)
         self._count += 1
         self._row += intervals
-        self._fit(t)
+        self._fit_line(t)
         if self._count > 2:       # two rows determine a line
             self._late += (t - self._line - self._late) / min(self._count - 2, LATE_ROWS)
 
@@ -212,7 +217,7 @@ class RowTimes:
             least_lost = round((t - t_before) / interval) - (self._row + 1 - self._assumed - row)
             only_late = min(self._assumed, max(self._assumed - least_lost, 0))
             self._hull = [(r - only_late if r > row else r, s) for r, s in self._hull]
-            self._assumed = self._assumed - only_late if self._row - row < SURE_LOST else 0
+            self._assumed = self._assumed - only_late if self._row - row < TESTED_LOST_ROWS else 0
             if only_late:
                 return -only_late
         if moves or lateness <= LATE_INTERVALS * self._interval or self._count <= FIRST_ROWS:
@@ -228,7 +233,8 @@ class RowTimes:
         self._assumed += lost
         return lost
 
-    def _fit(self, t: float) -> None:
+    def _fit_line(self, t: float) -> None:
+        """Add the row to the hull; the line is its edge at the middle of the rows."""
         hull, row = self._hull, self._row
         while len(hull) > 1 and (t - hull[-2][1]) * (hull[-1][0] - hull[-2][0]) <= (
                 hull[-1][1] - hull[-2][1]) * (row - hull[-2][0]):
@@ -242,23 +248,24 @@ class RowTimes:
             self._interval = (t1 - t0) / (row1 - row0)
         self._line = t if len(hull) == 1 else t1 + self._interval * (row - row1)
 
-    def _test(self, quantum: float) -> None:
-        """Compare the roughness of the travel at arrival and on the line."""
+    def _compare_roughness(self, quantum: float) -> None:
+        """Update the roughness of the travel at arrival and on the line, and ``error_s``."""
         (t0, p0, s0), (t1, p1, s1), (t2, p2, s2) = self._rows
-        if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * SURE_STEP * quantum:
+        if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * RELIABLE_COUNTS * quantum:
             return
         self._tested += 1
         share = 1 / min(self._tested, ROUGHNESS_ROWS)
         for k, (a, b, c) in enumerate(((t0, t1, t2), (p0, p1, p2))):
-            even = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
-            self._roughness[k] += ((s1 - even)**2 - self._roughness[k]) * share
+            linear = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
+            self._roughness[k] += ((s1 - linear)**2 - self._roughness[k]) * share
         self._moved += (((s2 - s0) / max(p2 - p0, LEAST_STEP))**2 - self._moved) * share
         self._rounding += (quantum**2 / 12 - self._rounding) * share
         limit = ROUGHNESS_LIMIT if self._line_is_smoother else ROUGHNESS_REUSE_LIMIT
-        known = self._tested > FIRST_ROWS
-        self._line_is_smoother = not known or self._roughness[1] <= limit**2 * self._roughness[0]
+        is_known = self._tested > FIRST_ROWS
+        self._line_is_smoother = not is_known or (
+            self._roughness[1] <= limit**2 * self._roughness[0])
         # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
-        left = max(self._roughness[self._in_use()] / 1.5 - self._rounding, 0.0)
-        self.error_s = math.sqrt(left / max(self._moved, LEAST_STEP))
-        if not known:       # few rows: times of arrival may be correct
+        variance = max(self._roughness[self._in_use()] / 1.5 - self._rounding, 0.0)
+        self.error_s = math.sqrt(variance / max(self._moved, LEAST_STEP))
+        if not is_known:       # times of arrival may be correct
             self.error_s = max(self.error_s, LATE_SIGMA * self._late)

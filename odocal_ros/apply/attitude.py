@@ -58,6 +58,7 @@ def rotate_vector(C: Sequence[Sequence[float]], v: Sequence[float]) -> Vector:
 
 
 def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """Return the cross product of two vectors."""
     (x, y, z), (u, v, w) = a, b
     return y * w - z * v, z * u - x * w, x * v - y * u
 
@@ -77,25 +78,28 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
     """
     Return the rotation vector of b from sample k to the next, rad.
 
-    t : s.   w : rad/s.   Bitwise equal to ``nav.strapdown.rotation_increments``.
+    t : s.   w : rad/s.   Bitwise equal to ``nav.strapdown.rotation_increments``: the integral of
+    the cubic through four rates, or of the line through two at uneven times, and its coning term.
     """
     h, first, second = t[k + 1] - t[k], w[k], w[k + 1]
-    rise = [b - a for a, b in zip(first, second, strict=True)]
-    mid = [(a + b) * 0.5 for a, b in zip(first, second, strict=True)]
-    mean = [m * h for m in mid]
+    rise = [b - a for a, b in zip(first, second, strict=True)]      # of the rate, over h
+    middle = [(a + b) * 0.5 for a, b in zip(first, second, strict=True)]      # rate at h / 2
+    angle = [m * h for m in middle]
     if 0 < k < len(t) - 2:
-        before, own = max(t[k] - t[k - 1], LEAST_INTERVAL), max(h, LEAST_INTERVAL)
+        before, between = max(t[k] - t[k - 1], LEAST_INTERVAL), max(h, LEAST_INTERVAL)
         after = max(t[k + 2] - t[k + 1], LEAST_INTERVAL)
-        if max(before, after) < EVEN_RATIO * own and own < EVEN_RATIO * min(before, after):
-            weight = own * own / 4 / (before + own + after)
-            of_left, of_right = weight * (own / 2 + after), weight * (own / 2 + before)
+        if (max(before, after) < EVEN_RATIO * between
+                and between < EVEN_RATIO * min(before, after)):
+            weight = between * between / 4 / (before + between + after)
+            left_weight = weight * (between / 2 + after)
+            right_weight = weight * (between / 2 + before)
             for i, (a, b, c, d) in enumerate(zip(w[k - 1], first, second, w[k + 2], strict=True)):
-                slope = rise[i] / own
-                left = (slope - (b - a) / before) / (before + own)
-                right = ((d - c) / after - slope) / (own + after)
-                bow = left * of_left + right * of_right
-                mid[i] -= bow
-                rise[i] -= (right - left) * (weight * own)
-                mean[i] -= bow * (h * (2 / 3))
-    coning, h2 = cross(mid, rise), h * h / 12
-    return mean[0] + coning[0] * h2, mean[1] + coning[1] * h2, mean[2] + coning[2] * h2
+                slope = rise[i] / between
+                left = (slope - (b - a) / before) / (before + between)
+                right = ((d - c) / after - slope) / (between + after)
+                sag = left * left_weight + right * right_weight
+                middle[i] -= sag
+                rise[i] -= (right - left) * (weight * between)
+                angle[i] -= sag * (h * (2 / 3))
+    coning, h2 = cross(middle, rise), h * h / 12
+    return angle[0] + coning[0] * h2, angle[1] + coning[1] * h2, angle[2] + coning[2] * h2

@@ -21,20 +21,22 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import Grade
 
-# definition: indices of the errors in the error state
+# definition: indices in the error state of position, attitude, gyro and accelerometer bias
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axes of b
-BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable errors; heading is not
-BY_REST = np.r_[3:9]
+# definition: of scale, mounting (pitch, yaw) and gyro scale; number of errors
+K, M, G, N = 12, slice(13, 15), 15, 16
+BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # definition: errors that gravity corrects; heading is not
+BY_REST = np.r_[3:9]                # definition: errors that a turn rate at rest corrects
 POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N)
 EYE, AXES = np.eye(N), np.eye(3)
 POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state
+PROPAGATION_PERIOD = 0.05      # s, judgement: between propagations of the covariance
 # judgement: m/sqrt(m), slip and sideslip: along, left, up
 SLIP_PER_METRE = (0.005, 0.01, 0.01)
 # judgement: rad/s, sigma of an unmeasured turn rate in a gap of the IMU; s, in shorter gaps the
 # turn decreases with the cube of the gap
 GAP_RATE, GAP_TIME = 0.1, 0.1
-# m/s^2; judgement: sigma of accelerations that odometer data of a second or more do not contain
+# m/s^2; judgement: sigma of accelerations that odometer data over a second or more do not measure
 DRIVING_FORCE = 0.4
 # physical: rad/sqrt(s), random walk of the tilt if the gyro bias contains the Earth rate, whose
 # direction in b changes as the vehicle turns: 11 deg/h, constant for about half a minute
@@ -43,22 +45,25 @@ EARTH_TILT_WALK = 6e-4
 # angle^2 / 2 of a normal angle; m per m, its limit, reached if the direction is unknown
 SHORTENING, LARGEST_SHORTENING = 3**0.5 / 2, 2.0
 GRAVITY = 9.81    # m/s^2; physical: more digits have no effect on the tilt
-MOST_FORCE_OFF = 5.0       # m/s^2; physical: half of g, largest mean acceleration of 1 s or 2 s
+MOST_ACCELERATION = 5.0    # m/s^2; physical: half of g, largest mean over 1 s or 2 s
 
 
 class Errors:
     """
     Covariance of the errors, (16, 16), and its updates by gravity and at standstill.
 
-    shortening : (3,) m in n, second-order effect of attitude errors on the position.   changed :
-    True if the covariance has changed since the last ``pose_and_twist``.
-    grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_in_bias :
-    True if the gyro bias contains the Earth rate.
+    Arguments: grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.
+    earth_in_bias : True if the gyro bias contains the Earth rate.
+
+    Attributes: shortening : (3,) m in n, second-order effect of attitude errors on the position.
+    changed : True if the covariance has changed since the last ``pose_and_twist``.
     """
 
     def __init__(self, grade: Grade, vehicle: Vehicle, tilt: float, bias_sigma: float | Floats,
                  earth_in_bias: bool = True) -> None:
-        self.grade = grade
+        self.grade, self._C_bv = grade, vehicle.C_vb.T
+        # s, m, rad: duration, travel and turn since the last propagation
+        self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
         self._walks = np.zeros(N)      # variance per s
         self._walks[PHI] = grade.gyro_noise**2
         self._walks[3:5] += (EARTH_TILT_WALK * earth_in_bias)**2
@@ -75,16 +80,26 @@ class Errors:
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
 
-    def propagate(self, T: float, C_nb: Floats, travel_n: Vector, turn_n: Vector, axes_n: Floats,
-                  travel_variance: float = 0.0, gaps: Sequence[float] = ()) -> None:
+    def add_interval(self, T: float, C_nb: Matrix, travel_n: Vector, turn_n: Vector,
+                     travel_variance: float = 0.0, gaps: Sequence[float] = ()) -> None:
         """
-        Propagate the covariance over an interval.
+        Add an interval; propagate every PROPAGATION_PERIOD, or at once if data are uncertain.
 
-        T : s.   C_nb : (3, 3) in its middle.   travel_n, turn_n : (3,) m, (3,) rad.
-        axes_n : (3, 3) columns forward, left, up.   travel_variance : m^2, of uncertain travel.
-        gaps : s, parts of the interval without IMU data.
+        T : s.   C_nb : at its end.   travel_n, turn_n : (3,) m, (3,) rad.   travel_variance :
+        m^2, of uncertain travel.   gaps : s, parts of the interval without IMU data.
         """
-        F = EYE.copy()
+        self._pending_s += T
+        self._pending_travel = add_scaled(self._pending_travel, travel_n)
+        self._pending_turn = add_scaled(self._pending_turn, turn_n)
+        if self._pending_s > PROPAGATION_PERIOD - 1e-6 or travel_variance or gaps:
+            self._propagate(self._pending_s, np.array(C_nb), self._pending_travel,
+                            self._pending_turn, travel_variance, gaps)
+            self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
+
+    def _propagate(self, T: float, C_nb: Floats, travel_n: Vector, turn_n: Vector,
+                   travel_variance: float, gaps: Sequence[float]) -> None:
+        """Propagate the covariance over an interval; arguments as ``add_interval``."""
+        F, axes_n = EYE.copy(), C_nb @ self._C_bv      # columns forward, left, up
         cross = cross_matrix(travel_n)
         F[P, PHI], F[P, K], F[P, M] = -cross, travel_n, -cross @ C_nb[:, 1:]
         F[PHI, BG], F[PHI, G] = C_nb * -T, add_scaled(ZERO, turn_n, -1.0)
@@ -94,12 +109,12 @@ class Errors:
                                      min(SHORTENING * sum(tilts), LARGEST_SHORTENING))
         cov = F @ self.cov @ F.T
         along, left, up = self.slip_variances(math.hypot(*travel_n))
-        hidden = sum(GAP_RATE * gap * min(1.0, gap / GAP_TIME)**2 for gap in gaps)
+        turn_sigma = sum(GAP_RATE * gap * min(1.0, gap / GAP_TIME)**2 for gap in gaps)
         cov[P, P] += axes_n * [along + travel_variance, left, up] @ axes_n.T
-        if hidden:
-            cov[P, P] += cross @ cross.T * hidden**2
+        if turn_sigma:
+            cov[P, P] += cross @ cross.T * turn_sigma**2
         cov[ALL, ALL] += self._walks * T
-        cov[ROTATIONS, ROTATIONS] += hidden**2
+        cov[ROTATIONS, ROTATIONS] += turn_sigma**2
         self.cov, self.changed = cov, True
 
     @staticmethod
@@ -114,6 +129,7 @@ class Errors:
         self.changed = True
 
     def add_turn(self, variance: Floats) -> None:
+        """Add the variance of an unknown turn, (3, 3) rad^2 in n, at most half a turn."""
         self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
         self.changed = True
 
@@ -123,12 +139,12 @@ class Errors:
         Return the correction of the error state, (16,), by the measured direction of gravity.
 
         residual_n : (3,) m/s^2, mean of specific force minus acceleration minus gravity; its
-        level part is used.   C_nb : (3, 3).   T : s, duration of the mean.   sigma : m/s^2, of the
-        acceleration, 0 at rest. A residual that exceeds its limit is tested again with the sigma
-        of driving. Returns None, without a correction, if it still does, or if the upward part is
-        not gravity.
+        horizontal part is used.   C_nb : (3, 3).   T : s, duration of the mean.   sigma : m/s^2,
+        of the acceleration, 0 at rest. A residual that exceeds its limit is tested again with
+        DRIVING_FORCE as sigma. Returns None, without a correction, if it exceeds this limit too,
+        or if the upward part is not gravity.
         """
-        if abs(residual_n[2]) > MOST_FORCE_OFF:      # unit g, no gravity, or upside down
+        if abs(residual_n[2]) > MOST_ACCELERATION:      # unit g, no gravity, or upside down
             return None
         H = np.zeros((2, N))
         H[0, 4], H[1, 3] = -GRAVITY, GRAVITY
@@ -154,12 +170,13 @@ class Errors:
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
     def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:
+        """Return the Kalman correction by z = H x with covariance R; others are not corrected."""
         cov = self.cov
         S = H @ cov @ H.T + R
         gain = np.zeros((N, len(z)))
         gain[observed] = np.linalg.solve(S, H @ cov)[:, observed].T
-        keep = np.eye(N) - gain @ H
-        self.cov, self.changed = keep @ cov @ keep.T + gain @ R @ gain.T, True
+        I_KH = np.eye(N) - gain @ H      # Joseph's form, valid for any gain
+        self.cov, self.changed = I_KH @ cov @ I_KH.T + gain @ R @ gain.T, True
         return gain @ z
 
     def pose_and_twist(self, C_nb: Matrix, arm_n: Vector, twist_b: Floats, T: float) -> Floats:
@@ -170,14 +187,14 @@ class Errors:
         to the point of the pose.   twist_b : (6, 3), turn rate in b to twist.   T : s, duration of
         the mean twist.
         """
-        J, out = POSE.copy(), np.empty((2, 6, 6))
+        J = POSE.copy()
         J[3:, M] = [row[1:] for row in C_nb]
         J[:3, 3:] = -cross_matrix(arm_n) @ J[3:, 3:]
-        out[0] = J @ self.cov @ J.T
-        out[0, :3, :3] += np.outer(self.shortening, self.shortening)
+        pose = J @ self.cov @ J.T
+        pose[:3, :3] += np.outer(self.shortening, self.shortening)
         # rotations about two axes cause half their product about the third
         a, b, c = self.cov[ROTATIONS, ROTATIONS].tolist()
-        out[0, ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
-        out[1] = twist_b @ (self.cov[BG, BG] + AXES * (self.grade.gyro_noise**2 / T)) @ twist_b.T
+        pose[ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
+        twist = twist_b @ (self.cov[BG, BG] + AXES * (self.grade.gyro_noise**2 / T)) @ twist_b.T
         self.changed = False
-        return out
+        return np.stack([pose, twist])

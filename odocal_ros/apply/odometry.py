@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Odometry of a stream: screened samples, a start, and the path from there.
+Odometry of a stream: from samples, block by block, to poses with covariances.
 
+Samples are screened; the start gives attitude and gyro bias; dead reckoning continues from there.
 If the path cannot be continued, it restarts at its origin, with a note.
 """
 
@@ -30,7 +31,7 @@ from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.settings.nominal import grade_of
 
-RESTARTS = 'odometry restarts'      # begin of the note on a restart
+RESTARTS = 'odometry restarts'      # first words of the note on a restart
 
 
 def clock_difference_text(difference_s: float) -> str:
@@ -52,8 +53,8 @@ class Odometry:
     def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
         self.vehicle, self.config = vehicle, config
         self.grade = grade_of(config.imu)
-        self.restarts = 0
-        self._first_lead_s: float | None = None
+        self.restarts = 0         # number of restarts
+        self._first_lead_s: float | None = None      # lead of the odometer's clock at first
         self._notes: list[str] = []
         self._reset()
 
@@ -80,6 +81,7 @@ class Odometry:
                     if screen.lag_ns is not None), key=abs) * 1e-9
 
     def restart(self, reason: str) -> None:
+        """Restart from the origin, and add a note with the reason."""
         self.restarts += 1
         self._notes.append(f'{RESTARTS} from the origin: {reason}')
         self._reset()
@@ -123,23 +125,25 @@ class Odometry:
         return self.missing_odometer_s() + self.imu.median_interval
 
     def poses(self) -> list[Pose]:
+        """Return the poses whose samples have arrived since the last call."""
         clock_difference_s = self.clock_difference_s()
         if clock_difference_s and self._path is not None:
             self.restart(clock_difference_text(clock_difference_s))
         if self._path is None and not clock_difference_s:
-            self._path = self._begin()
+            self._path = self._start_path()
         if self._path is None:
             self.imu.forget(ODOMETER_SILENCE)
             return []
         clock_step = max(screen.clock_step_s(STEP_ROWS) for screen in self._arrivals.values())
         permanent_step = max(screen.clock_step_s(PERMANENT_ROWS)
                              for screen in self._arrivals.values()) if clock_step else 0.0
-        out = self._path.poses(clock_step, permanent_step)
+        poses = self._path.poses(clock_step, permanent_step)
         if self._path.failed:
             self.restart(self._path.failed)
-        return out
+        return poses
 
-    def _begin(self) -> Reckoning | None:
+    def _start_path(self) -> Reckoning | None:
+        """Return the path from a start, None while there are too few samples."""
         start = find_start(self.imu, self.wheels, self.vehicle, self.config, self.grade)
         if start is None:
             return None

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.apply.errors import Errors, GRAVITY, MOST_FORCE_OFF
-from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
+from odocal_ros.apply.errors import Errors, GRAVITY, MOST_ACCELERATION
+from odocal_ros.apply.stream import IMU_GAP_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
@@ -19,11 +19,11 @@ from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.settings.nominal import Grade
 
-MOST_TILTING = 0.5         # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
+MOST_TILT_RATE = 0.5       # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
 START_SPAN = 2.0           # s; judgement: duration of the samples of a start
-GIVEN_TILT_SIGMA = 0.01    # rad; judgement: tilt of an attitude given by the settings
+CONFIGURED_TILT_SIGMA = 0.01    # rad; judgement: tilt of a configured attitude
 ROAD_TILT_SIGMA = 0.1      # rad; physical: a road slope of 10 %
-START_HOLE = 0.5           # s; judgement: largest IMU gap in the samples of a start
+START_GAP = 0.5            # s; judgement: largest IMU gap in the samples of a start
 BRAKING_SIGMA = 2.0        # m/s^2; physical: mean acceleration over START_SPAN
 
 
@@ -55,15 +55,15 @@ def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyCo
         return None
     rows = imu.rows[row:end + 1]
     t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
-    holes = np.flatnonzero(np.diff(t) > max(START_HOLE, HOLE_INTERVALS * imu.median_interval))
-    if len(holes):
-        imu.drop(row + int(holes[-1]) + 1)      # start from the rows after the gap
+    gaps = np.flatnonzero(np.diff(t) > max(START_GAP, IMU_GAP_INTERVALS * imu.median_interval))
+    if len(gaps):
+        imu.drop(row + int(gaps[-1]) + 1)      # start from the rows after the gap
         return None
     is_resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
     tilt_rate_b = _tilt_rate_b(w.mean(axis=0), f.mean(axis=0))
-    if not is_resting and np.linalg.norm(tilt_rate_b) > MOST_TILTING:
-        imu.drop(end)       # implausible gyro data: wait for its end
+    if not is_resting and np.linalg.norm(tilt_rate_b) > MOST_TILT_RATE:
+        imu.drop(end)       # implausible gyro data: start later
         return None
     return _start_by_gravity(end, float(t[-1] - t[0]), w, f, is_resting, vehicle, grade)
 
@@ -75,10 +75,11 @@ def _tilt_rate_b(w: Floats, f: Floats) -> Floats:
 
 
 def _start_from_settings(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
+    """Return the start with the configured attitude, gyro bias and latitude."""
     start = config.start
     q = np.asarray(start.attitude)
     earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))
-    errors = Errors(grade, vehicle, GIVEN_TILT_SIGMA, grade.gyro_bias, not earth.any())
+    errors = Errors(grade, vehicle, CONFIGURED_TILT_SIGMA, grade.gyro_bias, not earth.any())
     return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
 
 
@@ -86,8 +87,8 @@ def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting:
                       vehicle: Vehicle, grade: Grade) -> Start:
     """Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated."""
     mean = f.mean(axis=0)
-    is_level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
-    C_Lb = level_frame(mean) if is_level else vehicle.C_vb
+    has_gravity = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_ACCELERATION)    # False for NaN
+    C_Lb = level_frame(mean) if has_gravity else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
     C_nb = level_to_n_rotation(-np.arctan2(forward[1], forward[0])) @ C_Lb
     if is_resting:
@@ -95,9 +96,9 @@ def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting:
         noise = np.maximum(grade.gyro_noise / np.sqrt(length), w.std(axis=0) / np.sqrt(len(w)))
         sigma = np.hypot(noise, grade.gyro_bias_walk * np.sqrt(length))
     else:
-        known = vehicle.gyro_bias is not None
-        bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
+        bias = np.zeros(3) if vehicle.gyro_bias is None else vehicle.gyro_bias
+        sigma = grade.gyro_bias
     errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
-    if is_level:        # correlates the tilt with the accelerometer bias
+    if has_gravity:        # correlates the tilt with the accelerometer bias
         errors.correct_by_gravity(C_nb, np.zeros(3), length, 0.0 if is_resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

@@ -16,8 +16,8 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import SWAY
 
-# format: floats of nav_msgs/Odometry; of them before each covariance
-NUMBERS, PLACE, MOTION = struct.Struct('<85d'), struct.Struct('<7d'), struct.Struct('<6d')
+# format: floats of nav_msgs/Odometry; those of pose and twist before their covariances
+NUMBERS, POSE_MEAN, TWIST_MEAN = struct.Struct('<85d'), struct.Struct('<7d'), struct.Struct('<6d')
 TWIST = 43 * 8         # format: byte of the twist
 NONE = (0.0,) * 6      # definition
 
@@ -77,8 +77,8 @@ class Pose:
 def pack_pose(position: Vector, q: Quaternion, twist: Sequence[float],
               covariances: Sequence[bytes]) -> bytes:
     """Return the floats of a pose as in a message: m, x y z w, 6 m/s, rad/s, two covariances."""
-    of_pose, of_twist = covariances
-    return PLACE.pack(*position, *q) + of_pose + MOTION.pack(*twist) + of_twist
+    pose_cov, twist_cov = covariances
+    return POSE_MEAN.pack(*position, *q) + pose_cov + TWIST_MEAN.pack(*twist) + twist_cov
 
 
 def covariances(from_errors: Floats, by_delay: Sequence[float], along_n: Sequence[float],

@@ -33,7 +33,7 @@ from odocal_ros.apply.attitude import (
 from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
 from odocal_ros.apply.odometry_start import Start
 from odocal_ros.apply.pose import covariances, pack_pose, Pose, velocity_variances
-from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
+from odocal_ros.apply.stream import IMU_GAP_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import DelaySearch, Wheels
 from odocal_ros.data.arrays import Floats
@@ -42,15 +42,14 @@ from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.node_configs import ApplyConfig
 
 # judgement, all in s: between corrections; averaging time of a speed; odometer silence after which
-# only the attitude continues; IMU gap after which force is not used
-CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
+# only the attitude continues; longest IMU gap in which the force is used
+CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, FORCE_GAP = 1.0, 0.2, 10.0, 0.1
 # judgement: number of consecutive mismatches of force and motion after which the attitude is
 # invalid, if the size of the force differs from gravity by less than this, m/s^2
 MOST_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
 ROWS_BEHIND = 200         # judgement: IMU rows, older ones are dropped
-# judgement: s between propagations of the covariance; relative change of the interval of poses
-# above which their covariances are computed again
-PROPAGATION_PERIOD, PERIOD_CHANGE = 0.05, 0.1
+# judgement: relative change of the interval of poses: their covariances are computed again
+PERIOD_CHANGE = 0.1
 PLAUSIBLE = np.zeros(3)   # rad: no implausible turn
 GRAVITY_N = np.array([0.0, 0.0, GRAVITY])
 TILT_LOST = 0.5           # rad; judgement: larger sigmas are beyond a linearised correction
@@ -64,26 +63,32 @@ class Reckoning:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
         self._notes, self.failed = notes, ''
         self._delay = DelaySearch(SPEED_SPAN, delay_sigma, notes)
-        self.q: Quaternion = tuple(start.q_nb.tolist())
+        # state at the time _t of an IMU row
+        self.imu.drop(start.row)
+        self._t = self.imu.rows[self.imu.at].t
+        self._s = self.wheels.at(self._t)                   # m, travel
+        self.q: Quaternion = tuple(start.q_nb.tolist())     # attitude of b in n
+        self._C_nb = rotation_matrix(self.q)
         self.bias: Vector = tuple(start.gyro_bias.tolist())
         self.accel_bias, self.errors = ZERO, start.errors
-        self.position = ZERO      # of the odometer's point, relative to the start
-        self.imu.drop(start.row)
+        self.position = ZERO      # m, of the odometer's point, relative to the start
+        # constants
         self._earth_n, self._forward_b = start.earth_n.tolist(), vehicle.forward_b.tolist()
         self._arm_b, self._q_bv = vehicle.arm_b.tolist(), vehicle.q_bv.tolist()
-        self._t = self._t_pose = self._t_corrected = self.imu.rows[self.imu.at].t
-        self._s = self._s_pose = self.wheels.at(self._t)
-        self._C_nb = rotation_matrix(self.q)
-        self._turn_b, self._dv_n, self._force_is_usable = ZERO, ZERO, True
-        self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
+        self._start_arm_n = rotate_vector(self._C_nb, self._arm_b)
+        # since the last pose: time and travel there, turn, rad, variance of travel, m^2; interval
+        # of the last covariances, s
+        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, ZERO
+        self._travel_variance = self._T_cov = 0.0
+        # since the last correction: time and velocity there, integral of the force, m/s, turn
+        # rates, rad/s
+        self._t_corrected, self._v_corrected = self._t, self._velocity_n(self._t)
+        self._dv_n, self._force_is_usable = ZERO, True
         self._rates: list[Vector] = []
         self._was_resting, self._mismatch_count, self._implausible_turn = False, 0, PLAUSIBLE
-        self._v_corrected = self._velocity_n(self._t)
         # m/s in n: velocity at the start plus changes by turns
         self._turned_velocity_n: Vector = tuple(self._v_corrected.tolist())
         self._clock_step = self._permanent_step = 0.0      # s, clock steps: newest, and permanent
-        self._travel_variance = self._T_cov = 0.0      # m^2, of travel since the last pose; s
-        self._arm0_n = rotate_vector(self._C_nb, self._arm_b)
 
     def poses(self, clock_step: float = 0.0, permanent_step: float = 0.0) -> list[Pose]:
         """
@@ -91,7 +96,7 @@ class Reckoning:
 
         clock_step, permanent_step : s, by the last rows; by the last PERMANENT_ROWS.
         """
-        out: list[Pose] = []
+        poses: list[Pose] = []
         if permanent_step and not self._permanent_step:
             self._notes.append(f'stamps shifted by {permanent_step:.2g} s relative to their '
                                'arrival times; sigma increased. Likely cause: a clock was set, '
@@ -106,15 +111,15 @@ class Reckoning:
             if self.failed:
                 break
             if received:
-                out.append(self._pose())
-                if not out[-1].is_valid():
+                poses.append(self._pose())
+                if not poses[-1].is_valid():
                     self.failed = 'a value of the pose is not finite'
-                    return out[:-1]
+                    return poses[:-1]
             self._correct_periodically()
             if last > ROWS_BEHIND:
                 self.imu.drop(last - INTERVAL_ROWS)
                 self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)
-        return out
+        return poses
 
     def next_pose_time(self) -> float:
         """Return the earliest time of the next pose, s."""
@@ -142,7 +147,7 @@ class Reckoning:
         forward_n, f_n = rotate_vector(C_nb, self._forward_b), rotate_vector(C_nb, f[0])
         for k, T in enumerate(gaps):
             phi = rotation_increment(t, w, at - low + k)
-            C_nb = self._rotated_by(phi, T)
+            C_nb = self._rotate(phi, T)
             forward_before, forward_n = forward_n, rotate_vector(C_nb, self._forward_b)
             f_before, f_n = f_n, rotate_vector(C_nb, f[k + 1])
             turn_b = add_scaled(turn_b, phi)
@@ -152,38 +157,27 @@ class Reckoning:
         self._C_nb, self.position = C_nb, add_scaled(self.position, travel_n)
         self._dv_n = add_scaled(self._dv_n, dv_n)
         T, turn_n = t[-2] - self._t, rotate_vector(C_nb, turn_b)
-        long_gaps = [gap for gap in gaps if gap > HOLE_INTERVALS * imu.median_interval]
-        self._propagate(T, travel_n, turn_n, long_gaps,
-                        self.wheels.variance_between(self._t, t[-2]))
+        long_gaps = [gap for gap in gaps if gap > IMU_GAP_INTERVALS * imu.median_interval]
+        travel_variance = self.wheels.variance_between(self._t, t[-2])
+        self._travel_variance += travel_variance
+        self.errors.add_interval(T, C_nb, travel_n, turn_n, travel_variance, long_gaps)
         self._turned_velocity_n = add_scaled(self._turned_velocity_n, cross(turn_n, travel_n),
                                              1 / T)
         self._add_turn_variance([row.implausible for row in path_rows[1:]], gaps)
         if dropped_travel > self.wheels.quantum:
             self.errors.add_travel(dropped_travel)
-        is_plausible = self._implausible_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
+        is_plausible = self._implausible_turn is PLAUSIBLE and max(gaps) <= FORCE_GAP
         self._force_is_usable &= is_plausible and math.isfinite(sum(dv_n))
         self._turn_b = add_scaled(self._turn_b, turn_b)
         self._rates += [row.w_b for row in path_rows[1:]]
         self._t, imu.at = t[-2], last
 
-    def _rotated_by(self, phi: Vector, T: float) -> Matrix:
+    def _rotate(self, phi: Vector, T: float) -> Matrix:
+        """Rotate the attitude by phi, rad, in b, and by the Earth over T s; return C_nb."""
         self.q = quaternion_product(self.q, rotation(phi))
         if any(self._earth_n):
             self.q = quaternion_product(rotation(add_scaled(ZERO, self._earth_n, -T)), self.q)
         return rotation_matrix(self.q)
-
-    def _propagate(self, T: float, travel_n: Vector, turn_n: Vector, gaps: list[float],
-                   variance: float) -> None:
-        """Propagate the errors every PROPAGATION_PERIOD, or at once if data are uncertain."""
-        self._pending_s += T
-        self._travel_variance += variance
-        self._pending_travel = add_scaled(self._pending_travel, travel_n)
-        self._pending_turn = add_scaled(self._pending_turn, turn_n)
-        if self._pending_s > PROPAGATION_PERIOD - 1e-6 or variance or gaps:
-            C_nb = np.array(self._C_nb)
-            self.errors.propagate(self._pending_s, C_nb, self._pending_travel, self._pending_turn,
-                                  C_nb @ self.vehicle.C_vb.T, variance, gaps)
-            self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
 
     def _add_turn_variance(self, implausible: list[Vector], gaps: list[float]) -> None:
         """Add the variance of implausible turn rates in b, rad/s, each over a gap, s."""
@@ -201,13 +195,15 @@ class Reckoning:
             self.failed = f'the sigma of the tilt exceeds {TILT_LOST:g} rad'
 
     def _velocity_n(self, t: float) -> Floats:
-        v, C_nb = self.vehicle, np.array(self._C_nb)
+        """Return the velocity of the IMU by odometer and turn rate, (3,) m/s."""
+        vehicle, C_nb = self.vehicle, np.array(self._C_nb)
         travel = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
-        arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
+        arm_b = vehicle.C_vb.T @ self.config.imu.lever_arm + vehicle.arm_b
         rate = add_scaled(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
-        return C_nb @ (v.forward_b * travel / SPEED_SPAN + cross(rate, arm_b.tolist()))
+        return C_nb @ (vehicle.forward_b * travel / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _correct_periodically(self) -> None:
+        """Correct tilt by gravity and bias at standstill, and estimate the delay, every period."""
         T = self._t - self._t_corrected
         if T < CORRECTION_PERIOD - 1e-6:
             return
@@ -233,9 +229,9 @@ class Reckoning:
                 # error of the linearisation for a large correction
                 self.errors.add_turn(np.eye(3) * np.sum(correction[PHI]**2)**2 / 4)
         if self.config.levelling and is_standing:
-            of_rate = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
+            rate_variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_n
-            self._correct(self.errors.correct_by_rest(rate_b, of_rate))
+            self._correct(self.errors.correct_by_rest(rate_b, rate_variance))
         self.errors.changed |= self._delay.take(
             rotate_vector(self._C_nb, self._forward_b),
             velocity - self._v_corrected if received and self._force_is_usable else None,
@@ -258,12 +254,14 @@ class Reckoning:
             self.failed = f'specific force and attitude disagree for {self._mismatch_count} s'
 
     def _correct(self, correction: Floats) -> None:
+        """Correct attitude and biases by a correction of the error state, (16,)."""
         self.q = quaternion_product(rotation(correction[PHI].tolist()), self.q)
         self._C_nb = rotation_matrix(self.q)
         self.bias = add_scaled(self.bias, correction[BG].tolist())
         self.accel_bias = add_scaled(self.accel_bias, correction[BA].tolist())
 
     def _pose(self) -> Pose:
+        """Return the pose at this time, with the mean twist since the last one."""
         T, C_bn = self._t - self._t_pose, tuple(zip(*self._C_nb, strict=True))
         arm_n = rotate_vector(self._C_nb, self._arm_b)
         rate_b = add_scaled(add_scaled(ZERO, self._turn_b, 1 / T),
@@ -278,7 +276,7 @@ class Reckoning:
         self._t_pose, self._s_pose = self._t, self._s
         self._turn_b, self._travel_variance = ZERO, 0.0
         return Pose(self.imu.rows[self.imu.at].stamp_ns, pack_pose(
-            add_scaled(add_scaled(self.position, arm_n), self._arm0_n, -1.0),
+            add_scaled(add_scaled(self.position, arm_n), self._start_arm_n, -1.0),
             quaternion_product(self.q, self._q_bv),
             (twist_by_turn[0] + speed, *twist_by_turn[1:]), self._covariances))
 
@@ -292,9 +290,9 @@ class Reckoning:
         by_delay = (*add_scaled(ZERO, add_scaled(self._turned_velocity_n, forward_n, -speed),
                                 delay),
                     *add_scaled(ZERO, rotate_vector(self._C_nb, rate_b), self._clock_step))
-        now, since = self.wheels.variances(self._t, T)
+        travel_variance, increment_variance = self.wheels.variances(self._t, T)
         return covariances(
             self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), by_delay,
-            add_scaled(ZERO, forward_n, math.sqrt(now)),
+            add_scaled(ZERO, forward_n, math.sqrt(travel_variance)),
             [self.errors.grade.gyro_scale_error * component for component in twist_by_turn],
-            velocity_variances(self.vehicle, speed, T, since + self._travel_variance))
+            velocity_variances(self.vehicle, speed, T, increment_variance + self._travel_variance))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The IMU rows of a stream that dead reckoning still needs, without implausible ones.
+The IMU rows of a stream that dead reckoning still needs, without spikes and isolated outliers.
 
-A leg is screened as a whole (``screening/glitches.py``). A stream has the rows before, and those
-after within the longest duration of a spike. The limits are those of a leg. A block has two or
-three rows, so numbers are faster than numpy arrays.
+A leg is screened as a whole (``screening/glitches.py``). In a stream, a row is tested with earlier
+rows, and with later ones up to the longest duration of a spike; the limits are those of a leg. A
+block has two or three rows, so numbers are faster than numpy arrays.
 """
 
 from bisect import bisect_left, bisect_right
@@ -34,15 +34,15 @@ from odocal_ros.screening.glitches import (
 from odocal_ros.settings.node_configs import ApplyConfig
 
 INTERVAL_ROWS = 64      # judgement: rows of the median interval
-HOLE_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
+IMU_GAP_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
 # physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
 MOST_TURN, MOST_FORCE = 70.0, 2000.0      # rad/s, m/s^2
 USUAL_ROWS = 50           # judgement: rows of the mean step
-STUCK_TIME = 0.1          # s; judgement: rows that are equal for longer are frozen
+FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are frozen
 TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
-STRANGE_TURN_TIME = 1.0        # s; judgement: a longer turn after a step is real
-ALONE_CHANGE = 2.5        # rad/s^2; judgement: least isolated step; turns start more slowly
-SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
+IMPLAUSIBLE_TIME = 1.0    # s; judgement: a longer turn after a step is real
+ISOLATED_CHANGE = 2.5     # rad/s^2; judgement: least isolated step; turns start more slowly
+SINGLE_LIMITS = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
 SINGLE_ROWS = NEIGHBOUR_ROWS + 4      # definition: rows that ``is_single`` uses
 
 
@@ -86,39 +86,40 @@ class SpikeScreen:
 
     def __init__(self) -> None:
         self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
-        self._since = 0.0                   # s, begin of equal rows
+        self._equal_since = 0.0             # s, begin of equal rows
         self._kept: deque[Row] = deque(maxlen=NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
-        self._step_size = ZERO                # rad/s, implausible step of the gyro
+        self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none
         self._before = ZERO                 # rad/s, rate before the step
-        self._until = 0.0                   # s, end of the implausible part
+        self._until = 0.0                   # s, end of the implausible rates
 
     def screen(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
         kept, k = [], 0
         while k < len(rows):
             row, last = rows[k], self._kept[-1] if self._kept else rows[k]
-            step, isolated, return_row = _step(last, row), self._isolated_axes(rows[k:k + 2]), None
+            step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
+            spike_rows = None      # after this one, until the values are back
             if any(self._exceeds_usual(step)) and not self._is_over(row):
                 within = bisect_right(rows, last.t + GLITCH_TIME, key=time_of)
-                return_row = self._rows_until_return(last, rows[k + 1:within], step)
-                if return_row is None and within == len(rows):
-                    break
-            if any(isolated) and k + 1 == len(rows) and return_row is None:
+                spike_rows = self._rows_until_return(last, rows[k + 1:within], step)
+                if spike_rows is None and within == len(rows):
+                    break              # wait for later rows
+            if any(isolated) and k + 1 == len(rows) and spike_rows is None:
                 break                  # wait for the next row
             self._update_usual_step(step)
             if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
-                self._since = row.t
-            self._dropped = return_row is not None or row.t - self._since > STUCK_TIME
+                self._equal_since = row.t
+            self._dropped = spike_rows is not None or row.t - self._equal_since > FROZEN_TIME
             if not self._dropped:
                 implausible = self._implausible_part(last, row, isolated)
                 kept.append(row if implausible is ZERO else row._replace(implausible=implausible))
                 self._kept.append(row)
-            k += 1 + (return_row or 0)
+            k += 1 + (spike_rows or 0)
         return kept, list(rows[k:])
 
     def _isolated_axes(self, rows: Sequence[Row]) -> tuple[bool, ...]:
-        """Return a mask of the gyro axes with an isolated step: a turn starts over several."""
+        """Return a mask of gyro axes with an isolated step; a turn starts over several rows."""
         kept = self._kept
         if self._dropped or len(kept) <= NEIGHBOUR_ROWS or (
                 _largest(kept[-1].w_b, rows[0].w_b) <= SINGLE_TURN):
@@ -126,7 +127,7 @@ class SpikeScreen:
         steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
                  for one, other in pairwise((*kept, *rows))]
         current_step = steps.pop(NEIGHBOUR_ROWS)
-        least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
+        least = max(SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
         return tuple(size > max(least, SINGLE_TIMES * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
@@ -147,7 +148,7 @@ class SpikeScreen:
                 x, y, z = (size if is_isolated or size > limit else 0.0
                            for size, is_isolated in zip(steps, isolated or ZERO, strict=True))
                 self._step_size, self._before = (x, y, z), last.w_b
-                self._until = row.t + STRANGE_TURN_TIME
+                self._until = row.t + IMPLAUSIBLE_TIME
         return self._step_size
 
     def _exceeds_usual(self, step: Pair) -> tuple[bool, bool]:
@@ -165,11 +166,11 @@ class SpikeScreen:
             / USUAL_ROWS)
 
     def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
-        """Return the number of the row where the values are back after a step, None without."""
+        """Return the number of rows until the values are back after a step, None if never."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
-            if all(left <= RETURN_SHARE * size for left, size, bound in zip(
-                    _step(last, row), step, exceeds, strict=True) if bound):
+            if all(remaining <= RETURN_SHARE * size for remaining, size, is_large in zip(
+                    _step(last, row), step, exceeds, strict=True) if is_large):
                 return k
         return None
 
@@ -190,18 +191,17 @@ def is_single(rows: Sequence[Row]) -> bool:
     """
     Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
 
-    As ``screening.glitches.isolated``, but by earlier rows only.
+    As ``screening.glitches.isolated_outliers``, but only earlier rows give the usual deviation.
     """
     if len(rows) < SINGLE_ROWS:
         return False
     before, row, after = rows[-3:]
-    # least step to an outlier, in distances to the mean
-    least_share = 1 - EQUAL_NEIGHBOURS / 2
+    least_share = 1 - EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
     if not (_largest(before.w_b, row.w_b) > least_share * SINGLE_TURN
             or _largest(before.f_b, row.f_b) > least_share * SINGLE_FORCE):
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
-    for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
+    for k, (a, b, c, least) in enumerate(zip(*values, SINGLE_LIMITS, strict=True)):
         deviation = abs(b - (a + c) / 2)
         if deviation > least and abs(c - a) < EQUAL_NEIGHBOURS * deviation:
             x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
@@ -226,16 +226,16 @@ class ImuStream:
         self._offset_ns = round(config.imu.time_offset * 1e9)
         self._notes = notes
         self._screen = SpikeScreen()
-        self._held: list[Row] = []
+        self._held: list[Row] = []      # rows that may be spikes
         self.rows: list[Row] = []
         self.zero_ns = 0
         self.at = 0
         self.median_interval = 0.0
-        self._unmeasured = 0        # rows since ``median_interval`` was measured
+        self._new_rows = 0        # since ``median_interval`` was computed
 
     def feed(self, readings: Sequence[Reading]) -> None:
         """Add rows with rising stamps; possible spikes are held until the next call."""
-        rows, before = self._held, len(self._held)
+        rows, held_count = self._held, len(self._held)
         for stamp, _, w_i, f_i, *_ in readings:
             w_b, f_b = rotate_vector(self._gyro, w_i), rotate_vector(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
@@ -244,7 +244,7 @@ class ImuStream:
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._note_dropped(before + len(readings) - len(rows),
+        self._note_dropped(held_count + len(readings) - len(rows),
                            'hold NaN or impossible values')
         kept, self._held = self._screen.screen(rows)
         self._note_dropped(len(rows) - len(kept) - len(self._held),
@@ -254,11 +254,11 @@ class ImuStream:
             if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
                 self._note_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
-        self._unmeasured += len(kept)
+        self._new_rows += len(kept)
         few = len(self.rows) < INTERVAL_ROWS
-        if len(self.rows) > 1 and (few or self._unmeasured > INTERVAL_ROWS // 4):
+        if len(self.rows) > 1 and (few or self._new_rows > INTERVAL_ROWS // 4):
             steps = sorted(b.t - a.t for a, b in pairwise(self.rows[-INTERVAL_ROWS:]))
-            self.median_interval, self._unmeasured = steps[len(steps) // 2], 0
+            self.median_interval, self._new_rows = steps[len(steps) // 2], 0
 
     def _note_dropped(self, rows: int, cause: str) -> None:
         if rows:

@@ -26,27 +26,18 @@ SIDES = ('scale_factor_left', 'scale_factor_right')
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """
-    A calibrated vehicle.
+    """A calibrated vehicle."""
 
-    scale : m per unit of the odometer; of two wheels: of their mean.   scale_sigma : relative.
-    wheel_scales : m per unit, left and right; None if only the mean is calibrated.
-    yaw, pitch : rad, mounting angles, with sigmas.
-    lever_arm : (3,) m, position of the odometer in base_link.
-    gyro_bias : (3,) rad/s in b as last calibrated, None if unknown.
-    guessed : texts on assumed values.
-    """
-
-    scale: float
-    scale_sigma: float
-    wheel_scales: tuple[float, float] | None
-    yaw: float
+    scale: float            # m per unit of the odometer; of two wheels: of their mean
+    scale_sigma: float      # relative
+    wheel_scales: tuple[float, float] | None      # left and right; None: mean only
+    yaw: float              # rad, mounting angles
     pitch: float
     yaw_sigma: float
     pitch_sigma: float
-    lever_arm: Floats
-    gyro_bias: Floats | None
-    assumptions: tuple[str, ...] = ()
+    lever_arm: Floats       # (3,) m, position of the odometer in base_link
+    gyro_bias: Floats | None      # (3,) rad/s in b as last calibrated, None: unknown
+    assumptions: tuple[str, ...] = ()      # texts on values that are not in the calibration
 
     @cached_property
     def forward_b(self) -> Floats:
@@ -70,12 +61,12 @@ class Vehicle:
 
     def twist_by_turn(self, rate_b: Vector) -> tuple[float, ...]:
         """Return ``twist_b`` times a turn rate in b, rad/s, as numbers."""
-        C_vb, lever_v = self._plain
+        C_vb, lever_arm = self._as_lists
         rate_v = rotate_vector(C_vb, rate_b)
-        return *cross(lever_v, rate_v), *rate_v
+        return *cross(lever_arm, rate_v), *rate_v
 
     @cached_property
-    def _plain(self) -> Sequence[Any]:
+    def _as_lists(self) -> Sequence[Any]:
         return self.C_vb.tolist(), self.lever_arm.tolist()
 
     @cached_property
@@ -95,7 +86,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     if len(config.odometer.wheels) > len(SIDES):
         raise BadConfig(f'odometer.wheels has {len(config.odometer.wheels)} wheels; the limit of '
                         'this node is 2: name the wheels of an axle that does not steer')
-    # speeds without corrections have their own factor
+    # the odometry uses speeds without corrections, for which another factor is calibrated
     scale, sigma = estimate_of('scale_factor_as_sent', *estimate_of('scale_factor', math.nan))
     left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):

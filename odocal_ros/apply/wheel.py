@@ -18,21 +18,23 @@ from odocal_ros.apply.arrivals import RowTimes
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
-# judgement: averaging time of the speed, s, least and largest; counts that it contains
-LEAST_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
+# judgement: averaging time of the speed, s, least and largest; number of counts in this time
+LEAST_SPEED_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
 # m/s^2; physical: half of g, hard braking; largest acceleration of a wheel that locks or spins
 SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
-# judgement: s, longest burst of stamps; limit of the deviation of a row in mean jitters of the
-# stamps; rows that determine the mean
+# judgement: longest burst of stamps, s; largest deviation of a row, in mean jitters of the stamps;
+# rows of the mean jitter
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
-# judgement: limits of one row in the mean jitter, in mean jitters and s: lost counts are no jitter
+# judgement: largest part of one row in the mean jitter, in mean jitters plus s: lost counts are
+# no jitter
 LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
-HUNG_JITTERS = 2.0    # judgement: limit of a counter that stops abruptly; a held one has 3
-# judgement: rows before the first test; least number of consecutive refused rows, and their
-# duration, s, before one is accepted
+# judgement: of a counter that stops abruptly; one that holds its values has 3
+HUNG_JITTERS = 2.0
+# judgement: rows before the first test; number of consecutive rows that are refused, and their
+# least duration, s, before one is accepted
 TESTED_FROM_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
-UNEXPLAINED_TIME = 1.0    # s; judgement: after it, acceleration may explain a step of the speed
-KEPT_TIME = 60.0    # s; judgement: age of rows that are dropped, also without IMU messages
+UNEXPLAINED_TIME = 1.0    # s; judgement: later, acceleration may explain a step of the speed
+KEPT_TIME = 60.0    # s; judgement: older rows are dropped, also without IMU messages
 LEAST_BEND = 1e-3    # m; judgement: smaller errors of travel between two speeds are below slip
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, median intervals; judgement: least gap
 
@@ -122,6 +124,7 @@ class Wheel:
         return sag**2
 
     def forget(self, t: float) -> None:
+        """Drop the rows before a time, s, except the last one."""
         while len(self.t) > 2 and self.t[1] < t:
             self.t.popleft()
             self.s.popleft()
@@ -129,6 +132,7 @@ class Wheel:
             self.uncertain.popleft()
 
     def _take(self, t: float, value: float) -> None:
+        """Add a row: correct its time, test it, and update travel, speed and variance."""
         if self._value is None:
             self._value = value
             is_count = isinstance(value, int) and self.form.quantity != 'rate'
@@ -187,9 +191,11 @@ class Wheel:
             t - self._refused_since < REFUSED_TIME)
 
     def _step_limit(self, dt: float) -> float:
+        """Return the largest travel in dt s, m."""
         return FASTEST * max(dt, STAMP_BURST) + self.quantum
 
     def _stops_abruptly(self, dt: float, step: float) -> bool:
+        """Return True if the counter stops faster than by hard braking."""
         return not step and not self._unexplained_speed and self.form.quantity != 'rate' and (
             abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
 
@@ -200,9 +206,10 @@ class Wheel:
                 + (jitters * self._jitter + T - dt) * abs(self.speed))
 
     def _speed_time(self) -> float:
+        """Return the averaging time of the speed, s; longer for coarse counts."""
         counts = SPEED_COUNTS * self.quantum
         coarse = counts / max(abs(self.speed), counts) if counts else 0.0
-        return min(SPEED_TIME, LEAST_TIME + coarse)
+        return min(SPEED_TIME, LEAST_SPEED_TIME + coarse)
 
     def _update_speed(self, dt: float, step: float, row_speed: float, deviation: float) -> None:
         """Update the speed by an accepted row; add variance after a step of the speed."""
@@ -233,6 +240,7 @@ class Wheel:
         self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
 
     def _add_speed_variance(self, dt: float) -> None:
+        """Add the variance of travel by the unexplained speed in the last dt s."""
         path_length = self._unexplained_travel + self._unexplained_speed * dt
         self._add_variance((path_length**2 - self._unexplained_travel**2) / 3)
         self._unexplained_travel = path_length
@@ -263,6 +271,7 @@ class Wheel:
         self.s.append(s)
 
     def _step(self, value: float, before: float, dt: float) -> float:
+        """Return the travel from a value to the next, in units of the odometer."""
         if self.form.quantity == 'rate':
             return (before + value) / 2 * dt
         if self.form.quantity == 'increment':

@@ -21,21 +21,22 @@ from odocal_ros.settings.node_configs import ApplyConfig
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, Sequence[Reading], OdometerForm]
-# judgement: least and largest number of rows, one per second; s, correlation of residuals
+# judgement: least and largest number of rows of the regression, one per second; s, correlation of
+# residuals
 LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
 # judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
 # up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
 LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
 # judgement: ratio of the change of acceleration within a second to the central difference over
 # two, in simulated town drives
-CHANGE_SMOOTHED = 1.2
+CHANGE_RATIO = 1.2
 
 
 class Wheels:
     """
     Travel of the vehicle, m: of its only wheel, or the mean of two.
 
-    Each of two wheels has its own scale if the calibration has both.
+    Two wheels have different scales if the calibration has both.
     """
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig, notes: list[str]) -> None:
@@ -49,6 +50,7 @@ class Wheels:
         self.quantum = 0.0                   # m, size of a count of the travel
 
     def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
+        """Add rows of a wheel."""
         self._waiting.append((slot, rows, form))
         if not self.zero_ns:
             self._waiting = self._waiting[-100:]
@@ -76,13 +78,16 @@ class Wheels:
                 self._wheels[slot].rescale(scale)
 
     def ready(self) -> bool:
+        """Return True if all expected wheels have rows."""
         return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
             not self._two or len(self._wheels) == 2)
 
     def newest(self) -> float:
+        """Return the time up to which all wheels have rows, s."""
         return min(w.t[-1] for w in self._wheels.values())
 
     def oldest(self) -> float:
+        """Return the time from which all wheels have rows, s."""
         return max(w.t[0] for w in self._wheels.values())
 
     def at(self, t: float) -> float:
@@ -104,6 +109,7 @@ class Wheels:
 
     @property
     def delay_s(self) -> float:
+        """Return the sigma of the constant delay of the rows, s."""
         return max(w.delay_s for w in self._wheels.values())
 
     def still(self, t_from: float, t_to: float) -> bool:
@@ -112,6 +118,7 @@ class Wheels:
                    <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
+        """Drop the rows before a time, s."""
         for wheel in self._wheels.values():
             wheel.forget(t)
 
@@ -128,8 +135,11 @@ class DelaySearch:
     """
 
     def __init__(self, span_s: float, sigma_s: float, notes: list[str]) -> None:
-        self.sigma_s, self._notes, self._own_s, self._found_s = sigma_s, notes, span_s / 2, 0.0
+        self.sigma_s, self._notes, self._speed_delay_s = sigma_s, notes, span_s / 2
+        self._found_s = 0.0      # largest delay reported
+        # changes of speed in the last three seconds, m/s, by odometer and by force
         self._last: deque[tuple[float, float]] = deque(maxlen=3)
+        # rows of the regression: change of acceleration, difference of the changes of speed
         self._rows: deque[tuple[float, float]] = deque(maxlen=MOST_DELAY_ROWS)
 
     def take(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
@@ -146,10 +156,10 @@ class DelaySearch:
         self._last.append((float(forward_n @ change_n), float(forward_n @ force_n)))
         if len(self._last) < 3:
             return False
-        (before, _), (own, by_force), (after, _) = self._last
-        self._rows.append(((after - before) / 2, by_force - own))
+        (before, _), (by_odometer, by_force), (after, _) = self._last
+        self._rows.append(((after - before) / 2, by_force - by_odometer))
         delay, sigma = self._delay()
-        delay += self._own_s
+        delay += self._speed_delay_s
         if abs(delay) < max(LEAST_DELAY, DELAY_SIGMAS * sigma, self._found_s):
             return False
         self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
@@ -173,9 +183,9 @@ class DelaySearch:
         # residuals are correlated: Newey-West covariance
         middle = scores.T @ scores
         for lag in range(1, LAGS):
-            quaternion_product = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
-            middle += quaternion_product + quaternion_product.T
+            lagged = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
+            middle += lagged + lagged.T
         C = np.linalg.inv(N)
         white = np.sum((y - X @ fit)**2) / (len(y) - 2) * C[0, 0]
         variance = max(white, (C @ middle @ C)[0, 0])
-        return float(-fit[0]) / CHANGE_SMOOTHED, float(np.sqrt(variance)) / CHANGE_SMOOTHED
+        return float(-fit[0]) / CHANGE_RATIO, float(np.sqrt(variance)) / CHANGE_RATIO
