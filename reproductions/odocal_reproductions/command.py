@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What both commands share: the option --plot, and where a picture goes."""
+"""The options --json and --plot, which both commands have."""
 
 import argparse
 from pathlib import Path
@@ -9,10 +9,10 @@ from pathlib import Path
 from odocal_ros.errors import BadUsage
 
 
-def add_outputs(parser: argparse.ArgumentParser, drawn: str) -> None:
-    """Declare --json and --plot."""
+def add_outputs(parser: argparse.ArgumentParser, picture: str) -> None:
+    """Declare --json and --plot; picture: what it shows."""
     parser.add_argument('--json', action='store_true', help='print one JSON object instead')
-    parser.add_argument('--plot', metavar='FILE', help=f'draw {drawn}: .png, .svg or .pdf')
+    parser.add_argument('--plot', metavar='FILE', help=f'draw {picture}: .png, .svg or .pdf')
 
 
 def picture_of(args: argparse.Namespace) -> Path | None:

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.core
 
 @pytest.fixture(scope='module')
 def drive():
-    return patent.driven('rtk', 1)
+    return patent.planar_leg('rtk', 1)
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_picture_that_cannot_be_is_refused_before_anything_is_computed(capsys,
 
 
 def test_the_embodiment_as_printed():
-    leg = patent.driven('white', 0, duration=300.0, imu_grade='perfect', fix_sigma=0.0,
+    leg = patent.planar_leg('white', 0, duration=300.0, imu_grade='perfect', fix_sigma=0.0,
                         odometer_rate=50.0)
     table = embodiment(leg, truth=FOUND)
     rows = {row.name: row for row in table.rows}

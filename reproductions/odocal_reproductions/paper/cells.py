@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What Shi et al. 2015 prints in its tables 1 to 4, and a cell that holds it beside our value.
+The printed tables 1 to 4 of Shi et al. 2015, and a cell with a printed and a computed value.
 
 Shi, Ma, Zhang, Zhang 2015, 'The initial calibration of odometer and error analysis'. Tables 1 and
-2 print magnitudes. The yaw errors of tables 3 and 4 are printed as truth - estimate; ours are
-estimate - truth everywhere.
+2 print magnitudes. The yaw errors of tables 3 and 4 are printed as truth - estimate; computed
+errors are always estimate - truth.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 CONVENTION = ('value: estimate - truth; printed: as printed, which in the yaw columns of tables 3 '
               'and 4 is truth - estimate, and in tables 1 and 2 a magnitude')
 
-# rate of a state: {by: printed}
+# rate of a state: {state or drift: printed coefficient}
 TABLE_1 = {
     'dL': {'phi_U': 2.2e-6},
     'dlam': {'dL': 2.4e-6, 'phi_U': 2.8e-6},
@@ -49,23 +49,17 @@ TABLE_4 = {
 
 @dataclass(frozen=True)
 class Cell:
-    """
-    A printed value beside ours.
-
-    sense : what the printed one is times, to mean the same as ours (-1: truth - estimate).
-    sign : of our value by the equations, where a magnitude is shown.
-    remark : remark on it, usually a misprint.
-    """
+    """A printed and a computed value."""
 
     printed: float | None
-    value: float
-    sense: int = 1
-    sign: int | None = None
-    remark: str = ''
+    value: float              # computed
+    sense: int = 1            # -1 if the printed value is truth - estimate
+    sign: int | None = None   # of the computed value, if it is a magnitude
+    remark: str = ''          # usually a misprint
 
     @property
     def ratio(self) -> float | None:
-        """Return ours over the printed one, both in our sense."""
+        """Return the computed over the printed value, both estimate - truth."""
         return self.value / (self.sense * self.printed) if self.printed else None
 
     def as_dict(self) -> dict[str, float | str | None]:

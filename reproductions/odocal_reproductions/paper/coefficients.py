@@ -10,12 +10,12 @@ from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, S
 
 # definition: errors in Shi et al. 2015
 DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
-LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # 0.5', 3.6'
-# sizes of the errors that table 2 multiplies with: rad, rad/s
+LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # rad, 0.5' and 3.6'
+# factors of table 2, the sizes of the errors: rad, rad/s
 SIZES = {'dL': 10.0 / PAPER_RADIUS, 'phi_E': LEVEL, 'phi_N': LEVEL, 'phi_U': HEADING,
          'eps_E': DRIFT, 'eps_N': DRIFT, 'eps_U': DRIFT}
-OWN_DRIFT = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
-
+DRIFT_OF = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
+# remarks on printed values that differ from the computed ones
 REMARKS_1 = {
     ('phi_E', 'phi_N'): 'misprint: (15) has vE/R instead of vE tan L/R',
     ('phi_U', 'phi_U'): 'misprint: tan L of (17) is missing',
@@ -28,7 +28,7 @@ REMARKS_2 = {
     ('phi_E', 'phi_N'): MISSING,
 }
 ROUNDED = 'inputs rounded to two digits first'
-CUT = 'truncated, not rounded'
+TRUNCATED = 'truncated, not rounded'
 
 
 def table_1() -> dict[str, dict[str, Cell]]:
@@ -37,14 +37,11 @@ def table_1() -> dict[str, dict[str, Cell]]:
     velocity_n = (14.0, 14.0, 0.0)    # m/s, east, north, up
     F = coefficients(latitude, 0.0, velocity_n, PAPER_RADIUS)
 
-    def entry(row: str, column: str) -> float:
-        return -1.0 if OWN_DRIFT.get(row) == column else float(
-            F[STATES.index(row), STATES.index(column)])
-
     def cell(row: str, column: str, printed: float) -> Cell:
-        value = entry(row, column)
-        cut = '' if float(f'{abs(value):.1e}') == printed else CUT
-        return _cell(printed, value, REMARKS_1.get((row, column), cut))
+        value = -1.0 if DRIFT_OF.get(row) == column else float(
+            F[STATES.index(row), STATES.index(column)])
+        remark = '' if float(f'{abs(value):.1e}') == printed else TRUNCATED
+        return _cell(printed, value, REMARKS_1.get((row, column), remark))
 
     return {row: {column: cell(row, column, printed) for column, printed in cells.items()}
             for row, cells in TABLE_1.items()}
@@ -55,8 +52,8 @@ def table_2() -> dict[str, dict[str, Cell]]:
     first = table_1()
 
     def cell(row: str, column: str, printed: float) -> Cell:
-        own = first[row][column]
-        value = own.value * SIZES[column] * own.sign
+        coefficient = first[row][column]
+        value = coefficient.value * SIZES[column] * coefficient.sign
         remark = REMARKS_2.get((row, column), '')
         if not remark and abs(printed / abs(value) - 1) > 0.02:
             remark = ROUNDED

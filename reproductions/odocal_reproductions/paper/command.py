@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal paper: tables 1 to 4 of Shi et al. 2015, computed beside printed."""
+"""odocal paper: tables 1 to 4 of Shi et al. 2015, printed and computed values."""
 
 import argparse
 

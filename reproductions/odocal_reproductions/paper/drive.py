@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Section 3 of Shi et al. 2015: its drive, through the pipeline that a user's bag goes through.
+The drive of section 3 of Shi et al. 2015, calibrated by the pipeline that also processes bags.
 
-The drive is simulated with perfect sensors; the errors are put into the alignment that the
-pipeline is handed: phi in ENU, computed = (I - [phi x]) true, at the end of the
-standstill; drift as what the pipeline takes too little off the gyro from there on.
+The drive is simulated with perfect sensors. The errors are in the alignment, which the pipeline
+receives: attitude errors phi in ENU, computed = (I - [phi x]) true, at the end of the standstill;
+and a gyro drift, which is missing in the gyro bias that the pipeline subtracts from there on.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ from odocal_ros.sim.scenarios import Drive, SimOptions, simulate
 from odocal_ros.sim.sensors import imu_rotation
 
 GYRO_NOISE = np.deg2rad(0.001) / 60     # definition: rad/s/sqrt(Hz), 0.001 deg/sqrt(h)
-# phi at the end of the standstill, ENU; drift in x right, y forward, z up: in units of the paper's
+# phi at the end of the standstill, ENU, and drift in x right, y forward, z up: multiples of the
+# errors in the paper
 SOURCES = {
     'none': ((0, 0, 0), (0, 0, 0)),
     'eps_x': ((0, 0, 0), (1, 0, 0)),
@@ -52,35 +53,29 @@ def errors_of(source: str) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What the pipeline makes of a source of error; errors are estimate - truth."""
+    """The result of the pipeline with a source of error; errors are estimate - truth."""
 
-    yaw: float             # rad
-    scale: float           # relative to K
-    yaw_sigma: float       # rad, what the pipeline itself says
+    yaw: float             # rad, error
+    scale: float           # error relative to K
+    yaw_sigma: float       # rad, as stated by the pipeline
     result: LegResult
 
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """
-    How a source's errors grow after the standstill, by the error model.
+    """Growth of the errors of a source after the standstill, by the error model."""
 
-    t : (m,) s.   yaw : (m,) yaw error if the leg ended there, rad, NaN before it moves.
-    across : (m,) m to the right of the true position.   heading : (m,) phi_U, rad.
-    """
-
-    t: NDArray[np.float64]
-    yaw: NDArray[np.float64]
-    across: NDArray[np.float64]
-    heading: NDArray[np.float64]
+    t: NDArray[np.float64]         # (m,) s
+    yaw: NDArray[np.float64]       # (m,) rad, error if the leg ended at t; NaN before motion
+    across: NDArray[np.float64]    # (m,) m to the right of the true position
+    heading: NDArray[np.float64]   # (m,) rad, phi_U
 
 
 class PaperDrive:
     """The simulated drive of section 3, to be calibrated with any source of error."""
 
     def __init__(self) -> None:
-        # m; a count hides 1e-10 of the distance, less than the errors looked for
-        pulse = 1e-6
+        pulse = 1e-6    # m: quantisation is 1e-10 of the distance, less than the errors
         self.drive: Drive = simulate(SimOptions(
             scenario='paper', imu_grade='perfect', fix_sigma=0.0, scale=pulse))
         truth, options = self.drive.truth, self.drive.options
@@ -92,7 +87,7 @@ class PaperDrive:
         self.C_nb = attitude(state)[0] @ imu_rotation(options)
 
     def alignment(self, source: str) -> Alignment:
-        """Return the true alignment with the errors of a source in it."""
+        """Return the true alignment plus the errors of a source."""
         phi_n, eps_b = errors_of(source)
         return Alignment(
             t=0.0, C_nb=exp_so3(-phi_n) @ self.C_nb, gyro_bias=-eps_b, level_sigma=LEVEL,
@@ -103,9 +98,9 @@ class PaperDrive:
     def outcome(self, source: str) -> Outcome:
         """Return the pipeline result with the errors of a source."""
         result = calibrate(self.drive.leg(), self.config, self.alignment(source))
-        found, truth = result.methods['two_point'].estimates, self.drive.truth
-        yaw, scale = found['yaw_mounting_angle'], found['scale_factor']
-        # nothing in this drive is there to be refused
+        estimates, truth = result.methods['two_point'].estimates, self.drive.truth
+        yaw, scale = estimates['yaw_mounting_angle'], estimates['scale_factor']
+        # this drive determines both
         assert yaw.value is not None, result.reasons
         assert yaw.sigma is not None, result.reasons
         assert scale.value is not None, result.reasons

@@ -49,17 +49,13 @@ def chord_error(x: Floats | float, y: Floats | float, dx: Floats | float, dy: Fl
 
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
-    """
-    How a leg's distance is spread over its time; turns any heading history into dalpha and dK.
+    """Travel of a straight leg over time, which gives dalpha and dK of any heading error."""
 
-    t : (m,) s.   s : (m,) m travelled by then, at constant speed in between.
-    """
-
-    t: NDArray[np.float64]
-    s: NDArray[np.float64]
+    t: NDArray[np.float64]    # (m,) s
+    s: NDArray[np.float64]    # (m,) m, travel; constant speed between epochs
 
     def mean(self, x: Floats) -> float:
-        """Return the distance-weighted mean of (m,) values, straight between epochs."""
+        """Return the distance-weighted mean of (m,) values, linear between epochs."""
         return float(self._weight @ (x[1:] + x[:-1]) / 2)
 
     def mean_square(self, x: Floats) -> float:
@@ -78,10 +74,10 @@ class SpeedProfile:
         phi_U : (m,) heading error at the epochs, rad; dalpha is minus its mean.
         tilt : (m,) error or unmodelled pitch of the track, rad: in a plane it shortens the track.
 
-        To second order; a turn common to the whole track changes no length.
+        To second order; a constant heading error changes no length.
         """
-        spread = self.variance(phi_U) + (0.0 if tilt is None else self.mean_square(tilt))
-        return -self.mean(phi_U), spread / 2
+        variance = self.variance(phi_U) + (0.0 if tilt is None else self.mean_square(tilt))
+        return -self.mean(phi_U), variance / 2
 
     def heading_and_drift(self, phi_U0: float, eps_z: float) -> tuple[float, float]:
         """Return dalpha (rad) and dK / K of an initial heading error, rad, and a drift, rad/s."""
@@ -91,10 +87,10 @@ class SpeedProfile:
         """
         Return the yaw error, rad, 1 sigma, of white gyro noise, rad/s/sqrt(Hz).
 
-        sigma^2 = q integral (1 - F)^2 dt, F the share of the distance driven by then.
+        sigma^2 = q integral (1 - F)^2 dt, with F the share of the distance driven before t.
         """
-        left = 1 - (self.s - self.s[0]) / (self.s[-1] - self.s[0])
-        a, b = left[:-1], left[1:]
+        remaining = 1 - (self.s - self.s[0]) / (self.s[-1] - self.s[0])
+        a, b = remaining[:-1], remaining[1:]
         return float(gyro_noise * np.sqrt(np.diff(self.t) @ (a * a + a * b + b * b) / 3))
 
     @property

@@ -2,43 +2,41 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Error model of dead reckoning: how attitude errors and gyro drift become a wrong end point.
+Error model of dead reckoning: the end point error by attitude errors and gyro drift.
 
 Shi et al. 2015, eq. (15)-(23), corrected, as a linear time-varying system along a leg
 
     x' = F(t) x - [C_nb; 0] eps_b        x = [phi_E, phi_N, phi_U, dL, dlam, dh]
 
-phi (rad) and the position errors (rad, rad, m) are estimate less truth: computed attitude =
-(I - [phi x]) true attitude, the computed one against the local level at the *computed* position,
-the true one against that at the true position. eps_b (rad/s) is what the gyro reads too much.
+phi (rad) and the position errors (rad, rad, m) are estimate minus truth: computed attitude =
+(I - [phi x]) true attitude, the computed one relative to the local level at the computed position,
+the true one relative to that at the true position. eps_b (rad/s) is the error of the gyro.
 
-Two Earths. ``radius`` given: the sphere of the paper, no vertical speed, height not fed back;
-the first five states are eq. (15)-(23) and dh is the third row of (21). ``radius=None``: WGS 84
-with height and vertical speed, the exact linearisation of what ``strapdown`` and
-``dead_reckoning`` do.
+With a ``radius``, the Earth is the sphere of the paper, without vertical speed and effects of
+height; the first five states are eq. (15)-(23) and dh is the third row of (21). With
+``radius=None`` it is WGS 84 with height and vertical speed, the exact linearisation of
+``nav/strapdown.py`` and ``nav/dead_reckoning.py``.
 
-Those two work in axes n that are fixed to the Earth where the leg begins, and know no transport
-rate. With psi the attitude error there and dr the position error, both in n,
+These two use axes n that are fixed to the Earth at the start of the leg, without transport rate.
+With psi the attitude error and dr the position error in n, and l the local level at the true
+position,
 
     phi = C_ln psi + dtheta,    dtheta = [-dL, dlam cos L, dlam sin L]
     C_ln dr = [(N + h) cos L dlam, (M + h) dL, dh]
 
-l being the local level at the true position: dtheta is the turn of the local level between the
-true and the computed position. There psi' = psi x omega_ie - C_nb eps_b and dr' = v x psi, so a
-heading error psi is constant but for the Earth's turn; phi has the rest.
+dtheta is the rotation from the local level at the true to that at the computed position. In n,
+psi' = psi x omega_ie - C_nb eps_b and dr' = v x psi: psi changes by the Earth rate and drift only.
 """
 
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_reproductions.paper.path import Path
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.geodesy import E2, OMEGA, radii
 
 STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
-E, N, U, LAT, LON, H = range(6)    # definition: where the states stand
+E, N, U, LAT, LON, H = range(6)    # definition: indices of the states
 PAPER_RADIUS = 6378137.0    # m, physical: R_e of Shi et al. 2015
 
 
@@ -61,11 +59,11 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     if radius is None:
         meridian, normal = radii(latitude)
         RM, RN = meridian + height, normal + height
-        bend = E2 * s * c / (1 - E2 * s * s)      # d ln N / dL; that of M is three times as much
-        dRM, dRN, up = 3 * bend * meridian, bend * normal, 1.0
+        dlnRN = E2 * s * c / (1 - E2 * s * s)      # d ln RN / dL; d ln RM / dL is 3 times as large
+        dRM, dRN, by_height = 3 * dlnRN * meridian, dlnRN * normal, 1.0
     else:
         RM = RN = float(radius)
-        dRM = dRN = up = 0.0
+        dRM = dRN = by_height = 0.0
         vU = np.zeros_like(vU)
     F = np.zeros((*np.broadcast(latitude, vE).shape, 6, 6))
     # phi x omega_in of the attitude rows
@@ -74,9 +72,9 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     F[..., N, E], F[..., N, U] = -wU, wE
     F[..., U, E], F[..., U, N] = wN, -wE
     _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec)
-    # a wrong position: the Earth rate is taken elsewhere, the radii differ
-    north_L, north_h = -vN / RM**2 * dRM, -vN / RM**2 * up
-    east_L, east_h = -vE / RN**2 * dRN, -vE / RN**2 * up
+    # a position error changes the computed Earth rate and radii
+    north_L, north_h = -vN / RM**2 * dRM, -vN / RM**2 * by_height
+    east_L, east_h = -vE / RN**2 * dRN, -vE / RN**2 * by_height
     F[..., E, LAT], F[..., E, H] = -north_L, -north_h
     F[..., N, LAT], F[..., N, H] = -OMEGA * s + east_L, east_h
     F[..., U, LAT] = OMEGA * c + vE * sec**2 / RN + tan * east_L
@@ -90,7 +88,7 @@ def coefficients(latitude: Floats | float, height: Floats | float,
 def _add_turned_velocity(F: Floats, vE: Floats | float, vN: Floats | float, vU: Floats,
                          RM: Floats | float, RN: Floats | float, tan: Floats | float,
                          sec: Floats | float) -> None:
-    """Add what a velocity turned by phi, eq. (21), does to position and computed omega_in."""
+    """Add the effects of the velocity error v x phi, eq. (21), on position and omega_in."""
     dv = np.zeros((*F.shape[:-2], 3, 3))                # rows dvE, dvN, dvU by phi
     dv[..., 0, 1], dv[..., 0, 2] = -vU, vN
     dv[..., 1, 0], dv[..., 1, 2] = vU, -vE
@@ -108,58 +106,39 @@ def _column(x: Floats | float) -> Floats:
     return np.asarray(x)[..., None]
 
 
-@dataclass(frozen=True, eq=False)
-class Transition:
-    """
-    Response of the states since the first epoch: x = Phi x_0 + Gamma eps_b, eps_b constant.
-
-    Phi : (m, 6, 6).   Gamma : (m, 6, 3), per rad/s in the axes of b.
-    """
-
-    Phi: NDArray[np.float64]
-    Gamma: NDArray[np.float64]
-
-
-def transition(path: Path, radius: float | None = None) -> Transition:
-    """Return the transition matrices of a path, without a loop over its epochs."""
-    S = _steps(path, radius, np.eye(3))
-    _scan(S)
-    return Transition(S[..., :6], S[..., 6:])
-
-
 def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float],
               radius: float | None = None) -> Floats:
     """
     Return the states at every epoch, (m, 6).
 
-    path : leg.   x_0 : (6,) states at its first epoch.   eps_b : (3,) or (m - 1, 3) gyro drift in
-    b, rad/s, constant or mean of each interval.   radius : see the module.
+    x_0 : (6,) states at the first epoch.   eps_b : (3,) or (m - 1, 3) gyro drift in b, rad/s,
+    constant or mean of each interval.   radius : see the module.
     """
     S = _steps(path, radius, np.asarray(eps_b, dtype=float)[..., None])
-    _scan(S)
+    _compose(S)
     x: Floats = S[..., :6] @ np.asarray(x_0, dtype=float) + S[..., 6]
     return x
 
 
 def _steps(path: Path, radius: float | None, drift_b: Floats) -> Floats:
     """
-    Return the transition of each epoch: (m, 6, 6 + k), [A | B], x_1 = A x_0 + B.
+    Return the transition to each epoch, (m, 6, 7): [A | B], x_1 = A x_0 + B; the first is [I | 0].
 
-    drift_b : (..., 3, k) drifts in b, rad/s. The first row changes nothing.
+    drift_b : (..., 3, 1) drift in b, rad/s.
     """
-    S = np.zeros((len(path.t), 6, 6 + drift_b.shape[-1]))
+    S = np.zeros((len(path.t), 6, 7))
     S[:1, range(6), range(6)] = 1.0
-    drift_b = np.broadcast_to(drift_b, (len(S) - 1, *drift_b.shape[-2:]))
-    chunk = 4096    # steps made at a time
-    for first in range(0, len(S) - 1, chunk):      # what fits a cache is three times as fast
-        own = slice(first, first + chunk)
-        _fill(S[1:][own], path, slice(first, first + chunk + 1), own, radius, drift_b[own])
+    drift_b = np.broadcast_to(drift_b, (len(S) - 1, 3, 1))
+    chunk = 4096    # steps at a time: in the cache it is three times as fast
+    for first in range(0, len(S) - 1, chunk):
+        rows = slice(first, first + chunk)
+        _fill(S[1:][rows], path, slice(first, first + chunk + 1), rows, radius, drift_b[rows])
     return S
 
 
 def _fill(S: Floats, path: Path, epochs: slice, intervals: slice, radius: float | None,
           drift_b: Floats) -> None:
-    """Write [A | B] of some intervals into S; epochs: those at their edges."""
+    """Write [A | B] of intervals into S; epochs: those at their edges."""
     dt = np.diff(path.t[epochs])[:, None, None]
     latitude, height = ((a[:-1] + a[1:]) / 2
                         for a in (path.latitude[epochs], path.height[epochs]))
@@ -168,33 +147,33 @@ def _fill(S: Floats, path: Path, epochs: slice, intervals: slice, radius: float 
     S[..., :6] = Fdt + Fdt @ Fdt / 2
     S[:, range(6), range(6)] += 1.0
     C_nb = path.C_nb[epochs]
-    turned = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
-    # what came in during the interval has acted for half of it on average
-    S[..., 6:] = Fdt[..., :3] @ turned / -2
-    S[:, :3, 6:] -= turned
+    rotation = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
+    # the drift of an interval acts for half of it on average
+    S[..., 6:] = Fdt[..., :3] @ rotation / -2
+    S[:, :3, 6:] -= rotation
 
 
-def _scan(S: Floats) -> None:
+def _compose(S: Floats) -> None:
     """
-    Turn steps into running compositions, in place: (n, 6, 6 + k), see _steps.
+    Replace transitions from epoch to epoch by those from the first epoch, in place: (n, 6, 7).
 
-    Blocks are multiplied up side by side, their last rows by the same scan, and carried in.
+    A parallel scan: blocks of steps are composed side by side, then their ends by recursion.
     """
-    block = 64    # steps that a scan multiplies up one after the other
-    width = min(block, max(2, int(np.sqrt(len(S)))))
+    most_steps = 64    # of a block
+    width = min(most_steps, max(2, int(np.sqrt(len(S)))))
     for k in range(1, min(width, len(S))):
-        now = S[k::width]
-        now[:] = _after(now, S[k - 1::width][:len(now)])
+        step = S[k::width]
+        step[:] = _product(step, S[k - 1::width][:len(step)])
     ends = S[width - 1::width].copy()
     if len(ends) > 1:
-        _scan(ends)
+        _compose(ends)
     for k in range(width):
-        now = S[width + k::width]
-        now[:] = _after(now, ends[:len(now)])
+        step = S[width + k::width]
+        step[:] = _product(step, ends[:len(step)])
 
 
-def _after(then: Floats, first: Floats) -> Floats:
-    """Return the map that does first and then: A2 A1 x + (A2 B1 + B2)."""
-    both = then[..., :6] @ first
-    both[..., 6:] += then[..., 6:]
-    return both
+def _product(second: Floats, first: Floats) -> Floats:
+    """Return the transition of first and then second: A2 A1 x + (A2 B1 + B2)."""
+    product = second[..., :6] @ first
+    product[..., 6:] += second[..., 6:]
+    return product

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The picture of odocal paper: the track of figure 1, and how each error grows."""
+"""The picture of odocal paper: the track of figure 1, and the growth of each error."""
 
 from pathlib import Path
 from typing import Any
@@ -23,15 +23,7 @@ GRID = {'color': '0.88', 'linewidth': 0.6}
 
 
 def draw(tables: PaperTables, path: Path) -> None:
-    """
-    Draw the tables' drive into a .png, .svg or .pdf file, whole or not at all.
-
-    Raises
-    ------
-    BadUsage
-        The file cannot be written.
-
-    """
+    """Draw the drive of the tables into a file; BadUsage if it cannot be written."""
     figure = new_figure(12.0, 6.6)
     grid = figure.add_gridspec(1, 2, width_ratios=(0.82, 1.0))
     left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
@@ -68,13 +60,13 @@ def _growth(upper: Any, lower: Any, tables: PaperTables) -> None:
     """Draw yaw and position error by time: lines by the error model, dots by the pipeline."""
     for source, (colour, dash) in STYLES.items():
         growth = tables.growths[source]
-        found = tables.table_3[source].yaw_deg.value
+        yaw_deg = tables.table_3[source].yaw_deg.value
         style = {'color': colour, 'linestyle': dash, 'linewidth': 1.5}
-        label = f'{LABELS[source]}: {found:+.2e}°'.replace('-', '\N{MINUS SIGN}')
+        label = f'{LABELS[source]}: {yaw_deg:+.2e}°'.replace('-', '\N{MINUS SIGN}')
         upper.plot(growth.t, np.abs(np.rad2deg(growth.yaw)), label=label, **style)
         lower.plot(growth.t, np.where(np.abs(growth.across) > 0, np.abs(growth.across), np.nan),
                    **style)
-        upper.plot(growth.t[-1] + 8, abs(found), marker='o', markersize=4, color=colour,
+        upper.plot(growth.t[-1] + 8, abs(yaw_deg), marker='o', markersize=4, color=colour,
                    clip_on=False)
     upper.axhline(tables.noise_deg, color='0.5', linewidth=0.8, linestyle=':')
     upper.annotate('gyro noise of the whole drive, 1 σ', (395, tables.noise_deg * 1.15),

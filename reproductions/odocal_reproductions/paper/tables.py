@@ -22,29 +22,18 @@ SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """
-    A row of table 3.
-
-    yaw_deg, scale : computed and printed values, deg and relative to K.
-    model_deg : yaw error by the linear error model, deg.
-    noise_sigmas : printed minus computed yaw error, in sigmas of the effect of gyro noise; None:
-        not printed.
-    """
+    """A row of table 3."""
 
     yaw_deg: Cell
-    scale: Cell
-    model_deg: float
+    scale: Cell            # relative to K
+    model_deg: float       # yaw error by the linear error model
+    # printed minus computed yaw error, in sigmas of the effect of gyro noise; None: not printed
     noise_sigmas: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class PaperTables:
-    """
-    The four tables and the data from which they are computed.
-
-    noise_deg : 1 sigma of the yaw error by the paper's gyro noise over the drive, deg.
-    sigma_deg : yaw uncertainty, 1 sigma, stated by the pipeline for the drive, deg.
-    """
+    """The four tables, and the data from which they are computed by source of error."""
 
     table_1: dict[str, dict[str, Cell]]
     table_2: dict[str, dict[str, Cell]]
@@ -52,8 +41,8 @@ class PaperTables:
     table_4: dict[str, dict[str, dict[str, Cell]]]
     outcomes: dict[str, Outcome]
     growths: dict[str, Growth]
-    noise_deg: float
-    sigma_deg: float
+    noise_deg: float      # 1 sigma of the yaw error by the paper's gyro noise
+    sigma_deg: float      # 1 sigma of the yaw, stated by the pipeline
 
     def as_dict(self) -> dict[str, Any]:
         """Return the output of --json."""

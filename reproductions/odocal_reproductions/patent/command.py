@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal patent: the embodiment of CN104359492A, printed beside computed."""
+"""odocal patent: the embodiment of CN104359492A, printed and computed values."""
 
 import argparse
 import math
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     picture = picture_of(args)
     from odocal_reproductions.patent.embodiment import embodiment, FOUND, RADIUS
     from odocal_reproductions.patent.text import text_of
-    leg = driven(args.fix_noise, args.seed)
+    leg = planar_leg(args.fix_noise, args.seed)
     table = embodiment(leg, RADIUS, FOUND)
     if picture is not None:
         from odocal_reproductions.patent.plot import draw
@@ -45,11 +45,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
+def planar_leg(fix_noise: str, seed: int, **others: Any) -> 'PlanarLeg':
     """
-    Return the embodiment's drive in the plane: ten minutes of town, off by what it finds.
+    Return the drive of the embodiment, ten minutes of town, with the errors that it states.
 
-    more : options of the simulation that replace these.
+    others : options of the simulation that replace these.
     """
     from odocal_reproductions.patent.embodiment import FOUND, RADIUS
     from odocal_ros.pipeline.prepare import prepare
@@ -63,15 +63,15 @@ def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
         'two_wheels': True, 'scale': 2 / (1 / left + 1 / right),
         'wheel_difference': right / left - 1, 'yaw': 0.0, 'pitch': 0.0, 'nominal_scale': RADIUS,
         'fix_noise': fix_noise}
-    drive = simulate(SimOptions(**options | more))
-    # the track is to be turned counter-clockwise: the heading, clockwise, is given too large
+    drive = simulate(SimOptions(**options | others))
+    # the correction is counter-clockwise: the heading, clockwise, is too large
     config = with_settings(Config(), {
         'imu.grade': 'tactical', 'wheels.radius': RADIUS, 'alignment.heading_source': 'fixed',
         'alignment.heading': drive.truth.heading + math.radians(FOUND[2])})
     leg = drive.leg()
     inputs, _ = screen(leg, config)
     prepared, _ = prepare(leg, inputs, config)
-    assert prepared is not None     # a drive made for it
+    assert prepared is not None     # this drive is sufficient
     planar = planar_input(prepared, 0.0)
     assert planar is not None
     return planar

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The embodiment of CN104359492A as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
+The embodiment of CN104359492A: radii +-0.03 m in seven levels, heading +-1 deg in nine levels.
 
-It lists seven combinations that an orthogonal array is said to have chosen, and names as best one
-that is not among them. No orthogonal array for 7 x 7 x 9 levels is smaller than all 441
-combinations; here a nearly balanced one of 81 stands beside all of them, the refined optimum and
-least squares. Errors are what is to be added: true radius = nominal radius + error, and the track
-is to be turned counter-clockwise by the heading error.
+The patent lists seven combinations, selected by an orthogonal array, and states as best one that
+is not among them. No orthogonal array for 7 x 7 x 9 levels is smaller than all 441 combinations.
+The table compares a nearly balanced array of 81 with all combinations, the refined optimum and
+least squares. Errors are added: true radius = nominal radius + error, and the track is rotated
+counter-clockwise by the heading error.
 """
 
 from dataclasses import dataclass
@@ -41,44 +41,32 @@ RADIUS = 0.3                    # m, judgement: the patent states none
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One line of the table.
-
-    left, right : m, error of the radius.   heading_deg : error.   criteria : as Scores.row.
-    """
+    """One line of the table."""
 
     name: str
-    left: float
+    left: float               # m, error of the radius
     right: float
-    heading_deg: float
-    criteria: dict[str, float | None]
+    heading_deg: float        # error
+    criteria: dict[str, float | None]      # distances between track and fixes, by name, m
 
 
 @dataclass(frozen=True, eq=False)
 class Embodiment:
-    """
-    The table and what stands behind it.
-
-    imbalance : of the array of 81, see ``imbalance``.   least : rows of an orthogonal array.
-    small, whole : the rows of the best of 81 and of all 441 among ``rows``.
-    refined : by surfaces inside the range.   direct : by least squares, in no range.   radius :
-    m, nominal, of both wheels.
-    grid : (7, 7) m, least mean distance over the headings, by left and right radius of all 441.
-    """
+    """The table, and the results from which it is computed."""
 
     rows: tuple[Row, ...]
-    imbalance: float
-    least: int
-    small: Row
-    whole: Row
-    refined: Refined
-    direct: LeastSquares
-    radius: float
-    grid: NDArray[np.float64]
+    imbalance: float          # of the array of 81, see ``imbalance``
+    least: int                # fewest rows of an orthogonal array
+    small: Row                # best of the array
+    whole: Row                # best of all 441
+    refined: Refined          # by response surfaces, within the range
+    direct: LeastSquares      # without limits
+    radius: float             # m, nominal, of both wheels
+    grid: NDArray[np.float64]    # (7, 7) m, least mean distance by left and right radius
 
     @property
     def sigma_radius(self) -> float:
-        """Return the formal sigma of right less left radius by positions, m."""
+        """Return the formal sigma of right minus left radius by positions, m."""
         return self.direct.sigma_difference * self.radius
 
     def as_dict(self) -> dict[str, Any]:
@@ -95,7 +83,7 @@ class Embodiment:
 
     @property
     def separable(self) -> bool:
-        """Return True if the fixes constrain left against right better than the range does."""
+        """Return True if the fixes determine right minus left better than the range does."""
         return bool(self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2)
 
 
@@ -117,10 +105,10 @@ def least_rows(levels: tuple[int, ...]) -> int:
 
 def nearly_balanced(levels: tuple[int, ...]) -> Ints:
     """
-    Return a small array for unlike numbers of levels, by dummy levels.
+    Return a small array for different numbers of levels, (81, 3) for 7, 7 and 9, by dummy levels.
 
-    An orthogonal array of the next prime power is folded: columns with fewer levels let some of
-    them stand for two, spread evenly around the middle. Each pair of levels is still met.
+    In an orthogonal array of the next prime power, columns with fewer levels use some of them
+    twice, evenly around the middle. Each pair of levels still occurs.
     """
     q = next_prime_power(max(*levels, len(levels) - 1))
     rows = bose(q, len(levels))
@@ -136,8 +124,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     Run the embodiment on a leg.
 
     leg : its start values belong to wheels of the nominal radius.   radius : nominal radius of
-    both wheels, m.   truth : (left, right, heading) true errors, m and deg, for a line of their
-    own.
+    both wheels, m.   truth : (left, right, heading) true errors, m and deg, for one more line.
     """
     heading_step = np.deg2rad(0.25)
     half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
@@ -156,22 +143,23 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
         left, right = (float(r) for r in x[:2] * radius)
         return Row(name, left, right, float(np.rad2deg(x[2])), criteria)
 
-    def given(name: str, errors: tuple[float, float, float]) -> Row:
-        return row(name, np.array([errors[0] / radius, errors[1] / radius,
-                                   np.deg2rad(errors[2])]))
+    def row_of(name: str, errors: tuple[float, float, float]) -> Row:
+        left, right, heading_deg = errors
+        return row(name, np.array([left / radius, right / radius, np.deg2rad(heading_deg)]))
 
     best = row(f'best of {len(small)}', x_small), row(f'best of all {len(whole)}', x_whole)
-    rows = [given('start values', (0.0, 0.0, 0.0))]
-    rows += [given(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
-    rows += [given('printed as best', FOUND), *best,
+    rows = [row_of('start values', (0.0, 0.0, 0.0))]
+    rows += [row_of(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
+    rows += [row_of('printed as best', FOUND), *best,
              row('response surface', refined.x), row('  wheels together', together.x),
              row('least squares', direct.x), row('  wheels together', direct_together.x)]
-    rows += [] if truth is None else [given('truth', truth)]
+    rows += [] if truth is None else [row_of('truth', truth)]
     return Embodiment(tuple(rows), imbalance(array, LEVELS), least_rows(LEVELS), *best, refined,
                       direct, radius, means.reshape(LEVELS).min(axis=2))
 
 
 def _levels(rows: Ints, half: Floats) -> Floats:
+    """Return the errors of rows of level numbers, evenly from -half to half."""
     x: Floats = (2 * rows / (np.array(LEVELS) - 1) - 1) * half
     return x
 

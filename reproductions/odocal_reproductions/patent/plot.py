@@ -21,38 +21,38 @@ def draw(table: Embodiment, path: Path) -> None:
     """Draw a table into a file; BadUsage if it cannot be written."""
     figure = new_figure(12.0, 5.6)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
-    _valley(figure, left, table)
-    _lines(right, table)
+    _draw_grid(figure, left, table)
+    _draw_lines(right, table)
     save_figure(figure, path)
 
 
-def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
-    """Draw the mean distance over the errors of both radii, each at its best heading."""
+def _draw_grid(figure: Any, axes: Any, table: Embodiment) -> None:
+    """Draw the mean distance over the errors of both radii, each with its best heading."""
     mm = 1000.0
     levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * mm
     mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
                            norm='log')
     figure.colorbar(mesh, ax=axes, label='mean distance between track and fixes, m')
-    edge, beyond = 1.2 * levels[-1], []
+    edge, outside = 1.2 * levels[-1], []
     for name, (marker, colour) in MARKS.items():
         rows = [r for r in table.rows if r.name.startswith(name) and (
             name != 'printed' or 'best' not in r.name)]
         x, y = (mm * np.array([getattr(r, side) for r in rows]) for side in ('left', 'right'))
         if (np.abs([x, y]) > edge).any():
-            beyond.append(name)
+            outside.append(name)
         hollow = colour == 'none'
         axes.scatter(x, y, marker=marker, c=colour, s=200 if hollow else 70, label=name, zorder=3,
                      **({} if marker in 'x+' else {'edgecolors': 'white' if hollow else 'black'}))
     axes.set(title='All 441 combinations', xlabel='left radius error, mm', aspect='equal',
              ylabel='right radius error, mm', xlim=(-edge, edge), ylim=(-edge, edge))
-    if beyond:
-        axes.text(0.02, 0.02, f'outside the plot: {", ".join(beyond)}', fontsize=8,
+    if outside:
+        axes.text(0.02, 0.02, f'outside the plot: {", ".join(outside)}', fontsize=8,
                   transform=axes.transAxes)
     figure.legend(*axes.get_legend_handles_labels(), loc='outside lower left', ncols=6,
                   facecolor='0.75', fontsize=9)
 
 
-def _lines(axes: Any, table: Embodiment) -> None:
+def _draw_lines(axes: Any, table: Embodiment) -> None:
     """Draw mean and largest distance of each line of the table."""
     names = [f'{table.rows[k - 1].name}, {row.name.strip()}' if row.name.startswith(' ')
              else row.name for k, row in enumerate(table.rows)]
