@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files for drivers, controllers and filters: the wheel, its noise, errors of the IMU."""
+"""Files for drivers, controllers and filters: wheel radius, wheel noise, errors of the IMU."""
 
 from collections.abc import Mapping
 import math
@@ -14,7 +14,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.output.summary import sentence
 from odocal_ros.output.value_text import counted, inverse, known, with_sigma
 from odocal_ros.safe_io.text_formats import for_comment, one_line, parameter_block
-from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
+from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SIDES, SKID
 from odocal_ros.settings.levels import INFORMED_SHARE
 from odocal_ros.settings.nominal import nominal_scale
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from odocal_ros.estimator.result.odometry_output import TwistNoise
 
 CONTROLLERS = 'ros2_controllers.yaml'
-# controllers that take the radius itself, and their parameter for it
+# controllers whose parameter is the radius, not a multiplier
 RADIUS = {'ackermann_steering_controller': 'traction_wheels_radius',
           'tricycle_steering_controller': 'traction_wheels_radius',
           'bicycle_steering_controller': 'traction_wheel_radius',
           'tricycle_controller': 'wheel_radius'}
-# their parameters for radius and rotation lever
+# parameters for radius and rotation lever
 HOLONOMIC_KEYS = {
     MECANUM: ('wheels_radius', 'sum_of_robot_center_projection_on_X_Y_axis'),
     OMNI: ('wheel_radius', 'robot_radius')}
@@ -81,14 +81,14 @@ def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any
     if config.odometer.drive in HOLONOMIC:
         lever = known(calibration.estimates, 'rotation_lever').value
         keys = HOLONOMIC_KEYS[config.odometer.drive]
-        own = {key: value for key, value in zip(keys, (radius, lever), strict=True)
-               if value is not None}
-        if not own:
+        values = {key: value for key, value in zip(keys, (radius, lever), strict=True)
+                  if value is not None}
+        if not values:
             return {}
         if config.odometer.drive == MECANUM:
-            return {'mecanum_drive_controller': {'kinematics': own}}
+            return {'mecanum_drive_controller': {'kinematics': values}}
         return {'omni_wheel_drive_controller': {
-            'wheel_offset': config.odometer.wheel_offset, **own}}
+            'wheel_offset': config.odometer.wheel_offset, **values}}
     multipliers = _multipliers(calibration, config)
     blocks: dict[str, dict[str, Any]] = (
         {'diff_drive_controller': multipliers} if multipliers else {})
@@ -98,23 +98,22 @@ def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any
 
 
 def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
-    """Return the multipliers of diff_drive_controller, with wheel factors if there are any."""
+    """Return the multipliers of diff_drive_controller, by wheel if these are estimated."""
     estimates = calibration.estimates
     common = known(estimates, 'scale_ratio').value
-    left, right = (known(estimates, f'scale_factor_{side}') for side in ('left', 'right'))
+    left, right = (known(estimates, f'scale_factor_{side}') for side in SIDES)
     nominal = nominal_scale(config, left.unit or known(estimates, 'scale_factor').unit)
-    out = {}
+    ratios = [common, common]
     if nominal and left.value is not None and right.value is not None:
-        out = {'left_wheel_radius_multiplier': left.value / nominal,
-               'right_wheel_radius_multiplier': right.value / nominal}
-    elif common is not None:
-        out = {f'{name}_wheel_radius_multiplier': common for name in ('left', 'right')}
+        ratios = [left.value / nominal, right.value / nominal]
+    multipliers = {f'{side}_wheel_radius_multiplier': ratio
+                   for side, ratio in zip(SIDES, ratios, strict=True) if ratio is not None}
     width = known(estimates, 'track_width')
     if width.value is not None and width.sigma and config.odometer.track_width:
-        out['wheel_separation_multiplier'] = width.value / config.odometer.track_width
+        multipliers['wheel_separation_multiplier'] = width.value / config.odometer.track_width
     elif width.value is not None and config.odometer.drive == SKID:
-        out['wheel_separation'] = width.value       # in place of the distance of the wheels
-    return out
+        multipliers['wheel_separation'] = width.value      # effective, not between the wheels
+    return multipliers
 
 
 def wheel_radius(calibration: Calibration, config: Config) -> float | None:
@@ -139,8 +138,9 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
         return {}
     micrometres = with_sigma(scale.value, scale.sigma, MICRO)
     lines = [f'# one pulse: {micrometres} um; {inverse(scale)}']
-    for where, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
-        lines += ['', *textwrap.wrap(where, 98, initial_indent='# ', subsequent_indent='# ')]
+    for description, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
+        lines += ['', *textwrap.wrap(description, 98, initial_indent='# ',
+                                     subsequent_indent='# ')]
         lines += [setting] if setting else []
     return {DEVICES: head(calibration, content) + FOR_DEVICES + '\n'.join(lines) + '\n'}
 
@@ -177,14 +177,14 @@ def wheel_covariance(calibration: Calibration, config: Config,
     noise = twist_noise(calibration)
     if noise is None:
         return {}
-    usual = noise.variances(noise.speed, noise.turn_rate)
-    density = math.sqrt(usual[0] * noise.period)
+    variances = noise.variances(noise.speed, noise.turn_rate)
+    density = math.sqrt(variances[0] * noise.period)
     text = FOR_TWIST.format(base=config.frames.base, period=noise.period, unknown=UNKNOWN)
     if not noise.has_turn_rate:
         text += '# Without a left and a right wheel the turn rate is not measured: use a gyro.\n'
     text += ('# VIO with wheels (VINS-Fusion forks), m/s per sqrt(Hz):\n'
              f'#   wheel_velocity_noise_sigma: {density:.3g}\n')
-    diagonal = {'twist_covariance_diagonal': _diagonal(usual)}
+    diagonal = {'twist_covariance_diagonal': _diagonal(variances)}
     return {TWIST: head(calibration, content) + text
             + parameter_block(diagonal, 'diff_drive_controller') + _table(noise)}
 
@@ -212,34 +212,35 @@ def _table(noise: 'TwistNoise') -> str:
 def imu_errors(calibration: Calibration, config: Config,
                content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty if no IMU error is known better than its prior."""
-    found: dict[str, dict[str, float]] = {}
+    best: dict[str, dict[str, float]] = {}
     for leg in calibration.legs:
         method = leg.methods.get('smoother')
         if method is None or leg.verdict.value == 'rejected':
             continue
-        for name, entry in _known(method.details).items():
-            if name not in found or entry['sigma'] < found[name]['sigma']:
-                found[name] = entry
+        for name, entry in _imu_errors_of(method.details).items():
+            if name not in best or entry['sigma'] < best[name]['sigma']:
+                best[name] = entry
     for axis in 'xyz':
         bias = calibration.estimates.get(f'gyro_bias_{axis}')
         if bias is not None and bias.value is not None and bias.sigma is not None:
-            found[f'gyro_bias_{axis}'] = {'value': bias.value, 'sigma': bias.sigma}
-    if not found:
+            best[f'gyro_bias_{axis}'] = {'value': bias.value, 'sigma': bias.sigma}
+    if not best:
         return {}
     return {IMU_ERRORS: head(calibration, content) + FOR_IMU_ERRORS
-            + parameter_block(dict(sorted(found.items())), 'imu_errors')}
+            + parameter_block(dict(sorted(best.items())), 'imu_errors')}
 
 
-def _known(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return the errors of the IMU that a leg determined, by name."""
+def _imu_errors_of(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return value and sigma of the IMU errors that a leg determined, by name."""
     from odocal_ros.estimator.state import CONSTANTS
     ratio = details.get('posterior_to_prior', {})
-    found = {name: {key: details[name][key] for key in ('value', 'sigma')} for name in CONSTANTS
-             if name.startswith(('gyro_', 'accelerometer_')) and name in details
-             and ratio.get(name, 1.0) < INFORMED_SHARE}
-    biases = details.get('accelerometer_bias', {})
-    return found | {f'accelerometer_bias_{axis}': {key: one[key] for key in ('value', 'sigma')}
-                    for axis, one in biases.items() if one['ratio'] < INFORMED_SHARE}
+    errors = {name: details[name] for name in CONSTANTS
+              if name.startswith(('gyro_', 'accelerometer_')) and name in details
+              and ratio.get(name, 1.0) < INFORMED_SHARE}
+    errors |= {f'accelerometer_bias_{axis}': bias
+               for axis, bias in details.get('accelerometer_bias', {}).items()
+               if bias['ratio'] < INFORMED_SHARE}
+    return {name: {key: one[key] for key in ('value', 'sigma')} for name, one in errors.items()}
 
 
 def head(calibration: Calibration, content: dict[str, Any]) -> str:

@@ -25,7 +25,7 @@ from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1    # format: version of calibration.json
 MAIN = 'calibration.json'
-# values in every result, determined or not; a scale's unit is known only with its data
+# values in every result, also undetermined ones, and units; that of a scale depends on the data
 ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
           'pitch_mounting_angle': 'rad'}
 
@@ -44,22 +44,22 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
                               for name, unit in ALWAYS.items()}
     result |= {name: e.as_dict() | {'method': e.method or None}
                for name, e in calibration.estimates.items()}
-    giving = calibration.methods.get(result['scale_factor']['method'])
-    result |= giving.details.get('beside', {}) if giving else {}
+    main_method = calibration.methods.get(result['scale_factor']['method'])
+    result |= main_method.details.get('beside', {}) if main_method else {}
     result['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
                               'rpy': calibration.imu_rotation_rpy}
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
-    left: dict[str, Any] = {}
+    optional: dict[str, Any] = {}
     if (acceptance := accept(calibration, config)) is not None:
-        left['acceptance'] = acceptance.as_dict()
+        optional['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
         imu_change = 0.1    # of their prior sigma: change by temperature and time
-        left['imu'] = calibration.carried.select(
+        optional['imu'] = calibration.carried.select(
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_change).as_dict()
         if config.leg.automatic:
-            left['carried'] = calibration.carried.as_dict()
+            optional['carried'] = calibration.carried.as_dict()
     content: dict[str, Any] = plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
@@ -71,17 +71,17 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         'check': {name: _check(check) for name, check in checks.items()} | {
             'per_distance': _per_distance(calibration.legs)},
         'inputs': inputs,
-        'config': flat(config)} | left)
+        'config': flat(config)} | optional)
     return content
 
 
 def _method(method: MethodResult) -> dict[str, Any]:
-    # arrays among the details are for code, not for readers
-    more = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
+    """Return the entry of a method; arrays among its details are left out."""
+    details = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
     return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
             'estimates': {n: {'value': e.value, 'sigma': e.sigma, 'unit': e.unit}
                           for n, e in method.estimates.items()},
-            'correlation': {}, 'budget': {}} | more
+            'correlation': {}, 'budget': {}} | details
 
 
 def _check(check: TrackCheck | None) -> dict[str, Any] | None:
@@ -89,6 +89,7 @@ def _check(check: TrackCheck | None) -> dict[str, Any] | None:
 
 
 def _leg(leg: LegResult) -> dict[str, Any]:
+    """Return the entry of a leg."""
     return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
             'start_ns': leg.start_ns, 'stop_ns': leg.stop_ns,
             'distance': leg.distance, 'duration': leg.duration, 'imu_samples': leg.imu_samples,
@@ -160,7 +161,7 @@ class Results:
         return [self.directory / name for name in texts]
 
     def draw(self) -> str:
-        """Add the report, if requested; return why it cannot be drawn."""
+        """Add the report, if requested; return the cause if it cannot be drawn, else ''."""
         if not self.has_report:
             return ''
         page, cause = report_or_error_page(*self._arguments)
@@ -179,11 +180,11 @@ class Results:
 
     @contextmanager
     def name_results_when_interrupted(self) -> Iterator[None]:
-        """Let an interruption name the written results, if any."""
+        """Add to the text of an interruption the place of the written results, if any."""
         try:
             yield
         except KeyboardInterrupt:
             if not self.folder.written:
                 raise
-            left = '' if (self.directory / REPORT).exists() else f', {REPORT} is not'
-            raise KeyboardInterrupt(f'the results are in {self.directory}/{left}') from None
+            missing = '' if (self.directory / REPORT).exists() else f', {REPORT} is not'
+            raise KeyboardInterrupt(f'the results are in {self.directory}/{missing}') from None

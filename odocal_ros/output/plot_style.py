@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.errors import BadUsage
 from odocal_ros.safe_io.atomic_files import whole_file
 
-# Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
+# Okabe and Ito's colours, distinguishable with colour blindness
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, description, SVG
@@ -55,6 +55,7 @@ def new_figure_column(height: float, rows: int = 1, sharex: bool = True,
 
 
 def add_legend(figure: Any, axes: Any) -> None:
+    """Add a legend of axes above the figure."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,
@@ -71,10 +72,10 @@ def svg(figure: Any, name: str, description: str) -> str:
     from html import escape
 
     from matplotlib.backends.backend_svg import FigureCanvasSVG
-    out = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(out, metadata={
+    output = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(output, metadata={
         'Creator': None, 'Date': None, 'Format': None, 'Type': None})
-    text = out.getvalue()
+    text = output.getvalue()
     text = text[text.index('<svg'):].strip()
     text = re.sub(r'<defs>\s*<style.*?</style>\s*</defs>\s*', '', text, count=1, flags=re.DOTALL)
     text = re.sub(r'<!--.*?-->\s*', '', text, flags=re.DOTALL)

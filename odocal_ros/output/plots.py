@@ -26,8 +26,8 @@ def leg_figures(evidence: Evidence, name: str, scale_sigma: float | None = None,
     """
     Draw a leg.
 
-    name : prefix of the ids of each figure.   scale_sigma : relative sigma of the leg's scale: the
-    band about zero of the sections.   before_word : label of the track before the correction.
+    name : prefix of the ids of each figure.   scale_sigma : relative sigma of the leg's scale, a
+    band in the figure of sections.   before_word : label of the track before the correction.
     smoothed : details of the smoother: slips, and biases at its keyframes.
 
     Returns (title, description, svg element) of each figure; to be called under
@@ -60,20 +60,20 @@ def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
     factor, unit = style.length_unit(np.ptp(evidence.track_n[:, :2], axis=0).max())
     after, before, fixes = (factor * (x - start)[:, :2] for x in (
         evidence.track_n, evidence.track_before_n, evidence.fix_n))
-    few = style.even_rows(len(fixes))
-    ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
+    shown = style.even_rows(len(fixes))
+    ax.plot(*fixes[shown].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
     ax.plot(*before[style.peak_rows(before)].T, '--', color=style.RED, label=before_word,
             linewidth=1.2)
     ax.plot(*after[style.peak_rows(after)].T, '-', color=style.BLUE, label='as calibrated')
     ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
     ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
     middle = after.mean(axis=0)
-    for point, word in ((after[0], 'start'), (after[-1], 'stop')):
-        # away from the rest of the track
-        side, up = np.where(point < middle, -1, 1)
-        ax.annotate(word, point, xytext=(7 * side, 6 * up), textcoords='offset points',
-                    ha='right' if side < 0 else 'left', va='top' if up < 0 else 'bottom')
-    _marks(ax, evidence, lambda t: np.stack([np.interp(t, evidence.t, x) for x in after.T]), slips)
+    for point, label in ((after[0], 'start'), (after[-1], 'stop')):
+        right, up = np.where(point < middle, -1, 1)      # away from the middle of the track
+        ax.annotate(label, point, xytext=(7 * right, 6 * up), textcoords='offset points',
+                    ha='right' if right < 0 else 'left', va='top' if up < 0 else 'bottom')
+    _draw_marks(ax, evidence,
+                lambda t: np.stack([np.interp(t, evidence.t, x) for x in after.T]), slips)
     is_local = (evidence.fix_status == LOCAL).any()
     axes = ('x from', 'y from') if is_local else ('east of', 'north of')
     ax.set(xlabel=f'{axes[0]} the start, {unit}', ylabel=f'{axes[1]} the start, {unit}')
@@ -91,16 +91,16 @@ def _track(evidence: Evidence, name: str, before_word: str,
     return 'Track', text, style.svg(figure, f'{name}-track', text)
 
 
-def _marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
-           slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
-    """Mark unused fixes, gaps, slips and the end of the fit on the track."""
-    few = evidence.t_excluded[style.even_rows(len(evidence.t_excluded))]
-    if len(few):
-        ax.plot(*at(few), '.', color=style.GREY, markersize=3, zorder=4, label='fix not used')
+def _draw_marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
+                slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
+    """Mark unused fixes, gaps, slips and the end of the fit; at: positions at times, s."""
+    unused = evidence.t_excluded[style.even_rows(len(evidence.t_excluded))]
+    if len(unused):
+        ax.plot(*at(unused), '.', color=style.GREY, markersize=3, zorder=4, label='fix not used')
     step = np.diff(evidence.t_fix)
-    gap = 5.0    # median intervals between fixes: more is marked
+    least_gap = 5.0    # median intervals between fixes
     gaps = [('no fix used', evidence.t_fix[k], evidence.t_fix[k + 1]) for k in np.flatnonzero(
-        step > max(gap * np.median(step), 1.0))] if len(step) else []
+        step > max(least_gap * np.median(step), 1.0))] if len(step) else []
     gaps += [(f'no {name}', begin, end) for name, begin, end in evidence.gaps]
     labelled = set()
     for label, begin, end in gaps:
@@ -108,7 +108,7 @@ def _marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
         ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=PAUSE[label], linewidth=4,
                 alpha=0.6, zorder=1, solid_capstyle='butt',
                 label=None if label in labelled else label)
-        if label != 'no fix used':       # its ends also show short ones
+        if label != 'no fix used':       # marks at the ends make short gaps visible
             ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
         labelled.add(label)
     if evidence.t_fit < evidence.t[-1]:
@@ -167,20 +167,22 @@ def _residuals(evidence: Evidence, name: str, before_word: str) -> style.Drawing
 
 
 def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style.Drawing:
-    part = evidence.sections
+    sections = evidence.sections
     factor, unit = style.length_unit(evidence.distance[-1])
-    middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
-    off = part.ratio - 1
-    times, word = style.relative_unit(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
+    middle = factor * (sections.begin + sections.end) / 2
+    half = factor * (sections.end - sections.begin) / 2
+    largest = max(np.nanmax(np.abs(sections.ratio - 1) + sections.sigma), scale_sigma or 0.0)
+    scale, scale_unit = style.relative_unit(largest)
+    difference, sigma = (sections.ratio - 1) * scale, sections.sigma * scale
     figure, (ax,) = style.new_figure_column(2.7)
     if scale_sigma:
-        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=style.BAND, linewidth=0,
+        ax.axhspan(-scale_sigma * scale, scale_sigma * scale, color=style.BAND, linewidth=0,
                    label='± sigma of the result')
     ax.axhline(0.0, color=style.GREY, linewidth=0.8)
-    ax.hlines(off * times, middle - half, middle + half, color=style.BLUE, linewidth=1.1)
-    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=style.BLUE,
-                markersize=4.5, capsize=3, linewidth=1.1, label='section, ± its sigma')
-    ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale minus result, {word}')
+    ax.hlines(difference, middle - half, middle + half, color=style.BLUE, linewidth=1.1)
+    ax.errorbar(middle, difference, sigma, fmt='o', color=style.BLUE, markersize=4.5, capsize=3,
+                linewidth=1.1, label='section, ± its sigma')
+    ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale minus result, {scale_unit}')
     ax.set_xlim(0.0, factor * evidence.distance[-1])
     style.add_legend(figure, ax)
     text = ('Length from the fixes divided by the calibrated dead-reckoned length, in sections '

@@ -40,7 +40,7 @@ IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, TRACK, LEGS, device_files.CONTROLLERS,
          device_files.DEVICES, device_files.TWIST, device_files.IMU_ERRORS}
-# declared by the node for every drive; of one wheel they stay unknown
+# parameters that the node declares also for one wheel, then unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 AXES = 'xyz'
 IMU_FRAME = 'imu_link'      # REP-145, by default
@@ -53,19 +53,19 @@ def texts(calibration: Calibration, config: Config, content: dict[str, Any]) -> 
     Except calibration.yaml, files are for use on a vehicle: there are none for a rejected
     calibration, and each only if its values are determined.
     """
-    out: dict[str, str] = {}
+    files: dict[str, str] = {}
     formats = config.output.formats
     if 'params' in formats:
-        out[PARAMS] = _params(calibration, content)
-    if calibration.verdict is Verdict.REJECTED:
-        return out
-    for name, make in MAKERS.items():
-        if name in formats:
-            out |= make(calibration, config, content)
-    return out
+        files[PARAMS] = _params(calibration, content)
+    if calibration.verdict is not Verdict.REJECTED:
+        for name, texts_of in FORMATS.items():
+            if name in formats:
+                files |= texts_of(calibration, config, content)
+    return files
 
 
 def _params(calibration: Calibration, content: dict[str, Any]) -> str:
+    """Return the text of calibration.yaml."""
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
@@ -82,21 +82,22 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
 
 
 def _autoware(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
-    out: dict[str, tuple[str, str, dict[str, Any]]] = {}
+    """Return the parameter files of two nodes of Autoware, each if its values are known."""
+    files: dict[str, tuple[str, str, dict[str, Any]]] = {}
     factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
     if factor is not None:
-        out[VELOCITY] = 'vehicle_velocity_converter', 'the two stddev', {
+        files[VELOCITY] = 'vehicle_velocity_converter', 'the two stddev', {
             'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
             'angular_velocity_stddev_zz': 0.1, 'frame_id': config.frames.base}
     if bias_i is not None:
-        out[IMU] = 'imu_corrector', 'the stddev', {
+        files[IMU] = 'imu_corrector', 'the stddev', {
             f'angular_velocity_offset_{axis}': float(b)
             for axis, b in zip(AXES, bias_i, strict=True)} | {
             f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}
-    top = device_files.head(calibration, content)
-    return {name: f'{top}# for autoware {node}, in place of its param file of this name;\n'
+    head = device_files.head(calibration, content)
+    return {name: f'{head}# for autoware {node}, in place of its param file of this name;\n'
             f'# {defaults} are its defaults, not measured here\n{parameter_block(values)}'
-            for name, (node, defaults, values) in out.items()}
+            for name, (node, defaults, values) in files.items()}
 
 
 def _speed_factor(calibration: Calibration) -> float | None:
@@ -108,9 +109,9 @@ def _speed_factor(calibration: Calibration) -> float | None:
 
 
 def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
-    """Return the gyro bias in the IMU's own axes and raw unit, (3,), None if unknown."""
-    found = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
-    bias = [e.value for e in found if e is not None and e.value is not None]
+    """Return the gyro bias in the axes and raw unit of the IMU messages, (3,), None if unknown."""
+    estimates = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
+    bias = [e.value for e in estimates if e is not None and e.value is not None]
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
     if C_bi is None or len(bias) < len(AXES):
         return None
@@ -119,6 +120,7 @@ def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
 
 def _transform(calibration: Calibration, config: Config,
                content: dict[str, Any]) -> dict[str, str]:
+    """Return the transform of the IMU as launch file, URDF joint and command; {} if unknown."""
     if calibration.imu_rotation_rpy is None:
         return {}
     xyz = [repr(float(v)) for v in config.imu.lever_arm]
@@ -159,62 +161,58 @@ def _xml(root: Any, note: str) -> str:
 
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
     """
-    Return both with the frame of the IMU set.
+    Return result and settings with the frame of the IMU, unless it is configured.
 
-    frame : untrusted frame_id of the IMU; a note states if it is replaced.
+    frame : untrusted frame_id of the IMU messages; a note states if it is replaced.
     """
     if config.frames.imu or not frame:
         return calibration, config
-    taken = frame.lstrip('/')       # as ROS 1 wrote it
-    taken = taken if text_formats.is_frame(taken) else IMU_FRAME
-    if taken != frame:
+    valid = frame.lstrip('/')       # ROS 1 frames begin with /
+    valid = valid if text_formats.is_frame(valid) else IMU_FRAME
+    if valid != frame:
         note = Reason(Code.FRAME_REPLACED, 'the frame of the IMU messages, '
                       f"'{text_formats.one_line(frame[:60])}', is not valid in TF; "
-                      f'{taken} is written')
+                      f'{valid} is written')
         calibration = replace(calibration, reasons=(*calibration.reasons, note))
-    return calibration, with_settings(config, {'frames.imu': taken})
+    return calibration, with_settings(config, {'frames.imu': valid})
 
 
 def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty if no leg has a track."""
-    most_of_all = 150_000    # points of a file: it stays small with many legs
-    most = max(2, min(MOST_TRACK_POINTS, most_of_all // (3 * max(1, len(calibration.legs)))))
+    file_points = 150_000    # at most: a file stays small with many legs
+    most = max(2, min(MOST_TRACK_POINTS, file_points // (3 * max(1, len(calibration.legs)))))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
               for feature in features(n, leg, most)]
     if not shapes:
         return {}
-    whole = {'type': 'FeatureCollection', 'name': 'odocal', 'about': TRACK_TEXT,
-             'software': content['software'], 'created': content['created'],
-             'result': sentence(calibration), 'features': shapes}
-    return {TRACK: json.dumps(whole, allow_nan=False, ensure_ascii=False) + '\n'}
+    collection = {'type': 'FeatureCollection', 'name': 'odocal', 'about': TRACK_TEXT,
+                  'software': content['software'], 'created': content['created'],
+                  'result': sentence(calibration), 'features': shapes}
+    return {TRACK: json.dumps(collection, allow_nan=False, ensure_ascii=False) + '\n'}
 
 
 def features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
     """Return the features of a leg, of at most ``most`` points; none in a local frame."""
     if leg.origin is None:
         return []
-    out = []
-    for name, rows, make in (('corrected', leg.track_n, _line),
-                             ('as_configured', leg.track_before_n, _line),
-                             ('fixes', leg.reference_n, lambda rows: {
-                                 'type': 'MultiPoint', 'coordinates': rows.tolist()})):
+    def feature(geometry: dict[str, Any], kind: str, **properties: Any) -> dict[str, Any]:
+        return {'type': 'Feature', 'geometry': geometry,
+                'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,
+                               'verdict': leg.verdict.value, **properties}}
+    found = []
+    for kind, rows, geometry in (('corrected', leg.track_n, _line),
+                                 ('as_configured', leg.track_before_n, _line),
+                                 ('fixes', leg.reference_n, lambda rows: {
+                                     'type': 'MultiPoint', 'coordinates': rows.tolist()})):
         positions = _positions(rows, leg, most)
         if rows is not None and len(positions):
-            out.append(_feature(make(positions), number, leg, name,
-                                {'points': len(positions), 'of': len(rows)}))
+            found.append(feature(geometry(positions), kind, points=len(positions), of=len(rows)))
     track = _positions(leg.track_n, leg, most)
     if len(track):
         for name, row, stamp_ns in (('start', 0, leg.start_ns), ('stop', -1, leg.stop_ns)):
             point = {'type': 'Point', 'coordinates': track[row].tolist()}
-            out.append(_feature(point, number, leg, 'mark', {'mark': name, 'stamp_ns': stamp_ns}))
-    return out
-
-
-def _feature(geometry: dict[str, Any], number: int, leg: LegResult, kind: str,
-             more: dict[str, Any]) -> dict[str, Any]:
-    return {'type': 'Feature', 'geometry': geometry,
-            'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,
-                           'verdict': leg.verdict.value} | more}
+            found.append(feature(point, 'mark', mark=name, stamp_ns=stamp_ns))
+    return found
 
 
 def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
@@ -223,10 +221,9 @@ def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
         return np.empty((0, 3))
     rows_n = np.array(rows_n, dtype=float)[even_rows(len(rows_n), most)]
     rows_n = rows_n[np.isfinite(rows_n[:, :2]).all(axis=1)]
-    level = np.isnan(rows_n[:, 2]).any()
     geodetic = Origin(*leg.origin).to_geodetic(np.nan_to_num(rows_n))
     degrees = np.rad2deg(geodetic[:, 1::-1]).round(DEGREE_PLACES)
-    if level:
+    if np.isnan(rows_n[:, 2]).any():
         return degrees
     height_places = 3    # mm
     return np.column_stack([degrees, geodetic[:, 2].round(height_places)])
@@ -239,27 +236,24 @@ def _line(positions: Floats) -> dict[str, Any]:
         return {'type': 'Point', 'coordinates': positions[0].tolist()}
     if not len(jumps):
         return {'type': 'LineString', 'coordinates': positions.tolist()}
-    pieces: list[list[list[float]]] = []
-    begin: list[list[float]] = []
-    for piece, after in zip(np.split(positions, jumps + 1), [*(jumps + 1), None], strict=True):
-        end: list[list[float]] = []
-        if after is not None:
-            end, following = _crossing(positions[after - 1], positions[after])
-        pieces.append([*begin, *piece.tolist(), *end])
-        begin = [] if after is None else following
+    pieces = [piece.tolist() for piece in np.split(positions, jumps + 1)]
+    for k, row in enumerate(jumps):
+        end, begin = _crossing(positions[row], positions[row + 1])
+        pieces[k].append(end)
+        pieces[k + 1].insert(0, begin)
     return {'type': 'MultiLineString', 'coordinates': pieces}
 
 
-def _crossing(before: Floats, after: Floats) -> tuple[list[list[float]], list[list[float]]]:
-    """Return the point on the 180th meridian between two points, for either side."""
+def _crossing(before: Floats, after: Floats) -> tuple[list[float], list[float]]:
+    """Return the point on the 180th meridian between two points, on the side of each."""
     side = 180.0 if before[0] > 0 else -180.0
-    beyond = after[0] + 2 * side
-    share = (side - before[0]) / (beyond - before[0])
-    rest = (before[1:] + share * (after[1:] - before[1:])).round(DEGREE_PLACES).tolist()
-    return [[side, *rest]], [[-side, *rest]]
+    share = (side - before[0]) / (after[0] + 2 * side - before[0])
+    others = (before[1:] + share * (after[1:] - before[1:])).round(DEGREE_PLACES).tolist()
+    return [side, *others], [-side, *others]
 
 
-# name of the format in output.formats: function of calibration, settings, calibration.json
-MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': device_files.controllers,
-          'devices': device_files.devices, 'covariance': device_files.wheel_covariance,
-          'imu': device_files.imu_errors, 'track': geojson, 'legs': leg_table}
+# name in output.formats: function of calibration, settings, content of calibration.json
+FORMATS = {
+    'autoware': _autoware, 'transform': _transform, 'ros2_control': device_files.controllers,
+    'devices': device_files.devices, 'covariance': device_files.wheel_covariance,
+    'imu': device_files.imu_errors, 'track': geojson, 'legs': leg_table}

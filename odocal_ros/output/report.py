@@ -79,6 +79,7 @@ def report_or_error_page(calibration: Calibration, config: Config,
 
 
 def _context(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, Any]:
+    """Return the variables of the template, except figures."""
     legs = calibration.legs
     methods = _by_number_of_values(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
@@ -117,15 +118,16 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
 def _by_number_of_values(methods: dict[str, MethodResult],
                          estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
     """Return methods in order of the number of values that the result has from them."""
-    given = Counter(e.method for e in estimates.values() if e.value is not None)
-    return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
+    count = Counter(e.method for e in estimates.values() if e.value is not None)
+    return dict(sorted(methods.items(), key=lambda item: -count[item[0]]))
 
 
 def _budgets(methods: dict[str, MethodResult],
              legs: tuple[LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
+    """Return (method, error budget) of the methods that have one."""
     local = has_local_positions(legs)
-    found = [(tables.label(name), tables.budget_table(m, local)) for name, m in methods.items()]
-    return [(name, table) for name, table in found if table]
+    budgets = [(tables.label(name), tables.budget_table(m, local)) for name, m in methods.items()]
+    return [(name, table) for name, table in budgets if table]
 
 
 def _draw_figures(
@@ -154,11 +156,12 @@ def _draw_figures(
             for number, leg in numbered]
     # also legs whose tracks were removed to save memory
     with_track = [number for number, leg in numbered if leg.evidence is not None
-           or leg.before is not None]
+                  or leg.before is not None]
     return legs, comparison, [number for number in with_track if number not in figures]
 
 
 def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> dict[str, Any]:
+    """Return the section of a leg; several : the page has more legs."""
     rows, findings = tables.left_out(leg)
     methods = _by_number_of_values(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,

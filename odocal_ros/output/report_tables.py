@@ -27,7 +27,8 @@ from odocal_ros.settings.config import Config, flat, SETTINGS
 
 LABELS = tables.LABELS | {'scale_ratio': 'ratio to nominal',
                           'scale_factor_as_sent': 'scale factor of the speed as sent'}
-LOST = 'not determined'
+UNDETERMINED = 'not determined'
+# reasons about the data of a leg
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
            Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
@@ -46,7 +47,7 @@ def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
     """Return an estimate in its main unit, in another, and its relative sigma, as text."""
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
-        return LOST, '', ''
+        return UNDETERMINED, '', ''
     native = with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
     if unit == 'rad':
         return f'{with_sigma(value, sigma, DEG, signed=True)} deg', native, ''
@@ -78,17 +79,15 @@ def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
 
 def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     """Return the most important values, up to four: name, value, a second line."""
-    found = []
-    for name, words in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
-                        ('pitch_mounting_angle', 'pitch mounting')):
+    lines = []
+    for name, text in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
+                       ('pitch_mounting_angle', 'pitch mounting')):
         first, other, relative = in_units(name, known(calibration.estimates, name))
-        found.append((words, first, f'± {relative}' if relative else other))
-    pieces = tables.in_pieces(calibration.legs)
-    if pieces:
-        last = pieces[-1]
-        found.append((f'track error in {length(last.length)}', length(last.after),
-                      f'{tables.before_label(calibration.legs)}: {length(last.before)}'))
-    return found
+        lines.append((text, first, f'± {relative}' if relative else other))
+    for longest in tables.in_pieces(calibration.legs)[-1:]:
+        lines.append((f'track error in {length(longest.length)}', length(longest.after),
+                      f'{tables.before_label(calibration.legs)}: {length(longest.before)}'))
+    return lines
 
 
 def undetermined(calibration: result.Calibration) -> list[str]:
@@ -96,12 +95,13 @@ def undetermined(calibration: result.Calibration) -> list[str]:
     axes: dict[str, list[str]] = {}
     local = result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
-        # without a nominal scale nothing is missing
+        # the ratio requires a nominal scale, not another drive
         if known(calibration.estimates, name).value is None and name != 'scale_ratio':
-            whole, _, axis = name.rpartition('_')
-            one = axis in ('x', 'y', 'z')
-            axes.setdefault(label(whole if one else name, local), []).extend([axis] * one)
-    return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
+            quantity, _, axis = name.rpartition('_')
+            has_axis = axis in ('x', 'y', 'z')
+            axes.setdefault(label(quantity if has_axis else name, local), []).extend(
+                [axis] * has_axis)
+    return [f'{text} {", ".join(letters)}'.rstrip() for text, letters in axes.items()]
 
 
 def method_table(methods: dict[str, result.MethodResult],
@@ -140,18 +140,20 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
              if known(method.estimates, n).value is not None]
     heads, factors = zip(*(_column(n, known(method.estimates, n)) for n in names),
                          strict=True) if names else ((), ())
-    wholes = [sum(_number(row, n)**2 for row in table.values()) for n in names]
+    variances = [sum(_number(row, n)**2 for row in table.values()) for n in names]
     rows, small = [], []
-    worth_a_row = 0.005    # share of a variance
+    least_share = 0.005    # of a variance
     for source, row in table.items():
-        shares = [_number(row, n)**2 / w if w else 0.0 for n, w in zip(names, wholes, strict=True)]
-        if max(shares, default=0.0) < worth_a_row:
+        shares = [_number(row, n)**2 / variance if variance else 0.0
+                  for n, variance in zip(names, variances, strict=True)]
+        if max(shares, default=0.0) < least_share:
             small.append(label(source, local))
             continue
-        cells = [None if part < worth_a_row else (two_digits(_number(row, n) * factor), part)
+        cells = [None if part < least_share else (two_digits(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
-    totals = [two_digits(math.sqrt(w) * f) for w, f in zip(wholes, factors, strict=True)]
+    totals = [two_digits(math.sqrt(variance) * factor)
+              for variance, factor in zip(variances, factors, strict=True)]
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
 
 
@@ -166,8 +168,8 @@ def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
     if estimate.unit == 'rad':
         return f'{label(name)}, deg', DEG
-    small = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}    # of a budget's figures
-    factor, unit = small.get(estimate.unit, (1.0, estimate.unit))
+    smaller_units = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}
+    factor, unit = smaller_units.get(estimate.unit, (1.0, estimate.unit))
     return f'{label(name)}, {unit}', factor
 
 
@@ -179,12 +181,11 @@ def left_out(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]
         total = sum(counts.values())
         times = leg.evidence.t_excluded
         for reason, n in counts.most_common():
-            at = [t for t, why in zip(times, leg.evidence.excluded_because, strict=True)
-                  if why == reason]
-            # the list is thinned out: counts are of the whole
-            count = round(n * leg.evidence.excluded / total)
+            t = [time for time, cause in zip(times, leg.evidence.excluded_because, strict=True)
+                 if cause == reason]
+            count = round(n * leg.evidence.excluded / total)      # the list is thinned
             rows.append((f'{count} of {leg.evidence.fixes + leg.evidence.excluded} fixes',
-                         f'{reason}; first at t = {min(at):.1f} s, last at t = {max(at):.1f} s'))
+                         f'{reason}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
     elif leg.rejected_fixes:
         rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
     return rows, [r for r in leg.reasons if r.code in OF_DATA]
@@ -211,16 +212,18 @@ def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]
     for name, entry in content['result'].items():
         if name in result.NOT_ESTIMATES:
             rows += [(f'{name.replace("_", " ")}, {key.replace("_", " ")}',
-                      LOST if x is None else ', '.join(map(repr, np.atleast_1d(x).tolist())),
+                      UNDETERMINED if x is None else ', '.join(
+                          map(repr, np.atleast_1d(x).tolist())),
                       '', '', '') for key, x in entry.items() if key != 'unit']
         else:
-            rows.append((name, *(LOST if entry[k] is None else repr(entry[k])
+            rows.append((name, *(UNDETERMINED if entry[k] is None else repr(entry[k])
                                  for k in ('value', 'sigma')),
                          entry['unit'] or '', entry['method'] or ''))
     return rows
 
 
 def versions(software: str) -> list[tuple[str, str]]:
+    """Return (name, version) of odocal_ros, Python and the installed packages it uses."""
     from importlib.metadata import PackageNotFoundError, version
     import platform
     found = [('odocal_ros', software.rpartition(' ')[2]), ('Python', platform.python_version())]

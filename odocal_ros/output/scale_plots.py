@@ -22,49 +22,49 @@ MOST_LEGS = 40    # judgement: bars that are distinguishable in a picture
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 
 
-def draw_by_speed(ax: Any, found: SpeedScale) -> None:
+def draw_by_speed(ax: Any, scale: SpeedScale) -> None:
     """Draw on axes the ratio of fixes to odometer by speed, and the fit."""
-    speed, ratio, sigma, _ = found.bins.T
+    speed, ratio, sigma, _ = scale.bins.T
     ax.errorbar(3.6 * speed, ratio, sigma, fmt='o', color=style.BLUE, markersize=4.5, capsize=3,
                 linewidth=1.1, label='fixes / odometer as sent, ± sigma')
-    if found.factor and found.offset:
+    if scale.factor and scale.offset:
         v = np.linspace(speed.min(), speed.max(), 100)
-        # reference = factor * odometer + offset, divided by the odometer
-        fit = found.factor[0] * v / (v - found.offset[0])
+        # v = factor * odometer + offset, so v / odometer = factor v / (v - offset)
+        fit = scale.factor[0] * v / (v - scale.offset[0])
         ax.plot(3.6 * v, fit, '-', color=style.RED, linewidth=1.2, label='fit')
-        ax.axhline(found.factor[0], color=style.GREY, linewidth=0.8, linestyle='--',
+        ax.axhline(scale.factor[0], color=style.GREY, linewidth=0.8, linestyle='--',
                    label='factor')
     ax.set(xlabel='speed, km/h', ylabel='path by fixes / odometer')
     ax.ticklabel_format(axis='y', useOffset=False)
 
 
-def fit_text(found: SpeedScale) -> str:
+def fit_text(scale: SpeedScale) -> str:
     """Return the fit in words; '' if the speeds of the leg do not determine it."""
-    if not (found.factor and found.offset and found.lag):
+    if not (scale.factor and scale.offset and scale.lag):
         return ''
-    offset, lag = found.offset, found.lag
+    offset, lag = scale.offset, scale.lag
     low = 'low' if offset[0] > 0 else 'high'
-    delay = 'later' if lag[0] > 0 else 'earlier'
-    return (f'Fit: factor {with_sigma(*found.factor)}; the odometer reads '
+    later = 'later' if lag[0] > 0 else 'earlier'
+    return (f'Fit: factor {with_sigma(*scale.factor)}; the odometer reads '
             f'{with_sigma(abs(offset[0]), offset[1])} m/s {low} and is '
-            f'{with_sigma(abs(lag[0]), lag[1])} s {delay} than the fixes')
+            f'{with_sigma(abs(lag[0]), lag[1])} s {later} than the fixes')
 
 
-def by_speed(found: SpeedScale, name: str) -> style.Drawing:
+def by_speed(scale: SpeedScale, name: str) -> style.Drawing:
     """Return the figure of a leg: title, description, svg element."""
     figure, (ax,) = style.new_figure_column(2.7)
-    draw_by_speed(ax, found)
+    draw_by_speed(ax, scale)
     style.add_legend(figure, ax)
-    fit = fit_text(found) or 'No fit: the speed varies too little'
+    fit = fit_text(scale) or 'No fit: the speed varies too little'
     text = ('Path length from the fixes divided by that of the raw odometer. Each point is a '
             'group of sections of a few seconds. A constant factor gives a level line. '
             f'{fit}.')
     return 'Scale against speed', text, style.svg(figure, f'{name}-by-speed', text)
 
 
-def by_window(found: Floats, name: str) -> style.Drawing:
-    """Return the figure of the scale by windows of a leg, as ``by_speed``; found : (w, 4)."""
-    length, excess, sigma, _ = found.T
+def by_window(windows: Floats, name: str) -> style.Drawing:
+    """Return the figure of the scale by windows, (w, 4): s, ratio - 1, its sigma, ignored."""
+    length, excess, sigma, _ = windows.T
     figure, (ax,) = style.new_figure_column(2.7)
     ax.axhline(0.0, color=style.GREY, linewidth=0.8, linestyle='--')
     ax.errorbar(length, 100 * excess, 100 * sigma, fmt='o-', color=style.BLUE, markersize=4.5,
@@ -82,31 +82,35 @@ def by_window(found: Floats, name: str) -> style.Drawing:
 
 def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:
     """Draw scale, yaw and pitch by method and leg; empty for single values."""
-    rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
-            for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
+    rows = [(f'all legs, {m.replace("_", " ")}', m, method.estimates)
+            for m, method in calibration.methods.items()] if len(calibration.legs) > 1 else []
     for number, leg in list(enumerate(calibration.legs, 1))[-MOST_LEGS:]:
-        rows += [(f'leg {number}, {m.replace("_", " ")}', m, found.estimates)
-                 for m, found in leg.methods.items()]
+        rows += [(f'leg {number}, {m.replace("_", " ")}', m, method.estimates)
+                 for m, method in leg.methods.items()]
     panels = [(title, points, band) for title, points, band in (
-        _scale(calibration, rows), *(_angle(calibration, rows, angle) for angle in ANGLES))
-        if len(points) > 1]
-    return [_draw(panels, name, len(calibration.legs))] if panels else []
+        _scale_panel(calibration, rows),
+        *(_angle_panel(calibration, rows, angle) for angle in ANGLES)) if len(points) > 1]
+    return [_draw_panels(panels, name, len(calibration.legs))] if panels else []
 
 
-def _scale(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
+def _scale_panel(calibration: Calibration,
+                 rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
+    """Return the panel of scales, rows of (text, method, estimates), relative to the result."""
     result = known(calibration.estimates, 'scale_factor')
-    all_of = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
-    found = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
-             for text, method, e in all_of if e.value is not None and result.value]
-    times, word = style.relative_unit(max((abs(off) + sigma for _, _, off, sigma in found),
-                                          default=0.0))
-    band = (0.0, (result.sigma or 0.0) / abs(result.value) * times) if result.value else None
-    return f'scale minus result, {word}', [
-        (text, method, off * times, sigma * times) for text, method, off, sigma in found], band
+    points = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
+              for text, method, e in ((text, method, known(estimates, 'scale_factor'))
+                                      for text, method, estimates in rows)
+              if e.value is not None and result.value]
+    factor, unit = style.relative_unit(max((abs(x) + sigma for _, _, x, sigma in points),
+                                           default=0.0))
+    band = (0.0, (result.sigma or 0.0) / abs(result.value) * factor) if result.value else None
+    return f'scale minus result, {unit}', [
+        (text, method, x * factor, sigma * factor) for text, method, x, sigma in points], band
 
 
-def _angle(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]],
-           name: str) -> Panel:
+def _angle_panel(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]],
+                 name: str) -> Panel:
+    """Return the panel of a mounting angle, deg."""
     result = known(calibration.estimates, name)
     points = []
     for text, method, estimates in rows:
@@ -117,21 +121,21 @@ def _angle(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estima
     return f'{ANGLES[name]} mounting angle, deg', points, band
 
 
-def _draw(panels: list[Panel], name: str, legs: int) -> style.Drawing:
+def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
     heights = [0.24 * len(points) for _, points, _ in panels]
-    whole = sum(heights) + 0.75 * len(panels)
-    figure, axes = style.new_figure_column(whole, len(panels), sharex=False, heights=heights)
+    height = sum(heights) + 0.75 * len(panels)
+    figure, axes = style.new_figure_column(height, len(panels), sharex=False, heights=heights)
     figure.subplots_adjust(left=0.27, hspace=0.75 * len(panels) / sum(heights),
-                           top=1 - 0.1 / whole)
+                           top=1 - 0.1 / height)
     methods = dict.fromkeys(m for _, points, _ in panels for _, m, _, _ in points)
     shapes = {m: STYLES[i % len(STYLES)] for i, m in enumerate(methods)}
     for ax, (title, points, band) in zip(axes, panels, strict=True):
         if band is not None and all(map(math.isfinite, band)):
             ax.axvspan(band[0] - band[1], band[0] + band[1], color=style.BAND, linewidth=0)
             ax.axvline(band[0], color=style.GREY, linewidth=0.8)
-        for place, (_, method, value, sigma) in enumerate(points):
+        for row, (_, method, value, sigma) in enumerate(points):
             shape, colour = shapes[method]
-            ax.errorbar(value, place, xerr=sigma, fmt=shape, color=colour, markersize=5,
+            ax.errorbar(value, row, xerr=sigma, fmt=shape, color=colour, markersize=5,
                         capsize=3, linewidth=1.1)
         ax.set_yticks(range(len(points)), [text for text, *_ in points])
         ax.set_ylim(len(points) - 0.5, -0.5)

@@ -27,27 +27,30 @@ SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade'
 class Stored:
     """A calibration read from its file."""
 
-    name: str
-    created: str
+    name: str                           # of the file
+    created: str                        # ISO 8601
     verdict: Verdict
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]            # codes
     estimates: dict[str, Estimate]
     legs: frozenset[tuple[int, int]]    # (start, stop) ns
     bags: frozenset[str]                # sha256 of each known
-    config: dict[str, Any]
-    # parameter -> source -> one-sigma share in its unit, shared by all legs; of its method
+    config: dict[str, Any]              # settings by dotted name
+    # parameter -> source -> one-sigma effect in the unit of the parameter, True if all legs share
+    # the error
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
     carried: CarriedInformation | None = None      # information for later legs, with leg.automatic
-    imu: CarriedInformation | None = None          # its information on the IMU
+    imu: CarriedInformation | None = None          # information on the constants of the IMU
 
     @property
     def usable(self) -> bool:
+        """Return True unless the result is rejected."""
         return self.verdict is not Verdict.REJECTED
 
     def value(self, name: str) -> float | None:
-        found = self.estimates.get(name)
-        return None if found is None else found.value
+        """Return a value by name, None if it is unknown."""
+        estimate = self.estimates.get(name)
+        return None if estimate is None else estimate.value
 
 
 def read_stored(path: Path) -> Stored:
@@ -60,8 +63,8 @@ def read_stored(path: Path) -> Stored:
     name = str(path)
     try:
         path = path / MAIN if path.is_dir() else path
-        biggest = 2**28    # bytes; a day of legs is a thousandth of it
-        content = json.loads(read_bytes(path, biggest).decode(), parse_constant=_no_constant)
+        most_bytes = 2**28    # a day of legs is a thousandth of it
+        content = json.loads(read_bytes(path, most_bytes).decode(), parse_constant=_no_constant)
         return stored_from(content, name)
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)
@@ -98,7 +101,7 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
                   if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
         frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
         _part(content, 'config', dict),
-        {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
+        {key: _budget(methods, entry.get('method'), key) for key, entry in result.items()
          if key not in NOT_ESTIMATES},
         str(content.get('vehicle') or ''),
         *(read_carried(content[part]) if isinstance(content.get(part), dict) else None
@@ -114,22 +117,23 @@ def known_imu(config: Config) -> CarriedInformation | None:
     if not config.imu.constants:
         return None
     try:
-        found = read_stored(Path(config.imu.constants).expanduser())
+        stored = read_stored(Path(config.imu.constants).expanduser())
     except BadUsage as error:
         raise BadUsage(f'imu.constants: {error}') from None
     settings = flat(config)
-    other = ['vehicle'] * (found.vehicle != config.vehicle) + [
-        name for name in SAME_IMU if found.config.get(name) != plain(settings[name])]
-    if other:
-        raise BadUsage(f'imu.constants: {found.name} has another {" and ".join(other)}: the same '
-                       'IMU with unchanged mounting is required')
-    if found.imu is None:
-        raise BadUsage(f'imu.constants: {found.name} contains no IMU constants: none of its legs '
+    different = ['vehicle'] * (stored.vehicle != config.vehicle) + [
+        name for name in SAME_IMU if stored.config.get(name) != plain(settings[name])]
+    if different:
+        raise BadUsage(f'imu.constants: {stored.name} has another {" and ".join(different)}: the '
+                       'same IMU with unchanged mounting is required')
+    if stored.imu is None:
+        raise BadUsage(f'imu.constants: {stored.name} contains no IMU constants: none of its legs '
                        'has a result of the smoother')
-    return found.imu
+    return stored.imu
 
 
 def _part(content: dict[str, Any], key: str, kind: type[T]) -> T:
+    """Return an entry of a type, or raise ValueError."""
     if not isinstance(content.get(key), kind):
         raise ValueError(f'{key!r} is missing or has the wrong type')
     part: T = content[key]
@@ -169,7 +173,7 @@ def _number(value: float | None, what: str) -> float | None:
         raise ValueError(f'{what} is too large') from None
 
 
-def _shares(methods: dict[str, dict[str, Any]], method: str | None,
+def _budget(methods: dict[str, dict[str, Any]], method: str | None,
             parameter: str) -> dict[str, tuple[float, bool]]:
     """Return the budget of a parameter; empty without a readable one."""
     entry = methods.get(method) if isinstance(method, str) else None
@@ -182,12 +186,11 @@ def _shares(methods: dict[str, dict[str, Any]], method: str | None,
 
 def objection(old: Stored, new: Stored) -> str:
     """
-    Return the objection to replacing an old calibration silently, empty without one.
+    Return the reason why a new calibration is worse than an old one, empty if it is not.
 
-    The old one is good unless rejected. The new one is worse when it is rejected, when it lacks a
-    value that the old one has, or gives it with a sigma more than twice as large. A result with
-    all legs of the old one and more, or with its carried information, is never worse: legs that
-    disagree widen a sigma that was too small.
+    Worse than an old one that is not rejected: it is rejected, a value is missing, or a sigma is
+    more than twice as large. A result that contains the legs of the old one, or its carried
+    information, is never worse: legs that disagree increase a sigma that was too small.
     """
     if not old.usable:
         return ''
@@ -207,16 +210,17 @@ def objection(old: Stored, new: Stored) -> str:
 
 
 def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
+    """Return the reason why a value is missing or has a larger sigma, empty if not."""
     if old is None or old.value is None or not old.sigma:
         return ''
     if new is None or new.value is None:
         return f'the new result has no {label}, the old one has {estimate_text(old)}'
-    clearly = 2.0    # times the sigma: four times as many such legs would be needed
-    larger = (new.sigma or 0.0) / old.sigma
+    largest_ratio = 2.0    # of the sigmas: four times as many such legs would be needed
+    ratio = (new.sigma or 0.0) / old.sigma
     if old.unit != 'rad' and new.value:      # relative: the vehicles may differ
-        larger *= abs(old.value / new.value)
-    if new.unit == old.unit and larger > clearly:
-        return (f'the uncertainty of the {label} is {larger:.1f} times larger: '
+        ratio *= abs(old.value / new.value)
+    if new.unit == old.unit and ratio > largest_ratio:
+        return (f'the uncertainty of the {label} is {ratio:.1f} times larger: '
                 f'{estimate_text(new)}, the old result has {estimate_text(old)}')
     return ''
 
@@ -238,5 +242,5 @@ def stored_in(folder: Path) -> Stored | None:
 
 def objection_to_folder(old: Stored | None, new: Path) -> str:
     """Return ``objection`` of a calibration and a result folder, empty without either."""
-    found = stored_in(new)
-    return objection(old, found) if old and found else ''
+    stored = stored_in(new)
+    return objection(old, stored) if old and stored else ''

@@ -33,12 +33,12 @@ from odocal_ros.output.value_text import (
 from odocal_ros.reasons import Verdict
 
 DEG = math.degrees(1.0)    # definition
-PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of a wheel: +, -
+SIDE_TEXTS = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # positive, negative
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
 LABEL_WIDTH = 19      # judgement: columns of the label of a value
-# what is shown: small errors, notes, budget
+# contents of shorter and shorter summaries: small errors, notes, budget
 SHORTER = ((True, True, True), (False, True, True), (False, False, True), (False, False, False))
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
            Verdict.REJECTED: 'do not use these values'}
@@ -86,14 +86,14 @@ def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
         parts.append(f'scale factor {with_unit(scale)}{counts}')
-    words = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
-    for name, word in (words | {'track_width': 'track width'}).items():
+    labels = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
+    for name, label in (labels | {'track_width': 'track width'}).items():
         wheel = known(estimates, name)
         if wheel.value is not None:
-            parts.append(f'{word} {with_unit(wheel)}')
-    for name, word in _angles_of(estimates).items():
+            parts.append(f'{label} {with_unit(wheel)}')
+    for name, label in _angles_of(estimates).items():
         angle = known(estimates, name)
-        parts.append(f'{word} mounting ' + (
+        parts.append(f'{label} mounting ' + (
             'not determined' if angle.value is None else
             f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
     return ', '.join(parts)
@@ -114,6 +114,7 @@ def driven(legs: tuple[result.LegResult, ...]) -> str:
 
 
 def _values(calibration: result.Calibration, width: int) -> list[str]:
+    """Return a line for each value."""
     estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
@@ -126,8 +127,8 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
     lines.append(_path_ratio(calibration, scale, sent))
-    for name, word in _angles_of(estimates).items():
-        lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
+    for name, label in _angles_of(estimates).items():
+        lines.append(_line(f'{label} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
     wheels = _wheels(estimates)
     lines += wheels.values()
@@ -140,8 +141,8 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= WIDTH else '')
             lines.append(_line(tables.source_label(name), text))
-    lines += [_arm(estimates, name, result.name_antenna(word, local), width)
-              for name, word in ARMS.items()]
+    lines += [_arm(estimates, name, result.name_antenna(label, local), width)
+              for name, label in ARMS.items()]
     lines.append(_gyro_scale(calibration))
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
@@ -166,73 +167,76 @@ def not_estimated(calibration: result.Calibration) -> str:
 
 
 def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:
-    """Return the mounting angles that the method estimates: the planar one none."""
+    """Return the mounting angles that the method estimates; the planar method estimates none."""
     return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
 
 
 def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
-    """Return estimate -> line of its wheel, with '' for its position, for more than two wheels."""
+    """Return factor -> line of the wheel, and position -> '', for more than two wheels."""
     lines: dict[str, str] = {}
     for name in result.wheel_factors(estimates):
         wheel = name.removeprefix(result.FACTOR)
-        places = {f'{axis}_position_{wheel}': words for axis, words in PLACES.items()}
-        if any(place in estimates for place in places):
-            at = [f'{abs(e.value):.3f} m {words[e.value < 0]}' for place, words in places.items()
-                  if (e := known(estimates, place)).value is not None]
-            lines |= dict.fromkeys(places, '') | {
-                name: _line(f'wheel {wheel}', '   '.join((with_unit(estimates[name]), *at)))}
+        positions = {f'{axis}_position_{wheel}': texts for axis, texts in SIDE_TEXTS.items()}
+        if any(position in estimates for position in positions):
+            shown = [f'{abs(e.value):.3f} m {texts[e.value < 0]}'
+                     for position, texts in positions.items()
+                     if (e := known(estimates, position)).value is not None]
+            lines |= dict.fromkeys(positions, '') | {
+                name: _line(f'wheel {wheel}', '   '.join((with_unit(estimates[name]), *shown)))}
     return lines
 
 
 def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
                 sent: result.Estimate) -> str:
-    """Return the line that compares the path ratio of the legs with the factor it belongs to."""
+    """Return the line that compares the path ratio of the legs with the scale factor."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     path = sum(distance for _, distance in ratios)
-    factor, word = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
+    factor, label = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
     if not factor.value or not path:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / path
     unit = '' if scale.unit == '1' else f' {scale.unit}'
-    plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
-    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
-                 f'{100 * (ratio / factor.value - 1):+z.1f} % from the {word}')
+    four_digits = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'
+    return _line('  path ratio', f'{four_digits}{unit}   fixes / odometer, '
+                 f'{100 * (ratio / factor.value - 1):+z.1f} % from the {label}')
 
 
 def _gyro_scale(calibration: result.Calibration) -> str:
     """Return the factor for the turn rates of the gyro, '' if it is near 1."""
     method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
-    far_scale = 0.005    # of a gyro's scale from 1
-    if not error or abs(error['value']) < max(far_scale, 3 * error['sigma']):
+    least_error = 0.005
+    if not error or abs(error['value']) < max(least_error, 3 * error['sigma']):
         return ''
     return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
 
-def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int) -> str:
-    """Return the coordinates of a lever arm that are known, '' without any."""
-    found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
-    found = {axis: e for axis, e in found.items() if e.value is not None}
-    shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
-    where = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= WIDTH)
-    label, axes = f'{word} {", ".join(found)}', ''
-    if len(label) > LABEL_WIDTH:
-        label, axes = word, f'{", ".join(found)}: '
-    return _line(label, f'{axes}{shown} m{where}') if found else ''
+def _arm(estimates: dict[str, result.Estimate], arm: str, label: str, width: int) -> str:
+    """Return the line with the known coordinates of a lever arm, '' without any."""
+    known_axes = {axis: e for axis in 'xyz'
+                  if (e := known(estimates, f'{arm}_{axis}')).value is not None}
+    shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in known_axes.values())
+    note = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= WIDTH)
+    axes = ', '.join(known_axes)
+    if len(f'{label} {axes}') > LABEL_WIDTH:
+        shown = f'{axes}: {shown}'
+    else:
+        label = f'{label} {axes}'
+    return _line(label, f'{shown} m{note}') if known_axes else ''
 
 
 def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
-    found = []
-    for name, word in MAIN_VALUES.items():
+    texts = []
+    for name, short in MAIN_VALUES.items():
         estimate = known(calibration.estimates, name)
         source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
             label = tables.source_label(source, result.has_local_positions(calibration.legs))
-            found.append(f'{word}: {label} ({100 * part:.0f} %)')
+            texts.append(f'{short}: {label} ({100 * part:.0f} %)')
     # lines are broken between the values only
-    lines = textwrap.wrap('; '.join(found).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
+    lines = textwrap.wrap('; '.join(texts).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
     return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
             for k, line in enumerate(lines)]
 
@@ -285,6 +289,6 @@ def _budget(calibration: result.Calibration, width: int, small: bool) -> list[st
     if method is None or not scale.value:
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
-    shown = 0.01    # share of a variance from which a source is worth a line
-    return tables.budget_lines(method.details.get('budget'), scale.value, shown, hidden, width,
-                               small, result.has_local_positions(calibration.legs))
+    least_share = 0.01    # of a variance: smaller sources have no line
+    return tables.budget_lines(method.details.get('budget'), scale.value, least_share, hidden,
+                               width, small, result.has_local_positions(calibration.legs))

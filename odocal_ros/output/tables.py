@@ -37,14 +37,14 @@ from odocal_ros.safe_io.text_formats import for_table
 from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
-SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
+SCALES = {'scale_factor': '', 'scale_ratio': '1'}      # units; '': that of the calibration
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
           'fix_latency': 'fix delay', 'gnss_delay': 'fix delay',
           'receiver_smoothing': 'fix smoothing'}
-HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
+BUDGET_HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
 WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
-SIDES = 'before', 'after'
+CHECKS = 'before', 'after'      # the calibration: fields of LegResult
 LABEL, CELL = 22, 9      # judgement: columns
 
 
@@ -67,9 +67,9 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
 
 def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
     """Return a row; missing values of a leg are empty cells."""
-    giving = {e.method for e in calibration.estimates.values() if e.value is not None}
+    used = {e.method for e in calibration.estimates.values() if e.value is not None}
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
-                               if m.name in giving or not giving)]
+                               if m.name in used or not used)]
     row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,
@@ -78,12 +78,12 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
            'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
     wheels = dict.fromkeys(wheel_factors(calibration.estimates), '') | {
         name: 'm' for name in calibration.estimates if name.startswith('track_width')}
-    for name, unit in (SHOWN | wheels | dict.fromkeys(ANGLES, 'rad')).items():
+    for name, unit in (SCALES | wheels | dict.fromkeys(ANGLES, 'rad')).items():
         if name in calibration.estimates:
             unit = unit or calibration.estimates[name].unit
-            found = _estimate(leg, calibration, name)
-            row |= {f'{name} [{unit}]': found.value, f'{name}_sigma [{unit}]': found.sigma}
-    for name in SIDES:
+            estimate = _estimate(leg, calibration, name)
+            row |= {f'{name} [{unit}]': estimate.value, f'{name}_sigma [{unit}]': estimate.sigma}
+    for name in CHECKS:
         check = getattr(leg, name)
         row |= {f'{name}_{part} [m]': None if check is None else getattr(check, part)
                 for part in ('rms', 'mean', 'max', 'end')}
@@ -91,7 +91,7 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
 
 
 def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
-    """Return a leg's value from the method of the calibration's value, else from its own."""
+    """Return a leg's value by the method that gives the calibration's value, else by any."""
     method = leg.methods.get(calibration.estimates[name].method)
     return known(leg_estimates(leg) if method is None else method.estimates, name)
 
@@ -100,22 +100,23 @@ def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
     """Return a table of each leg's search, empty without one."""
     lines = []
     for k, leg in enumerate(legs, 1):
-        found = next((m.details['search'] for m in leg.methods.values()
-                      if m.details.get('search')), None)
-        if not found:
+        search = next((m.details['search'] for m in leg.methods.values()
+                       if m.details.get('search')), None)
+        if not search:
             continue
-        best, after = found['best_row'], found['after']
-        rows = ((f'best of {found["array"]["rows"]} ({found["array"]["name"]})', best, best),
-                ('response surface', found['response_surface'], after),
-                ('least squares', found['least_squares'], None))
+        best, after = search['best_row'], search['after']
+        rows = ((f'best of {search["array"]["rows"]} ({search["array"]["name"]})', best, best),
+                ('response surface', search['response_surface'], after),
+                ('least squares', search['least_squares'], None))
         lines += ['search by positions alone (CN104359492A), without sigmas'
                   + (f', leg {k}' if len(legs) > 1 else ''),
                   f'  {"":24}  {"left":>10}  {"right":>10}  turn, deg  mean, m   max, m']
         for name, values, fit in rows:
-            how = '' if fit is None else f'  {fit["mean"]:7.3f}  {fit["max"]:7.3f}'
-            lines.append(f'  {name:24}  {values["scale_left"]:10.6g}  '
-                         f'{values["scale_right"]:10.6g}  {values["heading_deg"]:+9.4f}{how}')
-        if found['left_and_right_held_together']:
+            distances = '' if fit is None else f'  {fit["mean"]:7.3f}  {fit["max"]:7.3f}'
+            left, right = values['scale_left'], values['scale_right']
+            lines.append(f'  {name:24}  {left:10.6g}  {right:10.6g}'
+                         f'  {values["heading_deg"]:+9.4f}{distances}')
+        if search['left_and_right_held_together']:
             lines.append('  the fixes do not separate left and right: their ratio is kept')
     return lines
 
@@ -127,10 +128,10 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     legs : those of the values, whose reasons apply to each method; rejected ones count only if all
     are rejected.
     """
-    twice = overlapping_legs([leg for leg in legs
-                              if verdict_of(leg.reasons) is not Verdict.REJECTED])
-    of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
-    used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
+    repeated = overlapping_legs([leg for leg in legs
+                                 if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    leg_verdicts = [verdict_of(leg.reasons) for leg in legs if leg not in repeated]
+    used = [v for v in leg_verdicts if v is not Verdict.REJECTED] or leg_verdicts
     worst = Verdict.worst([method.verdict, *used])
     if worst is method.verdict:
         return worst.value
@@ -161,8 +162,8 @@ def _refused(method: MethodResult) -> str:
 
 def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
     """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
-    twice = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
-    return ['not used' if leg in twice else leg.verdict.value for leg in legs]
+    repeated = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    return ['not used' if leg in repeated else leg.verdict.value for leg in legs]
 
 
 def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
@@ -170,9 +171,9 @@ def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
     if method is None or name not in method.parameters:
         return '', 0.0
     row = method.parameters.index(name)
-    parts = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
-    largest, whole = max(parts, key=lambda source: parts[source], default=''), sum(parts.values())
-    return (largest, parts[largest] / whole) if whole else ('', 0.0)
+    variances = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    largest, total = max(variances, key=variances.__getitem__, default=''), sum(variances.values())
+    return (largest, variances[largest] / total) if total else ('', 0.0)
 
 
 def source_label(name: str, local: bool = False) -> str:
@@ -180,40 +181,40 @@ def source_label(name: str, local: bool = False) -> str:
     return name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
-def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: float,
+def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_share: float,
                  hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
-                 small_too: bool = True, local: bool = False) -> list[str]:
+                 name_small: bool = True, local: bool = False) -> list[str]:
     """
     Return the lines of a budget, none without one.
 
-    table : source to one-sigma share of each parameter, as in calibration.json.   scale : scale
-    factor of the scale column.   shown : share of the variance below which a source is only
-    named.   hidden : parameters that are not determined: their column stays empty.
-    width : columns of the screen.   small_too : name the small ones.   local : positions in a
-    local frame.
+    table : source to one-sigma effect on each parameter, as in calibration.json.   scale : scale
+    factor of the scale column.   least_share : of the variance; smaller sources have no line.
+    hidden : parameters that are not determined: their column stays empty.   width : columns of the
+    screen.   name_small : list the smaller sources.   local : positions in a local frame.
     """
     if not table:
         return []
     factor = {PARAMETERS[0]: 1e6 / scale}
-    wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in PARAMETERS]
-    lines = [table_row(HEAD, WIDTHS)]
+    variances = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in PARAMETERS]
+    lines = [table_row(BUDGET_HEAD, WIDTHS)]
     small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
-        shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
-                  for p, whole in zip(PARAMETERS, wholes, strict=True)]
-        if max(shares) < shown:
+        shares = [row.get(p, 0.0)**2 / variance if variance and p not in hidden else 0.0
+                  for p, variance in zip(PARAMETERS, variances, strict=True)]
+        if max(shares) < least_share:
             small.append(source_label(name, local))
             continue
-        cells = ['-' if share < shown else
+        cells = ['-' if share < least_share else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
         lines.append(table_row([source_label(name, local), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))
-    if not (small and small_too):
+    if not (small and name_small):
         return lines
-    rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
-    return lines + textwrap.wrap(rest, width, initial_indent='  ', subsequent_indent='    ')
+    limit = f'{least_share:.1%}'.replace('.0%', '%').replace('%', ' %')
+    return lines + textwrap.wrap(f'under {limit}: {", ".join(small)}', width, initial_indent='  ',
+                                 subsequent_indent='    ')
 
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
@@ -235,16 +236,16 @@ def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
 
 def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance]:
     """Return the error per distance driven of all legs, pooled over sections."""
-    found: dict[float, list[PerDistance]] = {}
-    for one in (x for leg in legs for x in leg.per_distance):
-        found.setdefault(one.length, []).append(one)
-    return [_pooled(length, parts) for length, parts in sorted(found.items())]
-
-
-def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
-    whole = sum(x.pieces for x in parts)
-    return PerDistance(length, math.sqrt(sum(x.pieces * x.before**2 for x in parts) / whole),
-                       math.sqrt(sum(x.pieces * x.after**2 for x in parts) / whole), whole)
+    by_distance: dict[float, list[PerDistance]] = {}
+    for error in (x for leg in legs for x in leg.per_distance):
+        by_distance.setdefault(error.length, []).append(error)
+    pooled = []
+    for distance, errors in sorted(by_distance.items()):
+        count = sum(x.pieces for x in errors)
+        before, after = (math.sqrt(sum(x.pieces * getattr(x, name)**2 for x in errors) / count)
+                         for name in CHECKS)
+        pooled.append(PerDistance(distance, before, after, count))
+    return pooled
 
 
 def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
@@ -258,7 +259,7 @@ def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str,
     """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
     pieces = in_pieces(legs)
     rows = []
-    for label, name in zip((before_label(legs), 'as calibrated'), SIDES, strict=True):
+    for label, name in zip((before_label(legs), 'as calibrated'), CHECKS, strict=True):
         check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
         if check is not None:
             share = check.percent_of_distance

@@ -83,6 +83,7 @@ def length(metres: float) -> str:
 
 
 def time_span(seconds: float) -> str:
+    """Return a duration with a sensible unit."""
     if seconds < 120:
         return f'{seconds:.1f} s'
     minutes, rest = divmod(round(seconds), 60)
@@ -115,6 +116,7 @@ def known(estimates: dict[str, Estimate], name: str) -> Estimate:
 
 
 def with_unit(estimate: Estimate) -> str:
+    """Return 'value ± sigma unit'."""
     unit = '' if estimate.unit == '1' else f' {estimate.unit}'
     return with_sigma(estimate.value, estimate.sigma) + unit
 
@@ -148,23 +150,22 @@ def join_same_reasons(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
         match = OF_LEG.fullmatch(reason.text)
         number, text = match.groups() if match else ('', reason.text)
         joined.setdefault((replace(reason, text=text), bool(match)), []).append(number)
-    of_code: dict[object, list[tuple[Reason, list[str]]]] = {}
+    by_code: dict[object, list[tuple[Reason, list[str]]]] = {}
     for (reason, of_leg), numbers in joined.items():
-        of_code.setdefault(reason.code if of_leg else reason, []).append((reason, numbers))
-    return tuple(line for found in of_code.values() for line in _of_legs(found))
+        by_code.setdefault(reason.code if of_leg else reason, []).append((reason, numbers))
+    return tuple(reason for group in by_code.values() for reason in _name_legs(group))
 
 
-def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
-    """Return the reasons of a code with their legs; of many different ones, the first."""
-    if not found[0][1][0]:
-        return [found[0][0]]
-    few = 2    # reasons of a code that differ from leg to leg, listed one by one
-    if len(found) <= few:
-        return [replace(reason, text=f'{_legs(numbers)}: {reason.text}')
-                for reason, numbers in found]
-    reason, first = found[0]
-    every = sorted({int(n) for _, numbers in found for n in numbers})
-    return [replace(reason, text=f'{_legs([str(n) for n in every])}; of leg {first[0]}: '
+def _name_legs(group: list[tuple[Reason, list[str]]]) -> list[Reason]:
+    """Return reasons of one code, (reason, leg numbers), with the legs in their texts."""
+    reason, numbers = group[0]
+    if not numbers[0]:
+        return [reason]
+    most_listed = 2    # different texts of a code; of more, the first one is shown
+    if len(group) <= most_listed:
+        return [replace(one, text=f'{_legs(of_one)}: {one.text}') for one, of_one in group]
+    all_legs = sorted({int(n) for _, of_one in group for n in of_one})
+    return [replace(reason, text=f'{_legs(list(map(str, all_legs)))}; of leg {numbers[0]}: '
                                  f'{reason.text}')]
 
 
@@ -201,12 +202,12 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[s
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
                            (Verdict.ACCEPTED, 'notes')):
-        found = [r for r in join_same_reasons(reasons) if r.code.severity is verdict]
-        if brief and found and verdict is Verdict.ACCEPTED:
-            codes = ', '.join(dict.fromkeys(r.code.name for r in found))
+        group = [r for r in join_same_reasons(reasons) if r.code.severity is verdict]
+        if brief and group and verdict is Verdict.ACCEPTED:
+            codes = ', '.join(dict.fromkeys(r.code.name for r in group))
             lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)
             continue
-        for reason in found:
+        for reason in group:
             lines += [f'  {title}'] if title else []
             title = ''
             lines += wrapped(str(reason), '    ', '   ', width)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_reproductions.paper import error_model
-from odocal_reproductions.paper.error_model import coefficients, H, LAT, LON, PAPER_RADIUS, propagate
+from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, propagate
 from odocal_reproductions.paper.path import Path, planned_path
 from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b, Origin
 from odocal_ros.nav.geodesy import C_en, earth_rate_n, OMEGA, radii
@@ -65,7 +65,7 @@ def path_of(track, origin):
 
 def in_fixed_axes(path, x, origin):
     """Return psi (rad) and dr (m) in the n of the origin, as error_model's text relates them."""
-    phi, dL, dlam, dh = x[:, :3], x[:, LAT], x[:, LON], x[:, H]
+    phi, dL, dlam, dh = x[:, :3], x[:, 3], x[:, 4], x[:, 5]
     s, c = np.sin(path.latitude), np.cos(path.latitude)
     meridian, normal = radii(path.latitude)
     dtheta = np.stack([-dL, dlam * c, dlam * s], -1)
@@ -97,7 +97,7 @@ def difference(town, column, k):
 
 
 def size(path, k):
-    """Return what a unit of each state is in metres or rad x 1 m, to weigh the six alike."""
+    """Return one unit of each state in metres or rad x 1 m, to weigh the six alike."""
     meridian, normal = radii(path.latitude[k])
     return np.stack([np.ones_like(meridian)] * 3
                     + [meridian, normal * np.cos(path.latitude[k]), np.ones_like(meridian)], -1)

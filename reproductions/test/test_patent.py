@@ -34,7 +34,7 @@ def drive():
 
 @pytest.fixture
 def same_drive(drive, monkeypatch):
-    monkeypatch.setattr(patent, 'driven', lambda fix_noise, seed: drive)
+    monkeypatch.setattr(patent, 'planar_leg', lambda fix_noise, seed: drive)
 
 
 def test_json_and_page_have_the_same_lines_and_the_truth_is_found(same_drive, capsys):
