@@ -23,7 +23,7 @@ from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.settings.config import DRIVES, HOLONOMIC, SIDES, SKID
 from odocal_ros.sim.options import REFERENCES, SimOptions
 from odocal_ros.sim.scenarios import motion_of
-from odocal_ros.sim.wheels import effective_width, STRAIGHT
+from odocal_ros.sim.wheels import effective_width, STRAIGHT_RATIO
 
 MARKS = 'marks'
 KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
@@ -104,7 +104,7 @@ def robot_of(options: SimOptions) -> Robot:
     drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
     # the sigma of a correlated error; for a random walk that of the model with the same increments
     stationary = drift * np.sqrt((length or Robot.drift_length) / 2)
-    straight = STRAIGHT * options.track_width if options.drive == SKID else 0.0
+    straight = STRAIGHT_RATIO * options.track_width if options.drive == SKID else 0.0
     return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),
                  straight_width=straight, wheels=max(options.wheels or 2, 2),
                  slip=options.slip_walk, white=usual['fix_sigma'], rate=usual['fix_rate'],

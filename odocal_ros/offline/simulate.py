@@ -253,7 +253,7 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
     from odocal_ros.sim.truth import settings
     drive = simulate(drive_options(vehicle, number, bag, options))
     name = f'{vehicle.name}/bag_{bag + 1:02d}'
-    recorded = with_broken_counter(drive, vehicle.broken(bag))
+    recorded = with_broken_counter(drive) if vehicle.broken(bag) else drive
     write_bag(out / name, drive_topics(recorded), args.storage, args.compression, args.force)
     config = f'{vehicle.model.name}.yaml'
     if number < len(MODELS) and not bag:      # one of each model
@@ -273,7 +273,7 @@ def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
         'yaw_mounting_deg': [math.degrees(drive.truth.yaw) for drive in drives],
         'pitch_mounting_deg': math.degrees(last.pitch),
         'start': [iso(drive.truth.start_ns) for drive in drives],
-        'changes': [{'value': change.what, 'bag': change.bag + 1,
+        'changes': [{'value': change.value, 'bag': change.bag + 1,
                      'size': change.size, 'after': iso(drives[change.bag - 1].truth.start_ns),
                      'by': iso(drives[change.bag].truth.start_ns)}
                     for change in vehicle.changes]}

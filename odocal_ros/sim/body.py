@@ -75,7 +75,7 @@ def road_lean(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
     return hermite(t, lean, np.gradient(lean, step))
 
 
-def sprung_response(push: Floats, step: float) -> tuple[Floats, Floats]:
+def sprung_response(static_tilt: Floats, step: float) -> tuple[Floats, Floats]:
     """
     Return value and rate, (n,) each, of ``y'' + 2 z w y' + w^2 y = w^2 u`` from rest.
 
@@ -87,15 +87,15 @@ def sprung_response(push: Floats, step: float) -> tuple[Floats, Floats]:
     # transition over a step of the deviation from the steady response, and of its rate
     value_by_value, value_by_rate = decay * (cosine + z * w / damped * sine), decay * sine / damped
     rate_by_rate = decay * (cosine - z * w / damped * sine)
-    slopes = np.diff(push) / step
-    steady = push[:-1] - 2 * z / w * slopes     # response to a ramp
-    values, rates = np.empty(len(push)), np.empty(len(push))
-    value, rate = float(push[0]), 0.0
+    slopes = np.diff(static_tilt) / step
+    steady = static_tilt[:-1] - 2 * z / w * slopes     # response to a ramp
+    values, rates = np.empty(len(static_tilt)), np.empty(len(static_tilt))
+    value, rate = float(static_tilt[0]), 0.0
     values[0], rates[0] = value, rate
     for k, (base, slope) in enumerate(zip(steady.tolist(), slopes.tolist(), strict=True)):
-        off, off_rate = value - base, rate - slope
-        value = base + slope * step + value_by_value * off + value_by_rate * off_rate
-        rate = slope - value_by_rate * w * w * off + rate_by_rate * off_rate
+        deviation, deviation_rate = value - base, rate - slope
+        value = base + slope * step + value_by_value * deviation + value_by_rate * deviation_rate
+        rate = slope - value_by_rate * w * w * deviation + rate_by_rate * deviation_rate
         values[k + 1], rates[k + 1] = value, rate
     return values, rates
 
@@ -127,14 +127,14 @@ def imu_output(motion: Motion, state: State,
     # turn rate of the body relative to the vehicle, in body axes, and its derivative
     w_relative = np.stack([roll_rate, pitch_rate * cosine, -pitch_rate * sine], -1)
     dw_relative = np.stack([roll_acceleration,
-                     pitch_acceleration * cosine - pitch_rate * roll_rate * sine,
-                     -pitch_acceleration * sine - pitch_rate * roll_rate * cosine], -1)
+                            pitch_acceleration * cosine - pitch_rate * roll_rate * sine,
+                            -pitch_acceleration * sine - pitch_rate * roll_rate * cosine], -1)
     arm_v = C_vb @ arm
     w_rv = rotate(C_vb, w_relative)
-    moved, turning = arm_v - arm, np.cross(w_rv, arm_v)
+    displacement, tilt_velocity = arm_v - arm, np.cross(w_rv, arm_v)
     # the arm moved by the tilt: Euler, centrifugal and Coriolis terms
     dw_v = np.gradient(w_v, t, axis=0) if len(t) > 1 else np.zeros_like(w_v)
-    f_v = (f_v + np.cross(dw_v, moved) + np.cross(w_v, np.cross(w_v, moved))
-           + 2 * np.cross(w_v, turning) + np.cross(rotate(C_vb, dw_relative), arm_v)
-           + np.cross(w_rv, turning))
+    f_v = (f_v + np.cross(dw_v, displacement) + np.cross(w_v, np.cross(w_v, displacement))
+           + 2 * np.cross(w_v, tilt_velocity) + np.cross(rotate(C_vb, dw_relative), arm_v)
+           + np.cross(w_rv, tilt_velocity))
     return rotate_back(C_vb, w_v) + w_relative, rotate_back(C_vb, f_v)

@@ -46,8 +46,8 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     if set(ODOMETER_EFFECTS) <= set(effects or ()):
         raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer; '
                        'select one of them')
-    own = given.pop('real', {})
-    vehicle, options = _clean(seed, kind, grade, alone=effects is not None)
+    fixed = given.pop('real', {})
+    vehicle, options = _base_vehicle(seed, kind, grade, alone=effects is not None)
     if 'scale' in given:
         ratio = options['nominal_scale'] / options['scale']
         given = {'nominal_scale': given['scale'] * ratio} | given
@@ -57,22 +57,25 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
             make_rng(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers')))]
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == odometer]
     real: dict[str, Any] = {}
-    there = []
+    present = []
     for name in names:
         drawn = (EFFECTS | RARE)[name](make_rng(seed, f'vehicle {name}'), vehicle)
         if drawn.options or drawn.real:      # a draw may have no effect
-            there.append(name)
+            present.append(name)
         options |= drawn.options
         real |= drawn.real
-    return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
+    return SimOptions(**options | given, real=Real(**real | fixed)), tuple(present)
 
 
-def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:
-    rng, which = make_rng(seed, 'vehicle'), GRADES.index(grade)
-    roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in ROWS['mounting'][which])
+def _base_vehicle(seed: int, kind: str, grade: str,
+                  alone: bool) -> tuple[Vehicle, dict[str, Any]]:
+    """Return the vehicle and its options before any effect."""
+    rng, grade_index = make_rng(seed, 'vehicle'), GRADES.index(grade)
+    roll, pitch, yaw = (math.radians(sigma) * rng.standard_normal()
+                        for sigma in ROWS['mounting'][grade_index])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)
     quarter = int(rng.integers(1, 4)) if rng.uniform() < 0.2 else 0     # known
-    rtk, city = bool(rng.uniform() < SIZES['rtk'][which]), bool(rng.uniform() < 0.45)
+    rtk, city = bool(rng.uniform() < SIZES['rtk'][grade_index]), bool(rng.uniform() < 0.45)
     robot = kind == 'yard' and grade == 'consumer'
     size = 0.5 if robot else 1.0
     antenna = size * rng.normal((0.8, 0.0, 1.3), (0.8, 0.3, 0.2))
@@ -87,6 +90,6 @@ def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict
         'odometer_rate': 50.0, 'fix_rate': float(rng.choice([1.0, 5.0, 10.0])),
         'fix_noise': 'rtk' if rtk else 'white', 'fix_sigma': 0.02 if rtk else 1.5,
         'nominal_scale': scale,
-        'scale': scale * (1 + SIZES['nominal scale'][which] * rng.standard_normal())}
+        'scale': scale * (1 + SIZES['nominal scale'][grade_index] * rng.standard_normal())}
     options = {k: float(v) if isinstance(v, np.floating) else v for k, v in options.items()}
     return Vehicle(grade, kind, rtk, city and kind != 'motorway', robot, options, alone), options

@@ -14,10 +14,10 @@ from odocal_ros.sim.zoo import DEG, Drawn, flat, G, KMH, lognormal, MG, Vehicle
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw scale and misalignment of each axis, and a rotation between gyro and accelerometer."""
     x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
-    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it for each triad
+    rotation = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it for each triad
     figures = {}
     for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
-        M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * turned / math.sqrt(2)
+        M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * rotation / math.sqrt(2)
         # a data sheet limits it to three sigmas
         np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
                          * np.clip(rng.standard_normal(3), -3.0, 3.0))
@@ -26,6 +26,7 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Draw the sensitivity of each gyro to specific force along each axis."""
     return Drawn({'g_sensitivity': flat(rng.normal(0.0, vehicle.size('g sensitivity'), 9))})
 
 
@@ -41,14 +42,14 @@ def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw biases that change while the IMU warms up; it may have been on for some minutes."""
     tau = lognormal(rng, 300.0, 0.5)
-    since = rng.uniform(0.0, 600.0)
+    time_on = rng.uniform(0.0, 600.0)
     figures = {}
     for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
         median, spread = vehicle.row(f'{sensor} slope')
         sign = rng.choice([-1, 1], 3)
         figures[name] = flat(sign * (median * np.exp(spread * rng.standard_normal(3))))
     least, most = vehicle.row('warmth')
-    rise = rng.uniform(least, most) * math.exp(-since / tau)
+    rise = rng.uniform(least, most) * math.exp(-time_on / tau)
     return Drawn(figures | {'warm_rise': float(rise), 'warm_time': tau})
 
 
@@ -80,8 +81,8 @@ def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Quantise speeds as a vehicle bus, with a dead band; at times whole km/h at 1 to 10 Hz."""
     whole = vehicle.alone or rng.uniform() < 0.3      # as in OBD-II
-    least_bits = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of vehicle buses
-    real = {'speed_step': KMH * (1.0 if whole else float(rng.choice(least_bits))),
+    resolutions = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of vehicle buses
+    real = {'speed_step': KMH * (1.0 if whole else float(rng.choice(resolutions))),
             'speed_rounding': str(rng.choice(['floor', 'round']))}
     chance = rng.uniform()
     band = (0.0 if chance < 0.3 else rng.uniform(0.3, 1) if chance < 0.8 else rng.uniform(1, 3.5))
@@ -99,9 +100,9 @@ def coarse_pulses(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Delay stamps by filter and bus, with jitter."""
-    late = lognormal(rng, *((0.015, 0.6) if vehicle.robot else (0.04, 0.5)
-                            if vehicle.grade != 'tactical' else (0.005, 0.3)))
-    return Drawn({'odometer_jitter': 0.003}, {'odometer_delay': late})
+    delay = lognormal(rng, *((0.015, 0.6) if vehicle.robot else (0.04, 0.5)
+                             if vehicle.grade != 'tactical' else (0.005, 0.3)))
+    return Drawn({'odometer_jitter': 0.003}, {'odometer_delay': delay})
 
 
 def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -111,8 +112,8 @@ def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 def warming(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let tyres grow as they warm up."""
-    half = 0.5 if vehicle.grade == 'tactical' else 1.0
-    return Drawn({'warming': float(half * rng.uniform(0.001, 0.004)),
+    factor = 0.5 if vehicle.grade == 'tactical' else 1.0
+    return Drawn({'warming': float(factor * rng.uniform(0.001, 0.004)),
                   'warming_time': lognormal(rng, 600.0, 0.4)})
 
 
@@ -138,9 +139,9 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw errors of lever arms: measured with a tape, by eye, or left at zero."""
     zero, real = rng.uniform() < vehicle.size('arm at zero'), {}
     for name in ('imu', 'antenna', 'odometer'):
-        off = vehicle.size('arm error') * rng.standard_normal(3)
+        error = vehicle.size('arm error') * rng.standard_normal(3)
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
-        real[f'{name}_arm_error'] = flat(-arm if zero else off)
+        real[f'{name}_arm_error'] = flat(-arm if zero else error)
     return Drawn(real)
 
 
@@ -160,8 +161,8 @@ def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw correlated errors: most with a time of one minute, the rest of 15 minutes."""
     if vehicle.rtk:
         return Drawn({'slow_errors': ((0.01, 100.0),)}, {'fix_sigma': 0.008})
-    sbas = 0.6 if rng.uniform() < 0.4 else 1.0
-    sigma = sbas * lognormal(rng, 1.5, 0.4)
+    sbas_factor = 0.6 if rng.uniform() < 0.4 else 1.0
+    sigma = sbas_factor * lognormal(rng, 1.5, 0.4)
     return Drawn({'slow_errors': ((sigma * 0.6**0.5, 60.0), (sigma * 0.4**0.5, 900.0))},
                  {'fix_sigma': float(rng.uniform(0.02, 0.3))})
 

@@ -15,7 +15,7 @@ from odocal_ros.sim.scenarios import Drive, SimOptions
 WALK = 1e-4              # judgement: of the scale, relative, per square root of a day
 # judgement: shares of the vehicles whose tyres are changed, IMU moved, counter broken; at least
 # one of three
-FATES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
+CHANGE_SHARES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class FleetChange:
     """A change of a vehicle before one of its bags, which count from 0."""
 
     bag: int
-    what: str            # scale_factor, yaw_mounting_angle or counter
+    value: str           # its name: scale_factor, yaw_mounting_angle or counter
     size: float = 0.0    # relative, or rad
 
 
@@ -57,21 +57,22 @@ class FleetVehicle:
     changes: tuple[FleetChange, ...] = field(default=())
 
     def broken(self, bag: int) -> bool:
-        return any(change.what == 'counter' and change.bag <= bag for change in self.changes)
+        """Return whether the odometer counter is broken in a bag."""
+        return any(change.value == 'counter' and change.bag <= bag for change in self.changes)
 
 
 def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     """Return ``vehicles`` vehicles with ``bags`` drives each, one per week."""
     order = make_rng(seed, 'fleet').permutation(vehicles).tolist()
-    fates: dict[int, str] = {}
-    for what, share in FATES.items():
+    changed: dict[int, str] = {}
+    for value, share in CHANGE_SHARES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
-            fates[order.pop()] = what
-    return [_vehicle(k, bags, fates.get(k), make_rng(seed, f'fleet vehicle {k}'))
+            changed[order.pop()] = value
+    return [_vehicle(k, bags, changed.get(k), make_rng(seed, f'fleet vehicle {k}'))
             for k in range(vehicles)]
 
 
-def _vehicle(k: int, bags: int, fate: str | None, rng: np.random.Generator) -> FleetVehicle:
+def _vehicle(k: int, bags: int, changed: str | None, rng: np.random.Generator) -> FleetVehicle:
     model = MODELS[k % len(MODELS)]
     walk = np.cumsum(WALK * math.sqrt(7) * rng.standard_normal(bags))
     # between vehicles of a model, 1 sigma: 0.3 % of the scale, 0.3 and 0.2 deg
@@ -79,21 +80,22 @@ def _vehicle(k: int, bags: int, fate: str | None, rng: np.random.Generator) -> F
     yaw = np.full(bags, model.yaw + math.radians(0.3) * rng.standard_normal())
     pitch = model.pitch + math.radians(0.2) * rng.standard_normal()
     km = 1000.0 + 400.0 * np.cumsum(rng.uniform(0.5, 1.5, bags))    # 400 km a week
-    when = int(rng.integers(1, max(2, bags - 1)))
+    first_bag = int(rng.integers(1, max(2, bags - 1)))
     size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0))
     changes: tuple[FleetChange, ...] = ()
-    if fate == 'scale_factor':
+    if changed == 'scale_factor':
         size *= 0.02
-        scale[when:] *= 1 + size
-    elif fate == 'yaw_mounting_angle':
+        scale[first_bag:] *= 1 + size
+    elif changed == 'yaw_mounting_angle':
         size *= math.radians(3.0)
-        yaw[when:] += size
-    if fate:
-        changes = (FleetChange(when, fate, 0.0 if fate == 'counter' else size),)
+        yaw[first_bag:] += size
+    if changed:
+        changes = (FleetChange(first_bag, changed, 0.0 if changed == 'counter' else size),)
     return FleetVehicle(f'{model.name}_{k + 1:03d}', model, scale, yaw, pitch, km, changes)
 
 
 def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOptions) -> SimOptions:
+    """Return the options of a vehicle's drive; number, bag: of both, from 0."""
     return replace(
         options, seed=options.seed + 1000 * (number + 1) + bag, yaw=float(vehicle.yaw[bag]),
         start_ns=options.start_ns + bag * 7 * DAY_NS + number % 100 * DAY_NS // 24,
@@ -101,12 +103,9 @@ def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOpti
         nominal_scale=vehicle.model.nominal)
 
 
-def with_broken_counter(drive: Drive, broken: bool) -> Drive:
-    """Return a drive as in its bag: a broken counter stops after a third of the drive."""
-    if not broken:
-        return drive
-    rows = drive.odometer
-    value = rows.value.copy()
+def with_broken_counter(drive: Drive) -> Drive:
+    """Return a drive whose odometer counter stops after a third of its samples."""
+    value = drive.odometer.value.copy()
     third = int(1 / 3 * len(value))
     value[third:] = value[third]
-    return replace(drive, wheels=(replace(rows, value=value), *drive.wheels[1:]))
+    return replace(drive, wheels=(replace(drive.odometer, value=value), *drive.wheels[1:]))

@@ -68,11 +68,11 @@ class Motion:
                  tilt: tuple[Profile, ...] = (), lean: Profile | None = None) -> None:
         self.speed, self.yaw_rate, self.start = speed, yaw_rate, start
         self.hills, self.sway, self.tilt, self.lean = hills or Hills(), sway, tilt, lean
-        self._jolt = [profile.derivative() for profile in sway]
+        self._sway_rate = [profile.derivative() for profile in sway]
         self._acceleration, self._travel = speed.derivative(), speed.integral()
         self._yaw_acceleration, self._turn = yaw_rate.derivative(), yaw_rate.integral()
         self.duration = max(speed.end, yaw_rate.end)
-        self._place_nodes()
+        self._integrate()
 
     @property
     def distance(self) -> float:
@@ -87,7 +87,7 @@ class Motion:
         node = np.clip(np.searchsorted(self._nodes, t, side='right') - 1, 0, None)
         east, north, up, turned = self._section(self._nodes[node], t - self._nodes[node])
         latitude0, height0 = self._latitude[node], self._height[node]
-        latitude, longitude = _walk(latitude0, height0 + up / 2, east, north)
+        latitude, longitude = _steps(latitude0, height0 + up / 2, east, north)
         travel, speed, acceleration = self._travel(t), self.speed(t), self._acceleration.mean(t)
         slope, by_s, by_s2 = self.hills(travel)
         return State(
@@ -99,9 +99,9 @@ class Motion:
             height=height0 + up,
             turned=self._turned[node] + turned + longitude * np.sin(latitude0 + latitude / 2),
             sway=np.stack([profile(t) for profile in self.sway], -1),
-            sway_acceleration=np.stack([profile.mean(t) for profile in self._jolt], -1))
+            sway_acceleration=np.stack([profile.mean(t) for profile in self._sway_rate], -1))
 
-    def _place_nodes(self) -> None:
+    def _integrate(self) -> None:
         # 0.1 s: at 0.5 rad/s the error of the Gauss rule is then below round-off
         steps = np.arange(0.0, self.duration, 0.1)
         breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
@@ -113,7 +113,7 @@ class Motion:
         latitude = np.full(len(nodes), self.start.latitude)
         # each round gains four digits: the radii change by 1 % per rad of latitude
         for _ in range(5):
-            step, longitude = _walk_about((latitude[1:] + latitude[:-1]) / 2, middle, east, north)
+            step, longitude = _steps_at((latitude[1:] + latitude[:-1]) / 2, middle, east, north)
             latitude = self.start.latitude + running_sum(step)
         self._latitude = latitude
         self._longitude = self.start.longitude + running_sum(longitude)
@@ -138,17 +138,17 @@ class Motion:
         return sums
 
 
-def _walk_about(latitude: Floats, height: Floats, east: Floats,
-                north: Floats) -> tuple[Floats, Floats]:
+def _steps_at(latitude: Floats, height: Floats, east: Floats,
+              north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps about a middle latitude."""
     meridian, normal = geodesy.radii(latitude)
     return north / (meridian + height), east / ((normal + height) * np.cos(latitude))
 
 
-def _walk(latitude: Floats, height: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+def _steps(latitude: Floats, height: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps, m, that begin at latitude."""
-    step, _ = _walk_about(latitude, height, east, north)
-    return _walk_about(latitude + step / 2, height, east, north)
+    step, _ = _steps_at(latitude, height, east, north)
+    return _steps_at(latitude + step / 2, height, east, north)
 
 
 def attitude(state: State) -> Floats:
@@ -208,8 +208,8 @@ def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
     """Return gravity at d_n (m) from the vehicle minus that at the vehicle, in its ENU."""
     meridian, normal = geodesy.radii(state.latitude)
     tilt_e, tilt_n = d_n[:, 0] / (normal + state.height), d_n[:, 1] / (meridian + state.height)
-    there = geodesy.gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
-    return np.stack([-there * tilt_e, -there * tilt_n, gamma - there], -1)
+    gravity_at_d = geodesy.gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
+    return np.stack([-gravity_at_d * tilt_e, -gravity_at_d * tilt_n, gamma - gravity_at_d], -1)
 
 
 def point(state: State, lever_arm_v: tuple[float, float, float],

@@ -16,13 +16,13 @@ from odocal_ros.sim.real import NONE3, Real, Vector
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
-MOST_OWN_TOPICS, MOST_WHEELS = 2, 8    # definition: as in odometer.wheels
+MOST_WHEEL_TOPICS, MOST_WHEELS = 2, 8    # definition: as in odometer.wheels
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A kind of reference."""
+    """A kind of position reference: its topic, message type and usual options."""
 
     topic: str
     encoder: str            # function of ``bagio.encode``
@@ -57,7 +57,7 @@ class SimOptions:
     """
 
     scenario: str = 'straight'
-    duration: float = BY_SCENARIO   # s
+    duration: float = BY_SCENARIO          # s
     seed: int = 1
     start_ns: int = 1_750_000_000_000_000_000
     latitude: float = math.radians(40.0)
@@ -69,10 +69,10 @@ class SimOptions:
     imu: bool = True                       # False: the robot has none
     imu_grade: str = BY_SCENARIO
     imu_rate: float = 100.0                # Hz
-    yaw: float = BY_SCENARIO   # rad, yaw mounting angle
-    pitch: float = BY_SCENARIO   # rad, pitch mounting angle
+    yaw: float = BY_SCENARIO               # rad, yaw mounting angle
+    pitch: float = BY_SCENARIO             # rad, pitch mounting angle
     roll: float = 0.0                      # rad
-    mounting_rpy: Vector = NONE3          # rad, nominal, IMU frame to b
+    mounting_rpy: Vector = NONE3           # rad, nominal, IMU frame to b
     imu_lever_arm: Vector = NONE3
     gyro_scale_error: float = 0.0          # relative, of all axes
     accel_scale_error: float = 0.0         # relative, of all axes
@@ -81,9 +81,9 @@ class SimOptions:
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
     odometer_rate: float = 50.0            # Hz
     odometer_delay: float = 0.0            # s, delay of the stamps
-    odometer_lever_arm: Vector = NONE3    # wheel contact point; of two wheels: their middle
-    scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: the true value
-    nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
+    odometer_lever_arm: Vector = NONE3     # wheel contact point; of two wheels: their middle
+    scale: float = BY_SCENARIO             # m/pulse, 1 or m/rad: the true value
+    nominal_scale: float = BY_SCENARIO     # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
     drive: str = DIFFERENTIAL              # of a robot: or skid, mecanum, omni
     two_wheels: bool = False               # as wheels = 2
@@ -131,6 +131,7 @@ class SimOptions:
 
     @property
     def wheel_count(self) -> int:
+        """Return the number of wheels with an odometer."""
         return max(self.wheels, 1 + self.two_wheels)
 
 
@@ -180,7 +181,7 @@ def resolved(options: SimOptions) -> SimOptions:
     defaults: dict[str, Any] = COMMON | DEFAULTS[options.scenario]
     _choice('--reference', options.reference or defaults['reference'], REFERENCES)
     defaults |= REFERENCES[options.reference or defaults['reference']].usual
-    options = _filled(options, defaults)
+    options = _with_defaults(options, defaults)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--drive', options.drive, DRIVES)
     if options.drive != DIFFERENTIAL:
@@ -189,7 +190,7 @@ def resolved(options: SimOptions) -> SimOptions:
                           wheels=4 if options.drive == MECANUM else options.wheels)
     if options.drive == OMNI:
         options = replace(options, wheels=max(options.wheels, FEWEST_OMNI))
-    if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
+    if options.wheel_count > MOST_WHEEL_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
     scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]
     if options.scenario == 'paper':
@@ -198,15 +199,15 @@ def resolved(options: SimOptions) -> SimOptions:
         nominal = 1.2 * (options.scale or scale)
     elif options.scale is not None:
         nominal = options.scale * nominal / scale
-    filled = _filled(options, {'scale': scale, 'nominal_scale': nominal,
-                               'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
+    filled = _with_defaults(options, {'scale': scale, 'nominal_scale': nominal,
+                                      'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
     if isinstance(options.real, dict):      # as in truth.yaml
         filled = replace(filled, real=Real(**options.real))
     _check(filled)
     return filled
 
 
-def _filled(options: SimOptions, values: dict[str, Any]) -> SimOptions:
+def _with_defaults(options: SimOptions, values: dict[str, Any]) -> SimOptions:
     return replace(options, **{name: value for name, value in values.items()
                                if getattr(options, name) is BY_SCENARIO})
 
@@ -215,9 +216,9 @@ def _check(options: SimOptions) -> None:
     _choice('--imu-grade', options.imu_grade, SIM_GRADES)
     for option in fields(options):
         value = getattr(options, option.name)
-        for one in value if isinstance(value, tuple) else (value,):
-            if isinstance(one, (int, float)) and not isinstance(one, bool):
-                _check_number(option.name, one)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, (int, float)) and not isinstance(number, bool):
+                _check_number(option.name, number)
     if options.wheel_count > 1 and options.odometer == 'speed':
         raise BadUsage('--two-wheels and --wheels require --odometer counts or angle, not speed')
     if not 1 <= options.wheels <= MOST_WHEELS:

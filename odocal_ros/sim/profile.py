@@ -28,20 +28,22 @@ class Profile:
 
     @property
     def end(self) -> float:
+        """Return the last break, s."""
         return float(self.breaks[-1])
 
     def __call__(self, t: ArrayLike) -> Floats:
         """Return the values at (...) times; at a jump, the value after it."""
-        return self._on(self._piece(t), t)
+        return self._evaluate(self._piece(t), t)
 
     def mean(self, t: ArrayLike) -> Floats:
         """Return the values, at a jump the mean of both sides (a trapezoid rule is then exact)."""
         t = np.asarray(t, dtype=float)
         near = 1e-9    # s, a sample this near a break counts as on it
         before, after = self._piece(t - near), self._piece(t + near)
-        return (self._on(before, t) + self._on(after, t)) / 2
+        return (self._evaluate(before, t) + self._evaluate(after, t)) / 2
 
     def derivative(self) -> 'Profile':
+        """Return the derivative by time."""
         order = np.arange(1, self.powers.shape[1])
         return Profile(self.breaks, self.powers[:, 1:] * order if len(order)
                        else np.zeros((len(self.powers), 1)))
@@ -57,12 +59,13 @@ class Profile:
         piece = np.searchsorted(self.breaks, t, side='right') - 1
         return np.clip(piece, 0, len(self.powers) - 1)
 
-    def _on(self, piece: Ints, t: ArrayLike) -> Floats:
+    def _evaluate(self, piece: Ints, t: ArrayLike) -> Floats:
         t = np.clip(t, self.breaks[0], self.breaks[-1])
         return _horner(self.powers.T[:, piece], t - self.breaks[piece])
 
 
 def _horner(powers: Floats, x: Floats) -> Floats:
+    """Return polynomials at x, coefficients in order of rising powers: (d, ...)."""
     value: Floats = powers[-1]
     for power in powers[-2::-1]:
         value = value * x + power
@@ -130,20 +133,20 @@ class Hills:
     def __call__(self, travel: Floats) -> tuple[Floats, Floats, Floats]:
         """Return slope and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
-        wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
+        wave, cosine_wave = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
         _, sine, by, by2 = self._over_kerbs(travel)
         cosine = np.sqrt(1 - sine**2)
-        return (wave + np.arcsin(sine), k * along + by / cosine,
+        return (wave + np.arcsin(sine), k * cosine_wave + by / cosine,
                 -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
 
     def chord(self, travel: Floats, wheelbase: float) -> tuple[Floats, Floats]:
         """Return the slope of the line from ``travel`` to a wheelbase ahead and its derivative."""
         k, ahead = 2 * np.pi / self.length, travel + wheelbase
         mean = self.slope * (np.cos(k * travel) - np.cos(k * ahead)) / (k * wheelbase)
-        mean_by = self.slope * (np.sin(k * ahead) - np.sin(k * travel)) / wheelbase
-        here, there = self._over_kerbs(travel), self._over_kerbs(ahead)
-        sine, by = ((there[i] - here[i]) / wheelbase for i in (0, 1))
-        return mean + np.arcsin(sine), mean_by + by / np.sqrt(1 - sine**2)
+        mean_by_path = self.slope * (np.sin(k * ahead) - np.sin(k * travel)) / wheelbase
+        rear, front = self._over_kerbs(travel), self._over_kerbs(ahead)
+        sine, by = ((front[i] - rear[i]) / wheelbase for i in (0, 1))
+        return mean + np.arcsin(sine), mean_by_path + by / np.sqrt(1 - sine**2)
 
     def _over_kerbs(self, travel: Floats) -> Floats:
         """Return the height by kerbs, m, and its three derivatives by distance: (4, n)."""

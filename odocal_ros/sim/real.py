@@ -17,7 +17,7 @@ from odocal_ros.settings.nominal import GRADES
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
 NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
-WORDS = {'speed_rounding': ('floor', 'round'), 'configured_grade': tuple(GRADES)}
+CHOICES = {'speed_rounding': ('floor', 'round'), 'configured_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_step',
           'accel_step', 'gyro_slope', 'accel_slope', 'warm_rise', 'rectification', 'speed_law',
           'warming', 'imu_arm_error', 'odometer_arm_error', 'antenna_arm_error',
@@ -122,9 +122,9 @@ class Real:
 
 def _checked(name: str, value: Any, default: Any) -> Any:
     """Return a parameter as numbers and tuples of them, or raise BadUsage."""
-    if name in WORDS:
-        if value not in WORDS[name] and value != default:
-            raise BadUsage(f'--real {name}={value}: required: one of {", ".join(WORDS[name])}')
+    if name in CHOICES:
+        if value not in CHOICES[name] and value != default:
+            raise BadUsage(f'--real {name}={value}: required: one of {", ".join(CHOICES[name])}')
         return value
     if value is None and default is None:
         return None
@@ -161,8 +161,8 @@ def parsed(text: str) -> tuple[str, Any]:
     name, _, value = text.partition('=')
     names = [f.name for f in fields(Real)]
     if name not in names:
-        near = difflib.get_close_matches(name, names, 3) or names
-        raise BadUsage(f'--real {name}: no such parameter; similar: {", ".join(near)}')
+        similar = difflib.get_close_matches(name, names, 3) or names
+        raise BadUsage(f'--real {name}: no such parameter; similar: {", ".join(similar)}')
     try:
         return name, ast.literal_eval(value)
     except (ValueError, SyntaxError):

@@ -32,7 +32,7 @@ TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: ratio of height errors to those of east and north
 ONSET = (0.5, 1.5)   # judgement: range, of the mean rise and fall time of a burst
 HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
-OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
+OUTLIER_SIGMA = 5.0     # m/s, judgement: a wrong Doppler in a street
 
 
 def angles(d_b: Floats) -> tuple[float, float]:
@@ -56,15 +56,15 @@ def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     return np.stack([x, np.cross(z, x), z], -1)
 
 
-def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
-               accel_matrix: Floats) -> tuple[float, float, float, float]:
+def mounting_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
+                    accel_matrix: Floats) -> tuple[float, float, float, float]:
     """Return yaw and pitch by the IMU's own axes, then by its housing, rad; matrices in i."""
     d = np.asarray(C_vb)[0]
     R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
     return *angles(R.T @ d), *angles(d)
 
 
-def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
+def with_triad_errors(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
     """Return turn rate and specific force with the errors of the triads: (n, 3) each."""
     gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
     w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
@@ -77,8 +77,8 @@ def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float
     """Return gyro and accelerometer errors beyond noise and turn-on bias: (n, 3) or 0.0 each."""
     real = options.real
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
-    added = []
-    for name, shake in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
+    drifts_by_sensor = []
+    for name, rms in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
         slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
         total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
         if any(step := getattr(real, f'{name}_step')):
@@ -86,14 +86,14 @@ def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float
         if wander:
             total = total + _wander(make_rng(options.seed, f'real {name} wander'), wander,
                                     real.wander_time, t)
-        if shake:
+        if rms:
             level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
             total = total + level * vibration(make_rng(options.seed, f'real {name} vibration'),
-                                              shake, options.imu_rate, len(t))
+                                              rms, options.imu_rate, len(t))
             if name == 'accel' and real.rectification:
-                total = total + real.rectification * (shake * level)**2
-        added.append(total)
-    return added
+                total = total + real.rectification * (rms * level)**2
+        drifts_by_sensor.append(total)
+    return drifts_by_sensor
 
 
 def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
@@ -108,23 +108,23 @@ def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floa
     f = np.fft.rfftfreq(n, 1 / rate)
     power = np.zeros_like(f)
     for middle, width, share in RESONANCES:
-        at = min(middle, 0.4 * rate)
-        power += share * np.minimum(f / at, 1.0)**4 / (1 + ((f - at) / width)**2)
+        peak = min(middle, 0.4 * rate)
+        power += share * np.minimum(f / peak, 1.0)**4 / (1 + ((f - peak) / width)**2)
     shape = np.sqrt(power)[:, None]
     x = np.fft.irfft(np.fft.rfft(rng.standard_normal((n, 3)), axis=0) * shape, n, axis=0)
     # both halves of the spectrum: the mean square of the shape is that of the samples
     weight = np.full(len(f), 2.0)
     weight[0] = 1.0
     weight[-1] = 1.0 if n % 2 == 0 else 2.0
-    shaking: Floats = rms * x / np.sqrt((weight * power).sum() / n)
-    return shaking
+    acceleration: Floats = rms * x / np.sqrt((weight * power).sum() / n)
+    return acceleration
 
 
-def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
-            batch: int = 1) -> Ints:
+def delayed_stamps(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
+                   batch: int = 1) -> Ints:
     """Return stamps, ns, of samples at ``ns``: late (none early), in order, in batches."""
-    late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
-    stamp = ns + np.rint(late * 1e9).astype(np.int64)
+    delay = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
+    stamp = ns + np.rint(delay * 1e9).astype(np.int64)
     offsets_ns = LEAST_GAP_NS * np.arange(len(ns))
     if batch > 1:
         last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
@@ -132,20 +132,20 @@ def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
     return np.maximum.accumulate(stamp - offsets_ns) + offsets_ns
 
 
-def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
+def positions(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
     """Return latitude, longitude (rad), height (m) of a receiver without noise at t."""
     real, true = options.real, _antenna(motion, t, options)
-    out = true
+    position = true
     for weights, time in ((AVERAGING, real.receiver_lag), (TRACKING, real.receiver_tracking)):
         if time:
-            out = _filtered(motion, t, options, weights, time)
+            position = _filtered(motion, t, options, weights, time)
     if real.receiver_odometer:
         mean = _filtered(motion, t, options, AVERAGING, real.receiver_odometer_time)
         share = real.receiver_odometer
         latitude, longitude, height = (x + share * (now - past) for x, now, past in zip(
-            out, true, mean, strict=True))
+            position, true, mean, strict=True))
         return latitude, longitude, height
-    return out
+    return position
 
 
 def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
@@ -156,13 +156,13 @@ def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
         strict=True))
 
 
-def fused(t: Floats, errors: Floats, options: SimOptions) -> Floats:
+def fused_errors(t: Floats, errors: Floats, options: SimOptions) -> Floats:
     """Return (n, 3) satellite errors after fusion with the odometer of the receiver."""
     if not options.real.receiver_odometer:
         return errors
-    left = np.exp(-np.diff(t) / options.real.receiver_odometer_time)
+    decay = np.exp(-np.diff(t) / options.real.receiver_odometer_time)
     out = errors.copy()
-    for k, a in enumerate(left, 1):
+    for k, a in enumerate(decay, 1):
         out[k] = a * out[k - 1] + (1 - a) * errors[k]
     return out
 
@@ -197,14 +197,14 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
     return total
 
 
-def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Floats:
+def tunnel_errors(t: Floats, error: Floats, position: Floats, options: SimOptions) -> Floats:
     """Return (n, 3) m errors of a receiver that dead-reckons in tunnels from the entry."""
     real, out = options.real, error.copy()
     for begin, length in real.tunnels:
         inside = np.flatnonzero((t >= begin) & (t < begin + length))
         if len(inside) < 2:
             continue
-        steps = np.diff(place[inside], axis=0, prepend=place[inside[:1]])
+        steps = np.diff(position[inside], axis=0, prepend=position[inside[:1]])
         turned = real.tunnel_heading * (t[inside, None] - begin) / 60
         sideways = np.stack([-steps[:, 1], steps[:, 0], 0 * steps[:, 2]], -1)
         out[inside] = error[inside[0]] + np.cumsum(
@@ -225,8 +225,8 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
         return VelocitySamples.none()
     ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
     smoothed = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
-    before, after = (np.stack(places(motion, np.maximum(t + by, 0.0), smoothed), -1)
-                     for by in (-HALF_STEP, HALF_STEP))
+    before, after = (np.stack(positions(motion, np.maximum(t + dt, 0.0), smoothed), -1)
+                     for dt in (-HALF_STEP, HALF_STEP))
     latitude, _, height = after.T
     meridian, normal = radii(latitude)
     north, east, up = ((after - before) / (2 * HALF_STEP)).T
@@ -235,9 +235,9 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     time, rng = options.velocity_correlation_time, make_rng(options.seed, 'velocity')
     error = (gauss_markov(rng, sigma, time, t) if time
              else sigma * rng.standard_normal((len(t), 3)))
-    far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
+    is_outlier = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
     sent = true * (1 + options.velocity_scale_error) + (
-        error + far * OUTLIER * rng.standard_normal((len(t), 3)))
+        error + is_outlier * OUTLIER_SIGMA * rng.standard_normal((len(t), 3)))
     stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
     return VelocitySamples(stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), sent,
                            np.full(sent.shape, sigma**2))

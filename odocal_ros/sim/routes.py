@@ -12,28 +12,28 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 
 # judgement: of a run of a minute with a small robot
-STILL = 5.0         # s at standstill, at the start and at the end
-LONGEST = 19.0      # s of a cycle with the shortest straight
-BLEND = 0.4         # s, rise time of an acceleration or a turn rate
+STILL = 5.0            # s at standstill, at the start and at the end
+LONGEST_CYCLE = 19.0   # s of a cycle with the shortest straight
+BLEND = 0.4            # s, rise time of an acceleration or a turn rate
 
-Stretch = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
+Segment = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
 
 
-def _robot_stretches(duration: float, rng: np.random.Generator, cycles: int = 1) -> list[Stretch]:
+def _robot_segments(duration: float, rng: np.random.Generator, cycles: int = 1) -> list[Segment]:
     """
     Return cycles of a move and a turn on the spot, 5 s still before and after.
 
     A move of 2 to 8 s at 0.2 to 1.2 m/s is alternately straight or an arc of up to 90 deg. Turns
     on the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, alternately to the left and the right.
     """
-    left = _rest('indoor', duration, 2 * STILL, least=math.ceil(cycles * LONGEST))
-    found, side, k = [(hold(STILL), hold(STILL))], rng.choice([-1.0, 1.0]), 0
-    while left >= LONGEST:
+    left = _time_left('indoor', duration, 2 * STILL, least=math.ceil(cycles * LONGEST_CYCLE))
+    segments, side, k = [(hold(STILL), hold(STILL))], rng.choice([-1.0, 1.0]), 0
+    while left >= LONGEST_CYCLE:
         speed, rate, length = _cycle(rng, side, bool(k % 2), left)
-        found.append((speed, rate))
+        segments.append((speed, rate))
         left, side, k = round(left - length, 9), -side, k + 1
-    found.append((hold(STILL + left), hold(STILL + left)))
-    return found
+    segments.append((hold(STILL + left), hold(STILL + left)))
+    return segments
 
 
 def _cycle(rng: np.random.Generator, side: float, arc: bool,
@@ -42,11 +42,11 @@ def _cycle(rng: np.random.Generator, side: float, arc: bool,
     up, down, wait, pause = (round(float(rng.uniform(*r)), 1) for r in (
         (1.0, 1.5), (1.0, 1.5), (0.5, 2.0), (0.5, 2.0)))
     top, cruise = rng.uniform(0.2, 1.2), round(min(rng.uniform(2.0, 8.0), left - 15.0), 1)
-    bend = arc * rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 90))
+    arc_angle = arc * rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 90))
     angle = side * math.radians(rng.uniform(45, 200))
     spot = round(abs(angle) / rng.uniform(0.5, 1.2) + BLEND, 1)
     speed = ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND)
-    rate = hold(up) + turn(cruise, bend, BLEND) + hold(down)
+    rate = hold(up) + turn(cruise, arc_angle, BLEND) + hold(down)
     return (speed + hold(wait + spot + pause), rate + hold(wait) + turn(spot, angle, BLEND)
             + hold(pause), round(up + cruise + down + wait + spot + pause, 9))
 
@@ -62,14 +62,14 @@ class Route:
 
 def paper(duration: float, rng: np.random.Generator) -> Route:
     """Return the drive of the paper's section 3: 300 s still, 20 m/s for 520 s, 30 s still."""
-    cruise = _rest('paper', duration, 300 + 40 + 40 + 30)
+    cruise = _time_left('paper', duration, 300 + 40 + 40 + 30)
     pieces = (hold(300) + ramp(40, 20, 0.0) + hold(cruise) + ramp(40, -20, 0.0) + hold(30))
     return _route([(pieces, hold(duration))])
 
 
 def straight(duration: float, rng: np.random.Generator) -> Route:
     """Return one straight run: 60 s still, 25 s up to 12 m/s, cruise, 25 s down, 60 s still."""
-    cruise = _rest('straight', duration, 60 + 25 + 25 + 60)
+    cruise = _time_left('straight', duration, 60 + 25 + 25 + 60)
     pieces = hold(60) + ramp(25, 12) + hold(cruise) + ramp(25, -12) + hold(60)
     return _route([(pieces, hold(duration))])
 
@@ -77,7 +77,7 @@ def straight(duration: float, rng: np.random.Generator) -> Route:
 def out_and_back(duration: float, rng: np.random.Generator) -> Route:
     """Return a straight out, a stop of 30 s, a U turn at 4 m/s, the same straight back."""
     around = 5 + 2 + 14 + 2 + 10
-    cruise = _rest('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
+    cruise = _time_left('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
     out = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
     about = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
     back = hold(cruise) + ramp(15, -15) + hold(60)
@@ -95,20 +95,20 @@ def town(duration: float, rng: np.random.Generator) -> Route:
     first, so that the end is well away from the start.
     """
     enough = 135.0    # s, enough for any drawn cycle
-    left = _rest('town', duration, 20 + 15, enough=enough)
-    stretches, off = [(hold(20), hold(20))], 0.0
-    while left >= 90.0 or not stretches[1:]:
+    left = _time_left('town', duration, 20 + 15, enough=enough)
+    segments, off = [(hold(20), hold(20))], 0.0
+    while left >= 90.0 or not segments[1:]:
         speed, rate, off = _town_cycle(rng, off)
         length = round(sum(d for d, _ in speed), 9)
         if length > left:
             break
-        stretches.append((speed, rate))
+        segments.append((speed, rate))
         left -= length
-    if not stretches[1:]:
+    if not segments[1:]:
         raise BadUsage(f'scenario town: --duration {duration:g} s is too short for a stop-and-go '
                        f'cycle; give {enough:g} s or more')
-    stretches.append((hold(15 + left), hold(15 + left)))
-    return _route(stretches)
+    segments.append((hold(15 + left), hold(15 + left)))
+    return _route(segments)
 
 
 def motorway(duration: float, rng: np.random.Generator) -> Route:
@@ -122,33 +122,33 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
     ramp_top, fast = 12.0, rng.uniform(25, 36)
     slip_road = ramp(10, ramp_top) + hold(12)
     bend = turn(10, rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 60)), 2.0)
-    left = _rest('motorway', duration, 40 + 22 + up + down + 30)
-    stretches = [(hold(40), hold(40)),
-                 (slip_road + ramp(up, fast - ramp_top),
-                  hold(11) + bend + hold(1 + up))]
+    left = _time_left('motorway', duration, 40 + 22 + up + down + 30)
+    segments = [(hold(40), hold(40)),
+                (slip_road + ramp(up, fast - ramp_top),
+                 hold(11) + bend + hold(1 + up))]
     while left >= 60:
         length = _tenth(rng.uniform(15, 45))
         to = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
         angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(0.2, 1.2)) * (length - 6)
         change = _tenth(rng.uniform(8, 14))
-        stretches.append((ramp(change, to - fast) + hold(length - change),
-                          turn(length, angle, 6.0)))
+        segments.append((ramp(change, to - fast) + hold(length - change),
+                         turn(length, angle, 6.0)))
         fast, left = to, round(left - length, 9)
-    stretches.append((hold(left) + ramp(down, -fast) + hold(30), hold(left + down + 30)))
-    return _route(stretches)
+    segments.append((hold(left) + ramp(down, -fast) + hold(30), hold(left + down + 30)))
+    return _route(segments)
 
 
 def oval(duration: float, rng: np.random.Generator) -> Route:
     """Return laps of an oval, left turns only: half circles and straights at 12 to 20 m/s."""
     fast, straight = rng.uniform(12, 20), _tenth(rng.uniform(6, 12))
     bend = _tenth(math.pi * fast / 4.0 + 3.0)     # at 4 m/s^2 to the side, with flanks of 3 s
-    left = _rest('oval', duration, 40 + 12 + 12 + 20, least=math.ceil(2 * (straight + bend)))
+    left = _time_left('oval', duration, 40 + 12 + 12 + 20, least=math.ceil(2 * (straight + bend)))
     laps = int(left / (straight + bend))
     rest = round(left - laps * (straight + bend), 9)
-    stretches = [(hold(40) + ramp(12, fast), hold(52))]
-    stretches += [(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))] * laps
-    stretches.append((ramp(12, -fast) + hold(20 + rest), hold(32 + rest)))
-    return _route(stretches)
+    segments = [(hold(40) + ramp(12, fast), hold(52))]
+    segments += [(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))] * laps
+    segments.append((ramp(12, -fast) + hold(20 + rest), hold(32 + rest)))
+    return _route(segments)
 
 
 def yard(duration: float, rng: np.random.Generator) -> Route:
@@ -158,8 +158,8 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
     In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
     """
     longest = 40.0    # s, of a move with the stop after it
-    left = _rest('yard', duration, 20 + 15, least=longest)
-    stretches = [(hold(20), hold(20))]
+    left = _time_left('yard', duration, 20 + 15, least=longest)
+    segments = [(hold(20), hold(20))]
     while left >= longest:
         top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
         up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
@@ -168,17 +168,17 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
         turning = _tenth(abs(angle) / math.radians(rng.uniform(10, 40)) + 1.0)
         stop = _tenth(rng.uniform(3, 9))
         cruise = before + turning + after
-        stretches.append((ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
-                          hold(up + before) + turn(turning, angle, 0.5)
-                          + hold(after + down + stop)))
+        segments.append((ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
+                         hold(up + before) + turn(turning, angle, 0.5)
+                         + hold(after + down + stop)))
         left = round(left - up - cruise - down - stop, 9)
-    stretches.append((hold(15 + left), hold(15 + left)))
-    return _route(stretches)
+    segments.append((hold(15 + left), hold(15 + left)))
+    return _route(segments)
 
 
 def indoor(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves and turns on the spot of a small robot, 5 s still before and after."""
-    return _route(_robot_stretches(duration, rng))
+    return _route(_robot_segments(duration, rng))
 
 
 def square(duration: float, rng: np.random.Generator) -> Route:
@@ -187,7 +187,7 @@ def square(duration: float, rng: np.random.Generator) -> Route:
 
     10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
     """
-    rest = _rest('square', duration, 10 + 8 * 17, least=5.0)
+    rest = _time_left('square', duration, 10 + 8 * 17, least=5.0)
     # 4 m: a ramp of 1 s is as long as half a second at full speed
     speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND) + hold(8.0)
     sides = [(speed, hold(12.0) + turn(2.0, side * math.pi / 2, BLEND) + hold(3.0))
@@ -197,14 +197,14 @@ def square(duration: float, rng: np.random.Generator) -> Route:
 
 def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
-    parts = _robot_stretches(duration, rng, cycles=3)
+    parts = _robot_segments(duration, rng, cycles=3)
     still = [hold(sum(d for d, _ in speed)) for speed, _ in parts]
     aside = [k % 3 == 2 for k in range(len(parts))]
     route = _route([(rest if there else speed, rate) for (speed, rate), rest, there in zip(
         parts, still, aside, strict=True)])
     side = chain([piece for (speed, _), rest, there in zip(parts, still, aside, strict=True)
                   for piece in (speed if there else rest)])
-    return replace(route, side=_clean(side.integral()))
+    return replace(route, side=_without_rounding(side.integral()))
 
 
 def _town_cycle(rng: np.random.Generator, off: float) -> tuple[list[Piece], list[Piece], float]:
@@ -230,8 +230,8 @@ def _tenth(seconds: float) -> float:
     return round(float(seconds), 1)
 
 
-def _rest(name: str, duration: float, fixed: float, least: float = 10.0,
-          enough: float | None = None) -> float:
+def _time_left(name: str, duration: float, fixed: float, least: float = 10.0,
+               enough: float | None = None) -> float:
     """Return the time left besides the fixed parts, s; raise an error if it is too short."""
     if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
@@ -239,13 +239,13 @@ def _rest(name: str, duration: float, fixed: float, least: float = 10.0,
     return duration - fixed
 
 
-def _route(stretches: list[tuple[list[Piece], list[Piece]]]) -> Route:
-    acceleration = chain([p for speed, _ in stretches for p in speed])
-    yaw_rate = chain([p for _, rate in stretches for p in rate])
-    return Route(_clean(acceleration.integral()), yaw_rate)
+def _route(segments: list[tuple[list[Piece], list[Piece]]]) -> Route:
+    acceleration = chain([p for speed, _ in segments for p in speed])
+    yaw_rate = chain([p for _, rate in segments for p in rate])
+    return Route(_without_rounding(acceleration.integral()), yaw_rate)
 
 
-def _clean(speed: Profile) -> Profile:
+def _without_rounding(speed: Profile) -> Profile:
     """Return a speed without rounding errors: a stop is exactly 0 m/s."""
     powers = speed.powers.copy()
     powers[:, 0] = np.round(powers[:, 0], 11)

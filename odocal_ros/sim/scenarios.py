@@ -21,7 +21,7 @@ from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import make_rng, stamps
 from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
-from odocal_ros.sim.real_sensors import own_angles, velocity
+from odocal_ros.sim.real_sensors import mounting_angles, velocity
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -91,6 +91,7 @@ class Drive:
 
     @property
     def reference(self) -> Reference:
+        """Return the kind of the position reference."""
         return REFERENCES[self.options.reference]
 
     def leg(self) -> Leg:
@@ -116,24 +117,25 @@ class Drive:
 
 
 def motion_of(options: SimOptions) -> Motion:
+    """Return the motion of a drive with resolved options."""
     make = with_sideways_moves if options.drive in HOLONOMIC else ROUTES[options.scenario]
     route = make(options.duration, make_rng(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
     real = options.real
-    more: dict[str, Any] = {}
+    optional: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.road_lean(route.speed, route.yaw_rate, real)
             if real.cross_slope or real.banking or real.crossfall else None)
     if lean:
-        more['lean'] = lean
+        optional['lean'] = lean
     if route.side is not None:
-        more['sway'] = route.side, STEADY
+        optional['sway'] = route.side, STEADY
     elif options.sway or real.sideslip or lean:
-        more['sway'] = _sway(route, options, lean)
+        optional['sway'] = _sway(route, options, lean)
     if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:
-        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
-    return Motion(route.speed, route.yaw_rate, start, hills, **more)
+        optional['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
+    return Motion(route.speed, route.yaw_rate, start, hills, **optional)
 
 
 def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]:
@@ -157,17 +159,17 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
         v = body.lateral_velocity(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
-        side = _with(side, v)
+        side = _sum(side, v)
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
-        side, up = _with(side, rate * np.cos(phi)), _with(up, rate * np.sin(phi))
+        side, up = _sum(side, rate * np.cos(phi)), _sum(up, rate * np.sin(phi))
     return side, up
 
 
-def _with(sway: Profile, more: Floats) -> Profile:
-    """Return a velocity with another added, as cubics between its breaks."""
+def _sum(sway: Profile, velocity_at_breaks: Floats) -> Profile:
+    """Return the sum of a velocity and another at its breaks, cubic between them."""
     t = sway.breaks
-    added = hermite(t, more, np.gradient(more, t)).powers
+    added = hermite(t, velocity_at_breaks, np.gradient(velocity_at_breaks, t)).powers
     lacking = added.shape[1] - sway.powers.shape[1]
     return Profile(t, added + np.pad(sway.powers, ((0, 0), (0, lacking))))
 
@@ -217,5 +219,5 @@ def _angles(options: SimOptions) -> tuple[float, float, float, float]:
     if not (options.roll or gyro.any() or accel.any()):
         return (options.yaw, options.pitch) * 2
     # with a roll the angles are those of forward: docs/conventions.md
-    return own_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
-                      matrix_from_rpy(options.mounting_rpy), gyro, accel)
+    return mounting_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
+                           matrix_from_rpy(options.mounting_rpy), gyro, accel)

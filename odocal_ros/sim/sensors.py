@@ -38,7 +38,7 @@ from odocal_ros.sim.real import NONE3
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
-AT_REST = 1e-9           # m/s and rad/s, judgement
+MOTION_LIMIT = 1e-9      # m/s and rad/s, judgement
 
 
 def imu_rotation(options: SimOptions) -> Floats:
@@ -51,8 +51,8 @@ def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
     grade, real = SIM_GRADES[options.imu_grade], options.real
     gyro, accel = (
-        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if own is None
-        else np.array(own) for name, sigma, own in (
+        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if given is None
+        else np.array(given) for name, sigma, given in (
             ('gyro', grade.gyro_bias, real.gyro_bias),
             ('accelerometer', grade.accel_bias, real.accel_bias)))
     return gyro, accel
@@ -76,8 +76,9 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
     state = motion.at(t)
     C_vi = imu_rotation(options)
     w_v, f_v = body.imu_output(motion, state, options.imu_lever_arm)
-    w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
-                                    f_v @ C_vi * (1 + options.accel_scale_error), options.real)
+    w_i, f_i = real_sensors.with_triad_errors(
+        w_v @ C_vi * (1 + options.gyro_scale_error), f_v @ C_vi * (1 + options.accel_scale_error),
+        options.real)
     gyro, accel = imu_errors(options, len(t))
     gyro_drift, accel_drift = real_sensors.drifts(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
@@ -87,8 +88,8 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         variance = np.full(len(t), options.orientation_sigma**2)
     real = options.real
     if real.imu_latency or real.imu_jitter or real.imu_batch > 1:
-        ns = real_sensors.stamped(ns, make_rng(options.seed, 'real imu stamps'), real.imu_latency,
-                                  real.imu_jitter, real.imu_batch)
+        ns = real_sensors.delayed_stamps(ns, make_rng(options.seed, 'real imu stamps'),
+                                         real.imu_latency, real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
     return samples.ImuSamples(
         stamp, stamp + round(TRANSPORT_DELAY['imu'] * 1e9), w_i + gyro + gyro_drift,
@@ -130,45 +131,47 @@ def odometers(motion: Motion, options: SimOptions) -> list[samples.OdometerSampl
     """Return the samples of each wheel; pulses are whole counts, rounded down."""
     ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
-    stamp = options.start_ns + _late(ns, options, 'odometer')
+    stamp = options.start_ns + _delayed(ns, options, 'odometer')
     lean = motion.lean(t) if motion.lean else 0.0
     return [samples.OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
             for wheel in wheels.wheels_of(options)]
 
 
-def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
+def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
     """Return stamps that are late by a topic's delay and jitter, by a clock of its own."""
     delay, jitter, rate = (getattr(owner, f'{name}_{what}') for owner, what in (
         (options, 'delay'), (options.real, 'jitter'), (options.real, 'clock_rate')))
     ns = ns + np.rint(rate * ns).astype(np.int64)
     if not jitter:
-        late: Ints = ns + round(delay * 1e9)
-        return late
-    return real_sensors.stamped(ns, make_rng(options.seed, f'real {name} stamps'), delay, jitter)
+        delayed: Ints = ns + round(delay * 1e9)
+        return delayed
+    rng = make_rng(options.seed, f'real {name} stamps')
+    return real_sensors.delayed_stamps(ns, rng, delay, jitter)
 
 
 def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
              lean: Floats | float) -> Floats | Ints:
     arm, scale = wheel.arm, wheel.scale
-    real, spun = options.real, slip(state, options, wheel.draws)
+    real, slipped = options.real, slip(state, options, wheel.stream)
     grown = 1 + wheels.growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * make_rng(options.seed, 'speed').standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it
-        pulled = wheels.slip_share(state, real) * state.speed
-        rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
+        slip_speed = wheels.slip_share(state, real) * state.speed
+        rate = (contact_speed(state, arm, lean) + slip_speed
+                + np.gradient(slipped, state.t)) / grown
         sent = wheels.low_passed(rate + noise, state.t, real.speed_filter)
-        return wheels.coarse(sent / scale, real)
+        return wheels.quantized(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
             wheels.robot_path(state, options, wheel))
-    rolled = path + spun + wheels.tyre_slip(state, real)
+    rolled = path + slipped + wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + wheels.steered_path(state, arm)
     if np.ndim(grown):
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
     rolled = rolled / scale
-    phase = make_rng(options.seed, f'pulse phase {wheel.draws}').uniform()   # angle of the disc
+    phase = make_rng(options.seed, f'pulse phase {wheel.stream}').uniform()   # angle of the disc
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
@@ -176,22 +179,22 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
 
 def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     """Return the accumulated slip of a wheel at each time, m: (n,)."""
-    spun = np.zeros(len(state.t))
-    moving = (np.abs(state.speed) > AT_REST) | (np.abs(state.yaw_rate) > AT_REST)
+    length = np.zeros(len(state.t))
+    moving = (np.abs(state.speed) > MOTION_LIMIT) | (np.abs(state.yaw_rate) > MOTION_LIMIT)
     if options.drive in HOLONOMIC:
-        moving |= np.abs(state.sway[:, 0]) > AT_REST
+        moving |= np.abs(state.sway[:, 0]) > MOTION_LIMIT
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
         walk = make_rng(options.seed, f'slip walk {side}')
-        spun += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(spun)))
+        length += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(length)))
     if options.slip_events:     # each takes a second
         rng = make_rng(options.seed, f'slip events {side}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for at in rng.choice(state.t[moving], spins):
-            spun += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
+            length += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
     if options.start_slip:
-        spun += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
-    return spun
+        length += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
+    return length
 
 
 def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
@@ -201,24 +204,24 @@ def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
     since = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1
     if not len(starts):
         return np.zeros(len(moving))
-    fresh = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + 1e-6)    # s of rounding
-    return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * fresh)
+    counted = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + 1e-6)   # s, rounding
+    return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * counted)
 
 
 def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
-    latitude, longitude, height = real_sensors.places(motion, t, options)
+    latitude, longitude, height = real_sensors.positions(motion, t, options)
     error = fix_errors(t, options) + real_sensors.errors(t, options)
     error = error + reference_drift(t, motion.at(t).travel, options)
-    error = real_sensors.fused(t, error, options)
+    error = real_sensors.fused_errors(t, error, options)
     meridian, normal = radii(latitude)
     by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
     # from the first fix: metres per radian change along the path
-    off = np.stack([longitude - longitude[:1], latitude - latitude[:1]], -1)
-    place = np.column_stack([by_rad * off, height])
-    error = real_sensors.reckoned(t, error, place, options)
+    change = np.stack([longitude - longitude[:1], latitude - latitude[:1]], -1)
+    position = np.column_stack([by_rad * change, height])
+    error = real_sensors.tunnel_errors(t, error, position, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
     power = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
@@ -228,17 +231,17 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     if REFERENCES[options.reference].planar:
         variance[2] = 0.0
     n = len(t)
-    stamp = options.start_ns + _late(ns, options, 'fix')
+    stamp = options.start_ns + _delayed(ns, options, 'fix')
     sent = samples.FixSamples(
         stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), latitude, longitude,
         height + error[:, 2], np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
         np.full(n, 2 if options.fix_noise == 'rtk' else 0))
-    seen = np.ones(n, dtype=bool)
+    received = np.ones(n, dtype=bool)
     for begin, end in options.outages:
-        seen &= (t < begin) | (t >= end)
+        received &= (t < begin) | (t >= end)
     if real.drops:
-        seen &= make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
-    return samples.take(sent, seen)
+        received &= make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
+    return samples.take(sent, received)
 
 
 def _axes(options: SimOptions) -> Floats:
@@ -254,8 +257,8 @@ def fix_errors(t: Floats, options: SimOptions) -> Floats:
         draws = slow + WHITE_SHARE * draws
     errors = _axes(options) * draws
     rng = make_rng(options.seed, 'outliers')
-    far, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
-    reach = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (far < options.outliers)
-    errors[:, 0] += reach * np.cos(bearing)
-    errors[:, 1] += reach * np.sin(bearing)
+    share, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
+    distance = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (share < options.outliers)
+    errors[:, 0] += distance * np.cos(bearing)
+    errors[:, 1] += distance * np.sin(bearing)
     return errors

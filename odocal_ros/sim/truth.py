@@ -13,7 +13,7 @@ from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
 from odocal_ros.sim.wheels import effective_width, SIDEWAYS, wheels_of
 
-STANDS_FOR_PERFECT = 'navigation'   # the best grade in the settings
+BEST_GRADE = 'navigation'   # in the settings of a perfect IMU
 
 
 def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
@@ -75,12 +75,12 @@ def _robot(options: SimOptions) -> dict[str, Any]:
     if options.drive == DIFFERENTIAL:
         return {}
     width = effective_width(options)
-    found = {'track_width': width}
+    entries = {'track_width': width}
     if options.drive == MECANUM:
-        found |= {'lateral_scale_factor': SIDEWAYS * options.scale}
+        entries |= {'lateral_scale_factor': SIDEWAYS * options.scale}
     elif options.drive == SKID:
-        found |= {'track_width_arc': effective_width(options, 2 * width)}
-    return {'robot': found}
+        entries |= {'track_width_arc': effective_width(options, 2 * width)}
+    return {'robot': entries}
 
 
 def _plain(value: Any) -> Any:
@@ -111,7 +111,7 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
         odometer |= {'left': left, 'right': right, 'track_width': float(options.track_width)}
     groups = {
         'odometer': odometer,
-        'imu': {'grade': STANDS_FOR_PERFECT if grade == 'perfect' else grade,
+        'imu': {'grade': BEST_GRADE if grade == 'perfect' else grade,
                 'mounting_rpy': [float(x) for x in options.mounting_rpy],
                 'lever_arm': _configured_arm(options, 'imu')},
         'gnss': {'lever_arm': _configured_arm(options, 'antenna')},

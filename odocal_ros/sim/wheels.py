@@ -20,10 +20,10 @@ AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
          4: ('front', 'second', 'third', 'rear')}
 # of skid steering: effective over geometric track width in a turn on the spot and straight on.
 # Judgement: published centres of rotation are 1.3 to 2 times as far apart as the wheels
-SPOT, STRAIGHT = 1.7, 1.4
+SPOT_RATIO, STRAIGHT_RATIO = 1.7, 1.4
 SIDEWAYS = 0.95     # judgement: sideways motion over rolled path of mecanum wheels: rollers slip
-REST = 0.01          # physical: rolling resistance over load, of tyres on asphalt
-AIR = 1e-5           # judgement: air drag over load, per (m/s)^2
+ROLLING_RESISTANCE = 0.01    # physical: rolling resistance over load, of tyres on asphalt
+AIR_DRAG = 1e-5              # judgement: air drag over load, per (m/s)^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class SimWheel:
     """A wheel."""
 
     name: str         # joint
-    draws: str        # name of its random numbers
+    stream: str       # name of its random numbers
     arm: Floats       # (3,) m, contact point in base_link
     scale: float      # true scale factor
     steered: bool = False    # it is turned to its rolling direction (Ackermann)
@@ -56,17 +56,17 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
     if n == len(SIDES):
         ratio = 1 + options.wheel_difference        # right over left
         left = options.scale * (1 + 1 / ratio) / 2
-        return [SimWheel(f'{side}_wheel_joint', draws, middle + arm, scale)
-                for side, draws, arm, scale in zip(SIDES, 'LR', (half, -half),
-                                                   (left, left * ratio), strict=True)]
-    places = [(f'{axle}_{side}', axle, arm) for axle in AXLES[n // 2]
-              for side, arm in zip(SIDES, (half, -half), strict=True)]
-    places += [('front', 'front', 0 * half)] * (n % 2)
+        return [SimWheel(f'{side}_wheel_joint', stream, middle + arm, scale)
+                for side, stream, arm, scale in zip(SIDES, 'LR', (half, -half),
+                                                    (left, left * ratio), strict=True)]
+    positions = [(f'{axle}_{side}', axle, arm) for axle in AXLES[n // 2]
+                 for side, arm in zip(SIDES, (half, -half), strict=True)]
+    positions += [('front', 'front', 0 * half)] * (n % 2)
     front = np.array([options.wheelbase, 0.0, 0.0])
-    steered = np.array([axle == 'front' and options.front_steers for _, axle, _ in places])
+    steered = np.array([axle == 'front' and options.front_steers for _, axle, _ in positions])
     return [SimWheel(name, name, middle + arm + front * (axle == 'front'), scale, steers)
             for (name, axle, arm), scale, steers in zip(
-                places, _scales(options, ~steered), steered.tolist(), strict=True)]
+                positions, _scales(options, ~steered), steered.tolist(), strict=True)]
 
 
 def _scales(options: SimOptions, counted: Bools) -> list[float]:
@@ -81,8 +81,8 @@ def steered_path(state: State, arm: Floats) -> Floats:
     """Return the path length of a steered wheel minus that of a fixed one at its side: (n,)."""
     x, y, z = arm
     along = contact_speed(state, (0.0, y, z))
-    more = np.copysign(np.hypot(along, x * turn_rate(state)) - np.abs(along), along)
-    return running_integral(state.t, more)
+    additional = np.copysign(np.hypot(along, x * turn_rate(state)) - np.abs(along), along)
+    return running_integral(state.t, additional)
 
 
 def effective_width(options: SimOptions, radius: float = 0.0) -> float:
@@ -96,7 +96,7 @@ def effective_width(options: SimOptions, radius: float = 0.0) -> float:
 
 def _widening(radius: Floats, width: float) -> Floats:
     """Return the ratio of effective to geometric track width of skid steering, by turn radii."""
-    return SPOT + (STRAIGHT - SPOT) * radius / (radius + width)
+    return SPOT_RATIO + (STRAIGHT_RATIO - SPOT_RATIO) * radius / (radius + width)
 
 
 def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
@@ -135,7 +135,8 @@ def slip_share(state: State, real: Real) -> Floats:
     """Return the slip per metre of path under traction and braking: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
     # force over load; a slope adds to it
-    force = forward * (state.acceleration / G + state.slope) + REST + AIR * state.speed**2
+    force = (forward * (state.acceleration / G + state.slope) + ROLLING_RESISTANCE
+             + AIR_DRAG * state.speed**2)
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
     share: Floats = real.tyre_slip * (pull + np.minimum(force, 0.0))
@@ -147,14 +148,14 @@ def tyre_slip(state: State, real: Real) -> Floats:
     return np.cumsum(slip_share(state, real) * np.diff(state.travel, prepend=state.travel[:1]))
 
 
-def leg_factor(state: State, real: Real, spun: Floats) -> float:
+def leg_factor(state: State, real: Real, slipped: Floats) -> float:
     """Return the true path over that of the count with a cold wheel; spun: slip at starts, m."""
-    if not (real.speed_law or real.warming or real.tyre_slip or spun.any()):
+    if not (real.speed_law or real.warming or real.tyre_slip or slipped.any()):
         return 1.0
     path_length = np.diff(state.travel)
-    spun = np.diff(spun + tyre_slip(state, real) if real.tyre_slip else spun)
+    slipped = np.diff(slipped + tyre_slip(state, real) if real.tyre_slip else slipped)
     grown = growth(state, real) + np.zeros_like(state.t)
-    counted = (path_length + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
+    counted = (path_length + slipped) / (1 + (grown[1:] + grown[:-1]) / 2)
     return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
@@ -168,7 +169,7 @@ def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
     return np.array(out)
 
 
-def coarse(speed: Floats, real: Real) -> Floats:
+def quantized(speed: Floats, real: Real) -> Floats:
     """Return the published speeds: in steps, 0 below the dead band, or held."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step
@@ -176,10 +177,10 @@ def coarse(speed: Floats, real: Real) -> Floats:
         speed = np.sign(speed) * steps * real.speed_step
     if real.dead_band:
         speed = np.where(np.abs(speed) < real.dead_band, 0.0, speed)
-    return held(speed, real.speed_hold) if real.speed_hold else speed
+    return with_least_change(speed, real.speed_hold) if real.speed_hold else speed
 
 
-def held(speed: Floats, step: float) -> Floats:
+def with_least_change(speed: Floats, step: float) -> Floats:
     """Return speeds, each held until the next is 0 or differs by a step."""
     out = speed.tolist()
     for k, now in enumerate(out[1:], 1):

@@ -17,7 +17,7 @@ from odocal_ros.nav.coarse_speed import (
 from odocal_ros.nav.odometer import make_travel
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.wheels import coarse, held
+from odocal_ros.sim.wheels import quantized, with_least_change
 
 KMH = 1 / 3.6
 T = np.arange(0.0, 600.0, 0.1)
@@ -172,7 +172,7 @@ def town(t):
 
 @pytest.mark.parametrize('scale', [1.0, 37.0])
 def test_a_held_speed_is_known_by_its_step(scale):
-    found = find_held_speed(AT, scale * held(town(AT), STEP))
+    found = find_held_speed(AT, scale * with_least_change(town(AT), STEP))
     # the least change of many is a step and what the speed gains in a row at its slowest
     assert STEP <= found.step / scale < 1.05 * STEP
     assert not found.truncation
@@ -180,7 +180,7 @@ def test_a_held_speed_is_known_by_its_step(scale):
 
 @pytest.mark.parametrize('value', [
     town(AT), town(AT) + 0.01 * np.random.default_rng(1).standard_normal(len(AT)),
-    np.repeat(town(AT[::5]), 5), coarse(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
+    np.repeat(town(AT[::5]), 5), quantized(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
     np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
 def test_other_speeds_are_not_taken_for_held(value):
     path = make_travel(AT, value, RATE)[0]
@@ -189,7 +189,7 @@ def test_other_speeds_are_not_taken_for_held(value):
 
 def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
     true = town(AT)
-    found = find_held_speed(AT, held(true, STEP))
+    found = find_held_speed(AT, with_least_change(true, STEP))
     assert_allclose(found.instants.value, np.interp(found.instants.t, AT, true), atol=1e-9)
     off = np.abs(found.value - true)[true > 0]
     # a row beyond it where the vehicle turns about within a step
@@ -199,15 +199,16 @@ def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
 
 def test_the_path_has_no_more_than_the_error_of_its_cruises():
     true = town(AT)
-    middle = make_travel(AT, held(true, STEP), RATE)[0].s[-1]
-    whole, sent = (((x[1:] + x[:-1]) / 2 * np.diff(AT)).sum() for x in (true, held(true, STEP)))
+    held = with_least_change(true, STEP)
+    middle = make_travel(AT, held, RATE)[0].s[-1]
+    whole, sent = (((x[1:] + x[:-1]) / 2 * np.diff(AT)).sum() for x in (true, held))
     # four cruises of 20 s, each uniform within a step: 3 sigmas
     assert abs(middle - whole) < 3 * np.sqrt(4) * 20 * STEP / np.sqrt(12)
     assert abs(middle - whole) < abs(sent - whole)
 
 
 def test_reversed_counts_are_held_on_the_other_side():
-    value = held(town(AT), STEP)
+    value = with_least_change(town(AT), STEP)
     path, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
                                                               reversed_counts=True)[0]
     assert_allclose(back.s, path.s)

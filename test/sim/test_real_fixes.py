@@ -24,7 +24,7 @@ TAU = 0.8
 def north(drive, times):
     """Return how far north of the start a receiver without noise tells the antenna, m."""
     options = resolved(drive)
-    latitude, _, _ = real_sensors.places(motion_of(options), np.asarray(times), options)
+    latitude, _, _ = real_sensors.positions(motion_of(options), np.asarray(times), options)
     return (latitude - options.latitude) * 6.36e6
 
 
@@ -49,11 +49,11 @@ def test_a_receiver_that_filters_is_behind_by_its_closed_form(receiver, behind, 
 def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
     t, options = np.arange(0.0, 4000.0), replace(PAPER, real=Real(receiver_odometer=0.01))
     white = np.random.default_rng(1).standard_normal((len(t), 3))
-    left = real_sensors.fused(t, white, options)
+    left = real_sensors.fused_errors(t, white, options)
     a = np.exp(-1 / 20)
     # 4000 / 40 independent draws an axis
     assert left[200:].var() == pytest.approx((1 - a) / (1 + a), rel=5 * np.sqrt(2 / 300))
-    assert real_sensors.fused(t, white, PAPER) is white
+    assert real_sensors.fused_errors(t, white, PAPER) is white
 
 
 def test_slow_errors_have_their_size_and_the_covariance_knows():
@@ -87,7 +87,7 @@ def test_the_antenna_leans_with_the_body():
     options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
                                   real=Real(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
-    leaning = real_sensors.places(motion, t, options)
+    leaning = real_sensors.positions(motion, t, options)
     stiff = point(motion.at(t), options.antenna_lever_arm)
     aside = np.hypot(leaning[0] - stiff[0],
                      (leaning[1] - stiff[1]) * np.cos(options.latitude)) * 6.37e6

@@ -30,9 +30,9 @@ def test_the_imu_reads_by_its_model():
     rng = make_rng(1, 'test')
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
-    w_m, f_m = real_sensors.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
-                                               accel_matrix=tuple(accel.ravel()),
-                                               g_sensitivity=tuple(G.ravel())))
+    w_m, f_m = real_sensors.with_triad_errors(w, f, Real(
+        gyro_matrix=tuple(gyro.ravel()), accel_matrix=tuple(accel.ravel()),
+        g_sensitivity=tuple(G.ravel())))
     for k in range(7):
         assert_allclose(w_m[k], (np.eye(3) + gyro) @ w[k] + G @ f[k], atol=1e-15)
         assert_allclose(f_m[k], (np.eye(3) + accel) @ f[k], atol=1e-15)
@@ -91,14 +91,14 @@ def test_a_bias_steps_once_by_its_size():
 
 def test_stamps_are_late_in_order_and_in_batches():
     ns = np.arange(MANY) * 10_000_000
-    late = (real_sensors.stamped(ns, make_rng(3, 'test'), 0.02, 0.003) - ns) * 1e-9
+    late = (real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.02, 0.003) - ns) * 1e-9
     # stamps so far apart seldom cross: mean within 5 sigma, spread as said
     assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
     assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
-    wild = real_sensors.stamped(ns, make_rng(3, 'test'), 0.02, 0.02)
+    wild = real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.02, 0.02)
     assert (np.diff(wild) >= real_sensors.LEAST_GAP_NS).all()
     assert (wild >= ns).all()
-    batch = real_sensors.stamped(ns, make_rng(3, 'test'), 0.002, 0.0, 4)
+    batch = real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.002, 0.0, 4)
     assert set(np.diff(batch).tolist()) == {real_sensors.LEAST_GAP_NS,
                                             40_000_000 - 3 * real_sensors.LEAST_GAP_NS}
     assert (batch[:4] - ns[3] >= 2_000_000).all()

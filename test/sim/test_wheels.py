@@ -16,7 +16,7 @@ from odocal_ros.sim import wheels
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import motion_of, simulate
-from odocal_ros.sim.wheels import effective_width, robot_path, SIDEWAYS, SPOT, STRAIGHT, wheels_of
+from odocal_ros.sim.wheels import effective_width, robot_path, SIDEWAYS, SPOT_RATIO, STRAIGHT_RATIO, wheels_of
 
 pytestmark = pytest.mark.core
 
@@ -38,11 +38,11 @@ def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
     spot = (state.speed == 0.0) & (state.yaw_rate != 0.0)
     apart = np.diff(rolled['right_wheel_joint'] - rolled['left_wheel_joint'])
     turns = np.diff(state.turned)
-    assert effective_width(made.options) == pytest.approx(SPOT * 0.3)
-    assert_allclose(apart[spot[:-1] & spot[1:]], SPOT * 0.3 * turns[spot[:-1] & spot[1:]],
+    assert effective_width(made.options) == pytest.approx(SPOT_RATIO * 0.3)
+    assert_allclose(apart[spot[:-1] & spot[1:]], SPOT_RATIO * 0.3 * turns[spot[:-1] & spot[1:]],
                     rtol=1e-9, atol=1e-12)
     wide = effective_width(made.options, 1e9)
-    assert wide == pytest.approx(STRAIGHT * 0.3)
+    assert wide == pytest.approx(STRAIGHT_RATIO * 0.3)
 
 
 def test_mecanum_wheels_obey_their_kinematics():
@@ -186,9 +186,9 @@ def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
 def test_speeds_are_sent_in_steps_the_same_to_and_fro():
     v = np.array([0.0, 0.2, 0.3, 0.99, -0.99, 1.6])
     floor, near = (Real(speed_step=0.5, speed_rounding=r) for r in ('floor', 'round'))
-    assert_allclose(wheels.coarse(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
-    assert_allclose(wheels.coarse(v, near), [0, 0, 0.5, 1.0, -1.0, 1.5])
-    assert_allclose(wheels.coarse(v, Real(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
+    assert_allclose(wheels.quantized(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
+    assert_allclose(wheels.quantized(v, near), [0, 0, 0.5, 1.0, -1.0, 1.5])
+    assert_allclose(wheels.quantized(v, Real(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
 
 
 def test_a_filtered_speed_lags_a_ramp_by_its_time_constant():
