@@ -155,11 +155,7 @@ class RowTimes:
         self._before = (0, 0.0, 1.0)    # row, time, interval before the assumed lost rows
 
     def next_time(self, t: float, travel: float, speed: float, quantum: float) -> float:
-        """
-        Return the time of the next row, s.
-
-        t : s, arrival.   travel : m, up to the row.   speed : m/s, before it.   quantum : m.
-        """
+        """Return the time of the next row, s; t: arrival, s; travel: m, up to it; quantum: m."""
         expected = max(abs(speed) * self._interval, self._step) if speed else 0.0
         step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
         is_reliable = expected > max(RELIABLE_COUNTS * quantum, RELIABLE_SPEED * self._interval)

@@ -19,14 +19,8 @@ from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
+from odocal_ros.data import samples
 from odocal_ros.data.leg import COUNTER
-from odocal_ros.data.samples import (
-    ImuSamples,
-    OdometerForm,
-    OdometerSamples,
-    Reading,
-    readings_of,
-)
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.settings.nominal import grade_of
@@ -92,13 +86,14 @@ class Odometry:
         self._arrivals: dict[str, StampScreen] = {}
         self._path: Reckoning | None = None
 
-    def feed(self, slot: str, block: ImuSamples | OdometerSamples | list[Reading],
-             form: OdometerForm | None = None) -> None:
+    def feed(self, slot: str,
+             block: samples.ImuSamples | samples.OdometerSamples | list[samples.Reading],
+             form: samples.OdometerForm | None = None) -> None:
         """Add rows of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
         if slot not in self._arrivals:
             self._arrivals[slot] = StampScreen()
         arrivals = self._arrivals[slot]
-        rows = block if isinstance(block, list) else readings_of(block)
+        rows = block if isinstance(block, list) else samples.readings_of(block)
         usable = arrivals.select_usable(rows)
         if arrivals.clock_jumped:
             self.restart(f'the {slot} stamps jump by {arrivals.excess_s:+.3g} s')
@@ -107,7 +102,7 @@ class Odometry:
             usable = arrivals.select_usable(rows)
         if arrivals.dropped:
             self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
-                              f'from their arrival times by {arrivals.excess_s:+.3g} s')
+                               f'from their arrival times by {arrivals.excess_s:+.3g} s')
         if slot == 'imu':
             self.imu.feed(usable)
         else:

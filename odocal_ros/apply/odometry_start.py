@@ -29,11 +29,7 @@ BRAKING_SIGMA = 2.0        # m/s^2; physical: mean acceleration over START_SPAN
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """
-    Attitude and gyro bias at a row of the IMU.
-
-    earth_n : (3,) rad/s, Earth rate removed from the turn rates; zero if the bias contains it.
-    """
+    """Attitude and gyro bias at an IMU row; earth_n: (3,) rad/s, zero if the bias contains it."""
 
     row: int
     q_nb: Floats
@@ -61,17 +57,12 @@ def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyCo
         return None
     is_resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
-    tilt_rate_b = _tilt_rate_b(w.mean(axis=0), f.mean(axis=0))
+    w_mean, up = w.mean(axis=0), f.mean(axis=0) / np.linalg.norm(f.mean(axis=0))
+    tilt_rate_b = w_mean - up * (w_mean @ up)      # NaN without force: not tested
     if not is_resting and np.linalg.norm(tilt_rate_b) > MOST_TILT_RATE:
         imu.drop(end)       # implausible gyro data: start later
         return None
     return _start_by_gravity(end, float(t[-1] - t[0]), w, f, is_resting, vehicle, grade)
-
-
-def _tilt_rate_b(w: Floats, f: Floats) -> Floats:
-    """Return the horizontal part of a mean turn rate, (3,) rad/s; zero without force."""
-    up = f / np.linalg.norm(f)
-    return w - up * (w @ up) if np.isfinite(up).all() else np.zeros(3)
 
 
 def _start_from_settings(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:

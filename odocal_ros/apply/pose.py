@@ -24,11 +24,7 @@ NONE = (0.0,) * 6      # definition
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """
-    Pose of the vehicle, and mean motion since the previous pose.
-
-    stamp_ns : of the IMU.   raw : 85 floats of a nav_msgs/Odometry in order, as in a message.
-    """
+    """Pose at an IMU stamp, mean motion since the last; raw: 85 floats of nav_msgs/Odometry."""
 
     stamp_ns: int
     raw: bytes

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 The IMU rows of a stream that dead reckoning still needs, without spikes and isolated outliers.
@@ -19,18 +18,7 @@ from typing import NamedTuple
 from odocal_ros.apply.attitude import rotate_vector, Vector, ZERO
 from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.screening.glitches import (
-    EQUAL_NEIGHBOURS,
-    FORCE_STEP,
-    GLITCH_TIME,
-    NEIGHBOUR_ROWS,
-    RETURN_SHARE,
-    SINGLE_FORCE,
-    SINGLE_TIMES,
-    SINGLE_TURN,
-    TURN_STEP,
-    USUAL_STEPS,
-)
+from odocal_ros.screening import glitches
 from odocal_ros.settings.node_configs import ApplyConfig
 
 INTERVAL_ROWS = 64      # judgement: rows of the median interval
@@ -42,8 +30,8 @@ FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are fro
 TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
 IMPLAUSIBLE_TIME = 1.0    # s; judgement: a longer turn after a step is real
 ISOLATED_CHANGE = 2.5     # rad/s^2; judgement: least isolated step; turns start more slowly
-SINGLE_LIMITS = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
-SINGLE_ROWS = NEIGHBOUR_ROWS + 4      # definition: rows that ``is_single`` uses
+SINGLE_LIMITS = (glitches.SINGLE_TURN,) * 3 + (glitches.SINGLE_FORCE,) * 3
+SINGLE_ROWS = glitches.NEIGHBOUR_ROWS + 4      # definition: rows that ``is_single`` uses
 
 
 class Row(NamedTuple):
@@ -87,7 +75,7 @@ class SpikeScreen:
     def __init__(self) -> None:
         self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
         self._equal_since = 0.0             # s, begin of equal rows
-        self._kept: deque[Row] = deque(maxlen=NEIGHBOUR_ROWS + 1)
+        self._kept: deque[Row] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
         self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none
         self._before = ZERO                 # rad/s, rate before the step
@@ -101,7 +89,7 @@ class SpikeScreen:
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
             spike_rows = None      # after this one, until the values are back
             if any(self._exceeds_usual(step)) and not self._is_over(row):
-                within = bisect_right(rows, last.t + GLITCH_TIME, key=time_of)
+                within = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=time_of)
                 spike_rows = self._rows_until_return(last, rows[k + 1:within], step)
                 if spike_rows is None and within == len(rows):
                     break              # wait for later rows
@@ -121,20 +109,20 @@ class SpikeScreen:
     def _isolated_axes(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """Return a mask of gyro axes with an isolated step; a turn starts over several rows."""
         kept = self._kept
-        if self._dropped or len(kept) <= NEIGHBOUR_ROWS or (
-                _largest(kept[-1].w_b, rows[0].w_b) <= SINGLE_TURN):
+        if self._dropped or len(kept) <= glitches.NEIGHBOUR_ROWS or (
+                _largest(kept[-1].w_b, rows[0].w_b) <= glitches.SINGLE_TURN):
             return ()
         steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
                  for one, other in pairwise((*kept, *rows))]
-        current_step = steps.pop(NEIGHBOUR_ROWS)
-        least = max(SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
-        return tuple(size > max(least, SINGLE_TIMES * max(other_steps))
+        current_step = steps.pop(glitches.NEIGHBOUR_ROWS)
+        least = max(glitches.SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
+        return tuple(size > max(least, glitches.SINGLE_TIMES * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
     def _is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
         return self._step_size is not ZERO and (row.t > self._until or all(
-            abs(w - before) <= RETURN_SHARE * size for w, before, size in zip(
+            abs(w - before) <= glitches.RETURN_SHARE * size for w, before, size in zip(
                 row.w_b, self._before, self._step_size, strict=True) if size))
 
     def _implausible_part(self, last: Row, row: Row, isolated: Sequence[bool]) -> Vector:
@@ -142,7 +130,8 @@ class SpikeScreen:
         if self._is_over(row):
             self._step_size = ZERO
         elif self._step_size is ZERO:
-            limit = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
+            limit = max(TURN_CHANGE * (row.t - last.t),
+                        glitches.USUAL_STEPS * glitches.TURN_STEP * self._usual[0])
             if any(isolated) or _largest(last.w_b, row.w_b) > limit:
                 steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
                 x, y, z = (size if is_isolated or size > limit else 0.0
@@ -154,22 +143,23 @@ class SpikeScreen:
     def _exceeds_usual(self, step: Pair) -> tuple[bool, bool]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
-        return (turn > max(1.0, USUAL_STEPS * usual_turn),
-                force > max(1.0, USUAL_STEPS * usual_force))
+        return (turn > max(1.0, glitches.USUAL_STEPS * usual_turn),
+                force > max(1.0, glitches.USUAL_STEPS * usual_force))
 
     def _update_usual_step(self, step: Pair) -> None:
         """Update the mean step; a single spike has little effect."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         self._usual = (
-            usual_turn + (min(turn, 4 * usual_turn + 1 / USUAL_STEPS) - usual_turn) / USUAL_ROWS,
-            usual_force + (min(force, 4 * usual_force + 1 / USUAL_STEPS) - usual_force)
+            usual_turn + (min(turn, 4 * usual_turn + 1 / glitches.USUAL_STEPS) - usual_turn)
+            / USUAL_ROWS,
+            usual_force + (min(force, 4 * usual_force + 1 / glitches.USUAL_STEPS) - usual_force)
             / USUAL_ROWS)
 
     def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
         """Return the number of rows until the values are back after a step, None if never."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
-            if all(remaining <= RETURN_SHARE * size for remaining, size, is_large in zip(
+            if all(remaining <= glitches.RETURN_SHARE * size for remaining, size, is_large in zip(
                     _step(last, row), step, exceeds, strict=True) if is_large):
                 return k
         return None
@@ -183,8 +173,8 @@ def _largest(a: Vector, b: Vector) -> float:
 
 def _step(last: Row, row: Row) -> Pair:
     """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
-    force = _largest(last.f_b, row.f_b) / FORCE_STEP
-    return _largest(last.w_b, row.w_b) / TURN_STEP, force if force == force else 0.0
+    force = _largest(last.f_b, row.f_b) / glitches.FORCE_STEP
+    return _largest(last.w_b, row.w_b) / glitches.TURN_STEP, force if force == force else 0.0
 
 
 def is_single(rows: Sequence[Row]) -> bool:
@@ -196,16 +186,16 @@ def is_single(rows: Sequence[Row]) -> bool:
     if len(rows) < SINGLE_ROWS:
         return False
     before, row, after = rows[-3:]
-    least_share = 1 - EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
-    if not (_largest(before.w_b, row.w_b) > least_share * SINGLE_TURN
-            or _largest(before.f_b, row.f_b) > least_share * SINGLE_FORCE):
+    least_share = 1 - glitches.EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
+    if not (_largest(before.w_b, row.w_b) > least_share * glitches.SINGLE_TURN
+            or _largest(before.f_b, row.f_b) > least_share * glitches.SINGLE_FORCE):
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
     for k, (a, b, c, least) in enumerate(zip(*values, SINGLE_LIMITS, strict=True)):
         deviation = abs(b - (a + c) / 2)
-        if deviation > least and abs(c - a) < EQUAL_NEIGHBOURS * deviation:
+        if deviation > least and abs(c - a) < glitches.EQUAL_NEIGHBOURS * deviation:
             x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
-            if all(deviation > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
+            if all(deviation > glitches.SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
                    for i in range(1, len(x) - 1)):
                 return True
     return False
@@ -244,8 +234,7 @@ class ImuStream:
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._note_dropped(held_count + len(readings) - len(rows),
-                           'hold NaN or impossible values')
+        self._note_dropped(held_count + len(readings) - len(rows), 'hold NaN or impossible values')
         kept, self._held = self._screen.screen(rows)
         self._note_dropped(len(rows) - len(kept) - len(self._held),
                            'jump and return, or repeat one value')

@@ -40,11 +40,7 @@ MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, median intervals; judgement: least g
 
 
 class Wheel:
-    """
-    Travel of a wheel, m, at the times of its rows.
-
-    scale : m per unit.   ``notes`` collects texts on faults.
-    """
+    """Travel of a wheel, m, at its rows' times; scale: m per unit; notes: texts on faults."""
 
     def __init__(self, form: OdometerForm, scale: float, reversed_counts: bool = False) -> None:
         self.form = form

@@ -33,11 +33,7 @@ CHANGE_RATIO = 1.2
 
 
 class Wheels:
-    """
-    Travel of the vehicle, m: of its only wheel, or the mean of two.
-
-    Two wheels have different scales if the calibration has both.
-    """
+    """Travel of the vehicle, m: of its only wheel, or the mean of two, each with its scale."""
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig, notes: list[str]) -> None:
         self._vehicle, self._notes = vehicle, notes

@@ -27,17 +27,9 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.errors import BadBag, BadUsage, OdocalError
+from odocal_ros.fleet import rows
 from odocal_ros.fleet.bags import bag_fingerprint, file_system, FleetBag, is_local, local_copy
 from odocal_ros.fleet.engine import task_results
-from odocal_ros.fleet.rows import (
-    changed_settings,
-    FAILED,
-    key_of,
-    Row,
-    RowStore,
-    settings_key,
-    text_of_legs,
-)
 from odocal_ros.safe_io.text_formats import error_text
 
 # texts of other errors caused by a lack of memory: for the stack of a thread, or for a library
@@ -61,17 +53,17 @@ class BagJob:
     @property
     def failed_key(self) -> str:
         """Return the key of the row of a failed bag, whose content is unknown."""
-        return key_of('failed', self.bag.bag, self.settings)
+        return rows.key_of('failed', self.bag.bag, self.settings)
 
-    def row(self, **fields: Any) -> Row:
+    def row(self, **fields: Any) -> rows.Row:
         """Return the row of the bag with more fields."""
-        return Row(bag=self.bag.bag, vehicle=self.bag.vehicle, model=self.bag.model,
-                   odometer_km=self.bag.odometer_km, **fields)
+        return rows.Row(bag=self.bag.bag, vehicle=self.bag.vehicle, model=self.bag.model,
+                        odometer_km=self.bag.odometer_km, **fields)
 
-    def failed_row(self, reason: str, **fields: Any) -> Row:
+    def failed_row(self, reason: str, **fields: Any) -> rows.Row:
         """Return the row of the bag if it cannot be calibrated."""
         longest = 500    # characters of a reason
-        return self.row(key=self.failed_key, status=FAILED, reason=reason[:longest], **fields)
+        return self.row(key=self.failed_key, status=rows.FAILED, reason=reason[:longest], **fields)
 
 
 @dataclass(frozen=True)
@@ -85,7 +77,7 @@ class BagOutcome:
 
 def calibrate_bag(job: BagJob) -> BagOutcome:
     """Ensure that the data set has the row of a bag; compute it if it is missing."""
-    store, started_s = RowStore(job.folder), time.monotonic()
+    store, started_s = rows.RowStore(job.folder), time.monotonic()
     fingerprint = ''
     _load_libraries()
     with _resource_limits(job, lambda cause: store.put(job.failed_row(cause, seen=fingerprint))):
@@ -108,16 +100,12 @@ def calibrate_bag(job: BagJob) -> BagOutcome:
     # outside the memory limit: the row needs memory
     row = job.failed_row(cause, seen=fingerprint, seconds=time.monotonic() - started_s)
     store.put(row)
-    return BagOutcome(row.key, FAILED, True)
+    return BagOutcome(row.key, rows.FAILED, True)
 
 
 @cache
 def _load_libraries() -> None:
-    """
-    Load the libraries of a calibration before its memory is limited.
-
-    OpenBLAS maps a buffer when it is loaded or first used, and retries endlessly if it is refused.
-    """
+    """Load libraries before memory is limited: OpenBLAS retries endlessly if it is refused."""
     for name in ('odocal_ros.estimator', 'odocal_ros.library.calibrate_bag'):
         import_module(name)
     from scipy.linalg import cho_factor
@@ -125,7 +113,7 @@ def _load_libraries() -> None:
     cho_factor(matrix @ matrix)
 
 
-def _existing_row(store: RowStore, job: BagJob, fingerprint: str) -> Row | None:
+def _existing_row(store: rows.RowStore, job: BagJob, fingerprint: str) -> rows.Row | None:
     """Return the existing row of an unchanged bag, None without one."""
     if key := store.known(fingerprint):
         return store.get(key)
@@ -136,8 +124,8 @@ def _existing_row(store: RowStore, job: BagJob, fingerprint: str) -> Row | None:
     return None
 
 
-def _compute_row(job: BagJob, store: RowStore, fingerprint: str,
-                 started_s: float) -> tuple[Row, bool]:
+def _compute_row(job: BagJob, store: rows.RowStore, fingerprint: str,
+                 started_s: float) -> tuple[rows.Row, bool]:
     """Return the row of a bag, and whether it was computed; False: copied from an equal bag."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrate
@@ -146,7 +134,7 @@ def _compute_row(job: BagJob, store: RowStore, fingerprint: str,
         with open_bag(path) as bag:
             sha256 = bag_sha256(bag)
             size = sum(Path(file).stat().st_size for file in bag.files)
-        key = key_of(sha256, job.settings)
+        key = rows.key_of(sha256, job.settings)
         if (equal := store.get(key)) is not None:
             return replace(equal, bag=job.bag.bag, seen=fingerprint), False
         calibration = calibrate(path, job.topics, job.config, job.legs)
@@ -154,10 +142,10 @@ def _compute_row(job: BagJob, store: RowStore, fingerprint: str,
     return job.row(
         key=key, seen=fingerprint, sha256=sha256,
         topics=json.dumps(calibration.inputs[0]['topics']),
-        settings=json.dumps(changed_settings(calibration.config), sort_keys=True), bytes=size,
+        settings=json.dumps(rows.changed_settings(calibration.config), sort_keys=True), bytes=size,
         seconds=time.monotonic() - started_s, driven_s=sum(leg.duration for leg in legs),
         start_ns=min((leg.start_ns for leg in legs), default=0),
-        legs=text_of_legs(list(legs))), True
+        legs=rows.text_of_legs(list(legs))), True
 
 
 def _worker() -> Any:
@@ -228,7 +216,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     from odocal_ros.offline.replay import config_from_arguments, topics_from_arguments
     settings_of_file: dict[str, dict[str, Any]] = {}
     jobs, topics = [], topics_from_arguments(args)
-    base = changed_settings(config_of(config))
+    base = rows.changed_settings(config_of(config))
     for bag in bags:
         file = bag.config or args.config or ''
         if file not in settings_of_file:
@@ -237,7 +225,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
         settings = base | settings_of_file[file] | {'vehicle': bag.vehicle}
         legs = bag.legs or tuple(args.leg)
         legs_of(legs)
-        key = settings_key(config_of(settings), topics, legs)
+        key = rows.settings_key(config_of(settings), topics, legs)
         if is_local(bag.bag):      # valid for workers in any folder
             bag = replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
         jobs.append(BagJob(bag, topics, settings, legs, key, str(folder.resolve()), seconds,
@@ -248,7 +236,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
 def computed_rows(client: Any, jobs: Sequence[BagJob],
                   again: bool = False) -> Iterator[tuple[int, BagOutcome]]:
     """Yield (index of the job, outcome) as jobs end; ``again``: retry failed bags."""
-    store = RowStore(jobs[0].folder)
+    store = rows.RowStore(jobs[0].folder)
     open_jobs = []
     for i, job in enumerate(jobs):
         if (key := _existing_key(store, job)) is None:
@@ -264,11 +252,11 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
         if error is not None:      # the worker was ended each time, or could not write
             row = store.get(job.failed_key) or job.failed_row(_failure_text(error))
             store.put(row)
-            outcome = BagOutcome(row.key, FAILED, True)
+            outcome = BagOutcome(row.key, rows.FAILED, True)
         yield open_jobs[k], outcome
 
 
-def _existing_key(store: RowStore, job: BagJob) -> str | None:
+def _existing_key(store: rows.RowStore, job: BagJob) -> str | None:
     """Return the key of the row of an unchanged bag on this machine, None without one."""
     if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
         return None

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """fleet.html: the results of a fleet as one page that needs no network."""
 
@@ -13,25 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
+from odocal_ros.fleet import tables
 from odocal_ros.fleet.statistics import FEWEST_VEHICLES, Population, population
-from odocal_ros.fleet.tables import (
-    folder_name,
-    group_by_model,
-    LEGS,
-    needs_inspection,
-)
-from odocal_ros.output.plot_style import (
-    apply_style,
-    BLUE,
-    Drawing,
-    even_rows,
-    GREEN,
-    GREY,
-    new_figure_column,
-    PINK,
-    RED,
-    svg,
-)
+from odocal_ros.output import plot_style as style
 from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
 from odocal_ros.output.value_text import MAIN_VALUES, with_sigma
@@ -42,10 +25,10 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
           'pitch_mounting_angle': 'Pitch mounting angle'}
 
 
-def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[Drawing]:
+def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[style.Drawing]:
     """Return each figure that has data."""
     drawn = []
-    with apply_style():
+    with style.apply_style():
         for name in MAIN_VALUES:
             rows = [row for row in vehicles if row[name] is not None
                     and row[f'{MAIN_VALUES[name]}_deviate'] is not None]
@@ -56,10 +39,10 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[Drawin
     return drawn
 
 
-def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
+def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
     """Draw each vehicle's value against its model's median, one column a model."""
     models = sorted({row['model'] for row in rows})
-    figure, (ax,) = new_figure_column(2.8)
+    figure, (ax,) = style.new_figure_column(2.8)
     is_scale, points = name == 'scale_factor', []
     for k, model in enumerate(models):
         same_model = [row for row in rows if row['model'] == model]
@@ -69,9 +52,10 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
         median = np.median(x)
         deviation, error = ((x / median - 1) * 100, sigma / median * 100) if is_scale else (
             (x - median) * DEG, sigma * DEG)
-        keep = np.union1d(even_rows(len(x), MOST_POINTS // len(models)), np.flatnonzero(outlier))
+        keep = np.union1d(style.even_rows(len(x), MOST_POINTS // len(models)),
+                          np.flatnonzero(outlier))
         position = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
-        for which, colour in ((~outlier, BLUE), (outlier, RED)):
+        for which, colour in ((~outlier, style.BLUE), (outlier, style.RED)):
             shown = keep[which[keep]]
             ax.errorbar(position[shown], deviation[shown], error[shown], fmt='o', ms=3, lw=0.8,
                         color=colour)
@@ -82,8 +66,8 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> Drawing:
     title = f'{TITLES[name]} by model.'
     description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
                    'outside the plot.')
-    return title, description, svg(figure, f'population-{MAIN_VALUES[name]}',
-                                   f'{title} {description}')
+    return title, description, style.svg(figure, f'population-{MAIN_VALUES[name]}',
+                                         f'{title} {description}')
 
 
 def _limit_axis(ax: Any, points: np.ndarray) -> None:
@@ -97,29 +81,30 @@ def _limit_axis(ax: Any, points: np.ndarray) -> None:
     ax.set_ylim(-limit, limit)
     for sign, mark in ((1, '^'), (-1, 'v')):
         x = points[outside & (sign * points[:, 1] > 0), 0]
-        ax.plot(x, np.full(len(x), sign * 0.95 * limit), mark, ms=6, color=RED)
+        ax.plot(x, np.full(len(x), sign * 0.95 * limit), mark, ms=6, color=style.RED)
 
 
-def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> Drawing | None:
+def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Drawing | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
     current = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
     shown = [row['vehicle'] for row in vehicles if row['vehicle'] in current and any(
         change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
-    shown += [row['vehicle'] for row in vehicles if row['vehicle'] in current
-              and needs_inspection(row) and row['vehicle'] not in shown][:most_lines - len(shown)]
+    shown += [row['vehicle'] for row in vehicles
+              if row['vehicle'] in current and tables.needs_inspection(row)
+              and row['vehicle'] not in shown][:most_lines - len(shown)]
     points = _read_points(legs, set(current), set(shown))
     if not points:
         return None
-    figure, (ax,) = new_figure_column(3.4)
+    figure, (ax,) = style.new_figure_column(3.4)
     others = np.array([(t, scale / current[vehicle]) for vehicle, t, scale, _ in points
                        if vehicle not in shown]).reshape(-1, 2)
     ax.plot(others[:, 0].astype('datetime64[s]'), (others[:, 1] - 1) * 100, '.', ms=2.5,
-            color=GREY, label='others')
-    styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
+            color=style.GREY, label='others')
+    styles = [(colour, mark) for mark in 'os'
+              for colour in (style.BLUE, style.RED, style.GREEN, style.PINK)]
     for vehicle, (colour, mark) in zip(shown, styles, strict=False):
-        t, scale, sigma = np.array(sorted(point[1:] for point in points
-                                          if point[0] == vehicle)).T
+        t, scale, sigma = np.array(sorted(point[1:] for point in points if point[0] == vehicle)).T
         ax.errorbar(t.astype('datetime64[s]'), (scale / current[vehicle] - 1) * 100,
                     sigma / current[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
                     label=vehicle[:18])
@@ -131,7 +116,7 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> Drawing |
     title = 'Scale over time.'
     description = ('Legs relative to the current scale of their vehicle. Lines: vehicles that '
                    'changed or need inspection, the worst first.')
-    return title, description, svg(figure, 'control', f'{title} {description}')
+    return title, description, style.svg(figure, 'control', f'{title} {description}')
 
 
 def _read_points(path: Path, known: set[str],
@@ -146,8 +131,7 @@ def _read_points(path: Path, known: set[str],
     with pq.ParquetFile(path) as file:
         every = max(1, file.metadata.num_rows // MOST_POINTS)
         points, k = [], 0
-        for batch in file.iter_batches(columns=columns, batch_size=10_000,
-                                       use_threads=False):
+        for batch in file.iter_batches(columns=columns, batch_size=10_000, use_threads=False):
             for row in batch.to_pylist():
                 k += 1
                 vehicle = row['vehicle']
@@ -166,8 +150,8 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     return render_page(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model_row(*kind, rows) for kind, rows in sorted(
-            group_by_model(row for row in vehicles if row['legs']).items())],
-        figures=fleet_figures(vehicles, output / LEGS),
+            tables.group_by_model(row for row in vehicles if row['legs']).items())],
+        figures=fleet_figures(vehicles, output / tables.LEGS),
         vehicles=[_vehicle_row(row) for row in vehicles[:most_rows]],
         left=max(0, len(vehicles) - most_rows))
 
@@ -222,7 +206,7 @@ def _vehicle_row(row: dict[str, Any]) -> dict[str, Any]:
             'legs': f'{row["legs_good"]} of {row["legs"]}', 'km': f'{row["distance_km"]:.1f}',
             'since': f'{row["since"]:%Y-%m-%d}' if row['since'] else '',
             'remarks': '; '.join(remarks(row)[1:] + no_report),
-            'link': f'reports/{quote(folder_name(row["vehicle"]))}/report.html'
+            'link': f'reports/{quote(tables.folder_name(row["vehicle"]))}/report.html'
                     if row['report'] == '' else ''}
 
 

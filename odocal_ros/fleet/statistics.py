@@ -99,7 +99,9 @@ def _select(z: Floats, level: Floats, W: Floats, limit: float) -> list[int]:
     """Return the columns of W that explain z with significance, in addition to the level."""
     selected: list[int] = []
     while len(selected) < (len(z) - 1) // 2 or not selected:
-        residual, W_residual = _remove_projection(np.column_stack([level, W[:, selected]]), z, W)
+        # z and W minus their projections on level and selected changes
+        Q, _ = np.linalg.qr(np.column_stack([level, W[:, selected]]))
+        residual, W_residual = z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)
         size = np.linalg.norm(W_residual, axis=0)
         sigmas = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), W_residual.T @ residual
                           / np.maximum(size, 1e-300), 0.0)
@@ -114,12 +116,6 @@ def _select(z: Floats, level: Floats, W: Floats, limit: float) -> list[int]:
             break
         del selected[int(sigmas.argmin())]
     return selected
-
-
-def _remove_projection(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
-    """Return z and the columns of W minus their projections on the columns of X."""
-    Q, _ = np.linalg.qr(X)
-    return z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)
 
 
 def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:

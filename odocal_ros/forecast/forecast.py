@@ -39,11 +39,7 @@ class ParameterForecast:
     manoeuvre: str = ''     # required manoeuvres, besides distance
 
     def as_text(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
-        """
-        Return the forecast as text, sigmas times ``factor`` in ``unit``.
-
-        since : distance driven since the forecast, m.
-        """
+        """Return the forecast as text, sigmas times ``factor`` in ``unit``, ``since`` m later."""
         limit = three_digits(float(f'{self.limit * factor:.2g}'))
         limit_with_unit = f'{limit} {unit}'
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
@@ -97,11 +93,7 @@ class Forecast:
                 'left_right': wheels.left_right, 'track_width': wheels.track_width}[quantity]
 
     def as_text(self, distance_m: float = 0.0) -> str:
-        """
-        Return the forecast as a sentence: reached and unreachable limits, remaining distances.
-
-        distance_m : current path length of the leg, m.
-        """
+        """Return reached and unreachable limits, and the distances from distance_m, as text."""
         since = max(0.0, distance_m - self.distance_m)
         return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, since),
                           self.yaw.as_text('yaw', 'deg', math.degrees(1), since)])

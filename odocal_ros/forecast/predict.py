@@ -21,6 +21,7 @@ from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.nav import rotations
 from odocal_ros.nav.alignment import (
     Alignment,
     COMPASS_LIMIT,
@@ -35,13 +36,6 @@ from odocal_ros.nav.alignment import (
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.geodesy import earth_rate_n, gravity
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import (
-    quat_conjugate,
-    quat_from_matrix,
-    quat_multiply,
-    rotate_back,
-    transpose,
-)
 from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
@@ -124,7 +118,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
                        f'({1 / sigmas.fix_rate:.3g} s); drive longer or raise the fix rate')
     spans = drive.standstills(config.leg.standstill)
     alignment, alignment_reasons = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
-    track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
+    track = dead_reckon(drive.t, rotations.quat_from_matrix(drive.C_nb),
                         Travel(drive.t, drive.travel, sigmas.quantum))
     distance, drive_reasons = check_drive(track, drive.duration, 1.0, config.leg)
     keep = track.t >= alignment.t - 1e-9
@@ -239,7 +233,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
     """Return the level of a standstill from the mean of its planned samples."""
     span = (span[0], min(span[1], drive.duration))
-    C_bn = transpose(drive.C_nb[int(np.searchsorted(drive.t, span[0]))])
+    C_bn = rotations.transpose(drive.C_nb[int(np.searchsorted(drive.t, span[0]))])
     up_b, earth_b = C_bn[:, 2], C_bn @ earth_rate_n(drive.latitude)
     return level_at_rest(np.array(span), np.tile(earth_b, (2, 1)),
                          np.tile(up_b * gravity(drive.latitude, drive.height), (2, 1)), span,
@@ -254,9 +248,9 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
     t, C_nb = drive.t[rows], drive.C_nb[rows]
     velocity_n = C_nb[:, :, 0] * drive.speed[rows][:, None]
     f_n = np.gradient(velocity_n, t, axis=0) + [0.0, 0.0, gravity(drive.latitude, drive.height)]
-    q_nb = quat_from_matrix(C_nb)
-    return level_in_motion(t, rotate_back(C_nb, f_n),
-                           quat_multiply(quat_conjugate(q_nb[0]), q_nb),
+    q_nb = rotations.quat_from_matrix(C_nb)
+    return level_in_motion(t, rotations.rotate_back(C_nb, f_n),
+                           rotations.quat_multiply(rotations.quat_conjugate(q_nb[0]), q_nb),
                            drive.speed[rows][[0, -1]], drive.latitude, grade)
 
 

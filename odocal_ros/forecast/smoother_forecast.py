@@ -131,11 +131,7 @@ def _slow_share(running: RunningEstimate) -> float:
 
 
 def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
-    """
-    Return the forecast of the yaw, which accelerations along or across determine.
-
-    Its information is proportional to ``running.agility``, the integral of squared accelerations.
-    """
+    """Return the forecast of the yaw: its information is proportional to running.agility."""
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
     ratio, manoeuvre = sigma / limit, ''
@@ -164,11 +160,7 @@ def format_value(value: float, sigma: float) -> str:
 
 
 def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> Forecast:
-    """
-    Return the forecast by the planar estimator of a leg that ends here, as ``forecast_leg``.
-
-    Raises Abandoned if is_needed returns False, BadData if no fit is possible yet.
-    """
+    """Return the planar estimator's forecast; raises Abandoned: not needed, BadData: no fit."""
     def check_needed(_: Stage | None = None) -> None:
         if not is_needed():
             raise Abandoned

@@ -65,11 +65,7 @@ class LegSpan:
 
 
 def paths_of(argument: Any) -> list[Path]:
-    """
-    Return the paths of one bag or several.
-
-    Raises BadUsage: there is none, or one is not a path.
-    """
+    """Return the paths of one bag or several; BadUsage: there is none, or one is not a path."""
     is_one = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
     paths = [argument] if is_one else list(argument)
     if not paths:
@@ -151,11 +147,7 @@ def _leg_text(leg: Any) -> str:
 
 
 def parse_leg(text: str) -> LegSpan:
-    """
-    Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
-
-    Raises BadUsage: not of that form, or B not after A.
-    """
+    """Return the leg of ``A:B``, s, or ``A/B``, ISO 8601, sides optional; raises BadUsage."""
     parts = text.split('/' if '/' in text else ':')
     if len(parts) != 2:
         raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """One calibration from bags: ``odocal replay`` as a function."""
 
@@ -52,9 +51,8 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     holdout : keep the last fifth of each leg back from the fit and check the correction on it.
     listener : receives notes and progress.
 
-    Returns a Calibration; its reasons name the cause if the drive cannot be calibrated.
-    Raises BadUsage, BadBag, BadData, BadConfig: a bag cannot be read or used, or an argument is
-    invalid.
+    Returns a Calibration; its reasons name the cause if the drive cannot be calibrated. Raises
+    BadUsage, BadBag, BadData, BadConfig: a bag cannot be read or used, or an argument is invalid.
     """
     from odocal_ros.output.program_files import framed
     from odocal_ros.output.stored import known_imu
@@ -231,11 +229,7 @@ def check_all_bags(paths: list[Path], check: Callable[[Path], object]) -> None:
 
 def unique_names(paths: list[Path], legs: list[list[LegResult]],
                  inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
-    """
-    Return legs and inputs with unique bag names: paths if the names are not unique.
-
-    legs : of each bag.   inputs : entry of each bag in the results.
-    """
+    """Return each bag's legs and inputs with unique bag names: paths if they are not unique."""
     names = [entry['bag'] for entry in inputs]
     if len(set(names)) == len(names):
         return [leg for of_bag in legs for leg in of_bag], inputs

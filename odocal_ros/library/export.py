@@ -17,17 +17,8 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage, unknown_name
-from odocal_ros.library import export_pictures
+from odocal_ros.library import export_pictures, series
 from odocal_ros.library.calibration import TABLES_INSTALL
-from odocal_ros.library.series import (
-    residuals,
-    sensor_residuals,
-    SensorResiduals,
-    Series,
-    stack_legs,
-    states,
-    trajectory,
-)
 from odocal_ros.output.plot_style import PICTURES
 from odocal_ros.safe_io.atomic_files import whole_file
 
@@ -46,7 +37,7 @@ def rrd(result: Calibration, path: Path) -> None:
     import rerun
     recording = rerun.RecordingStream('odocal_ros')
     memory = recording.memory_recording()
-    pose, state = trajectory(result), states(result)
+    pose, state = series.trajectory(result), series.states(result)
     for leg in np.unique(pose['leg']).tolist():
         _log_leg(recording, f'leg_{leg}', *(
             {name: column[one['leg'] == leg] for name, column in one.items()}
@@ -55,7 +46,7 @@ def rrd(result: Calibration, path: Path) -> None:
         file.write(memory.drain_as_bytes())
 
 
-def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
+def _log_leg(recording: Any, name: str, pose: series.Series, state: series.Series) -> None:
     """Log the series of one leg under a name."""
     import rerun
     track_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
@@ -73,7 +64,7 @@ def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
                 scalars=column), recording=recording)
 
 
-def tum(columns: Series) -> str:
+def tum(columns: series.Series) -> str:
     """Return poses in the format of evo: s, m, quaternion x y z w, separated by spaces."""
     stamp = columns['stamp_ns']
     rows = zip(*(columns[name] for name in (
@@ -83,13 +74,13 @@ def tum(columns: Series) -> str:
         for s, row in zip(stamp.tolist(), rows, strict=True))
 
 
-def csv(columns: Series) -> str:
+def csv(columns: series.Series) -> str:
     """Return a series as CSV text with a header line, numbers in full."""
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return ','.join(columns) + '\n' + ''.join(f'{",".join(map(str, row))}\n' for row in rows)
 
 
-def kml(columns: Series) -> str:
+def kml(columns: series.Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
@@ -109,7 +100,7 @@ def kml(columns: Series) -> str:
     return ElementTree.tostring(root, 'unicode', xml_declaration=True) + '\n'
 
 
-def parquet(columns: Series, path: Path) -> None:
+def parquet(columns: series.Series, path: Path) -> None:
     """Write a series as a Parquet file."""
     import pyarrow
     from pyarrow import parquet as files
@@ -131,7 +122,7 @@ def mcap(result: Calibration, path: Path) -> None:
 
 def _topics(result: Calibration) -> list[encode.Topic]:
     """Return the topics of ``mcap``."""
-    pose, bias = (_by_time(series(result)) for series in (trajectory, states))
+    pose, bias = (_by_time(make(result)) for make in (series.trajectory, series.states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     zeros = np.zeros(n, np.int64)
     (gyro, gyro_sigma), (force, force_sigma) = (
@@ -152,19 +143,19 @@ def _residual_topics(result: Calibration) -> list[encode.Topic]:
     """Return a topic for each sensor, with its residuals in all legs."""
     legs_of_sensor: dict[str, list[Any]] = {}
     for number, leg in enumerate(result.legs, 1):
-        for residual in sensor_residuals(leg):
+        for residual in series.sensor_residuals(leg):
             legs_of_sensor.setdefault(residual.sensor, []).append(
                 (number, leg, _component_columns(residual)))
     topics = []
     for sensor, legs in legs_of_sensor.items():
-        rows = _by_time(stack_legs(legs))
+        rows = _by_time(series.stack_legs(legs))
         topics.append(encode.joints(f'/odocal/residuals/{sensor}', {
             name: OdometerSamples(rows['stamp_ns'], rows['stamp_ns'], column)
             for name, column in rows.items() if name not in ('leg', 'stamp_ns', 't_s')}))
     return topics
 
 
-def _component_columns(residual: SensorResiduals) -> Series:
+def _component_columns(residual: series.SensorResiduals) -> series.Series:
     """Return the residuals of a sensor as columns: each component, then its sigma."""
     columns, unit = {'t': residual.t}, UNIT_NAMES[residual.unit]
     for name, value, sigma in zip(residual.components, residual.value.T, residual.sigma.T,
@@ -174,7 +165,7 @@ def _component_columns(residual: SensorResiduals) -> Series:
     return columns
 
 
-def _by_time(columns: Series) -> Series:
+def _by_time(columns: series.Series) -> series.Series:
     order = np.argsort(columns['stamp_ns'], kind='stable')
     return {name: column[order] for name, column in columns.items()}
 
@@ -187,9 +178,9 @@ def _is_importable(module: str) -> bool:
     return True
 
 
-SERIES: dict[str, Callable[[Calibration], Series]] = {
-    'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals,
-    'scale_by_speed': export_pictures.scale_by_speed}
+SERIES: dict[str, Callable[[Calibration], series.Series]] = {
+    'trajectory': series.trajectory, 'track': series.trajectory, 'states': series.states,
+    'residuals': series.residuals, 'scale_by_speed': export_pictures.scale_by_speed}
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
 # names of files that ``export`` writes
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(

@@ -25,11 +25,7 @@ FIT_UNITS = {'factor': 'm_per_unit', 'offset': 'm_per_s', 'lag': 's'}
 
 
 def draw_map(result: Calibration, path: Path) -> None:
-    """
-    Write the features of track.geojson as a picture.
-
-    Raises BadUsage: the positions are in a local frame.
-    """
+    """Write the features as a picture; BadUsage: the positions are in a local frame."""
     shapes = [feature for number, leg in enumerate(result.legs, 1)
               for feature in features(number, leg, MOST_POINTS)]
     if not shapes:

@@ -44,11 +44,7 @@ class Standstills(NamedTuple):
 
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:
-    """
-    Return the legs that a node marked in the bag by its status; cancelled ones are left out.
-
-    The stop is 0 where the bag ends before it.
-    """
+    """Return the legs marked by a node, not cancelled; stop 0 where the bag ends before it."""
     legs = []
     for values in last_statuses(bag):
         start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
@@ -59,11 +55,7 @@ def marked_legs(bag: Bag) -> list[tuple[int, int]]:
 
 def missing_stop_reasons(spans: Spans,
                          marks: Sequence[tuple[int, int]]) -> list[tuple[Reason, ...]]:
-    """
-    Return a note for each leg that was marked at its start and not at its end.
-
-    spans : (start, stop) of the legs.   marks : result of ``marked_legs``.
-    """
+    """Return a note for each leg marked only at its start; spans: (start, stop) of the legs."""
     starts = {start for start, stop in marks if not stop}
     return [(Reason(Code.STOP_MARK_MISSING, OPEN_LEG),) if start in starts else ()
             for start, _ in spans]

@@ -53,11 +53,7 @@ class JournalNotes:
 
 
 def journal_notes(bag: Path) -> JournalNotes | None:
-    """
-    Return the metadata of a journal from its folder or a file; None for other bags.
-
-    Raises BadUsage, BadConfig: its settings cannot be read, or are not of this version.
-    """
+    """Return a journal's metadata, None for other bags; BadUsage, BadConfig: wrong settings."""
     path = (bag if bag.is_dir() else bag.parent) / JOURNAL
     if not path.exists():
         return None
@@ -203,11 +199,7 @@ def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
 
 
 def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
-    """
-    Raise BadUsage for a mark at which the wheels move, or that is outside the recording.
-
-    start_ns : of the first message of the bag.
-    """
+    """Raise BadUsage for a mark in motion or outside the bag, which begins at start_ns."""
     rows = recorder.rows('odometer')
     t, value = (rows.stamp_ns - start_ns) * 1e-9, np.asarray(rows.value, dtype=float)
     if recorder.form.quantity != 'cumulative':

@@ -137,11 +137,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
 
 class Results:
-    """
-    The result files of a calibration, in a folder that is replaced as a whole.
-
-    The report takes seconds to draw: it is added after the other files.
-    """
+    """Result files of a calibration in a folder replaced as a whole; the slow report is last."""
 
     def __init__(self, calibration: Calibration, config: Config, directory: Path,
                  inputs: list[dict[str, Any]], created: str) -> None:

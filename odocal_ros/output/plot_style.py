@@ -87,11 +87,7 @@ def svg(figure: Any, name: str, description: str) -> str:
 
 
 def peak_rows(y: Floats) -> Ints:
-    """
-    Return row numbers of a line that keep its peaks and both ends: (m,) int.
-
-    In blocks of equal size, the least and the greatest y of each column are kept.
-    """
+    """Return rows, (m,) int, of a line: both ends, the least and greatest y of equal blocks."""
     y = np.asarray(y, float)
     n = len(y)
     if n <= MOST_POINTS:

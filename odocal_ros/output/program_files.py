@@ -160,11 +160,8 @@ def _xml(root: Any, note: str) -> str:
 
 
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
-    """
-    Return result and settings with the frame of the IMU, unless it is configured.
-
-    frame : untrusted frame_id of the IMU messages; a note states if it is replaced.
-    """
+    """Return result and settings with the frame of the IMU messages, unless it is configured."""
+    # frame is untrusted: a note states if it is replaced
     if config.frames.imu or not frame:
         return calibration, config
     valid = frame.lstrip('/')       # ROS 1 frames begin with /
@@ -195,6 +192,7 @@ def features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
     """Return the features of a leg, of at most ``most`` points; none in a local frame."""
     if leg.origin is None:
         return []
+
     def feature(geometry: dict[str, Any], kind: str, **properties: Any) -> dict[str, Any]:
         return {'type': 'Feature', 'geometry': geometry,
                 'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,

@@ -8,14 +8,8 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
+from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, REASON_ESTIMATES
-from odocal_ros.calib.result import (
-    Calibration,
-    Estimate,
-    has_local_positions,
-    LegResult,
-    MethodResult,
-)
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.plot_style import apply_style, Drawing
 from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
@@ -31,7 +25,7 @@ TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Warnings',
           Verdict.ACCEPTED: 'Notes'}
 
 
-def report_html(calibration: Calibration, config: Config, content: dict[str, Any]) -> str:
+def report_html(calibration: result.Calibration, config: Config, content: dict[str, Any]) -> str:
     """
     Return the page of a calibration.
 
@@ -60,13 +54,9 @@ def render_page(room: str, name: str, **content: Any) -> str:
     return template.render(style=style, **content) + '\n'
 
 
-def report_or_error_page(calibration: Calibration, config: Config,
+def report_or_error_page(calibration: result.Calibration, config: Config,
                          content: dict[str, Any]) -> tuple[str, str]:
-    """
-    Return the page, and the reason if it cannot be drawn, else empty.
-
-    A drawing error must not affect a result: the page then states the error.
-    """
+    """Return the report, or a page that states a drawing error, and the error: '' without one."""
     try:
         return report_html(calibration, config, content), ''
     except ImportError as error:
@@ -78,7 +68,8 @@ def report_or_error_page(calibration: Calibration, config: Config,
             'calibration.json.</p></body></html>\n', cause)
 
 
-def _context(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, Any]:
+def _context(calibration: result.Calibration, config: Config,
+             content: dict[str, Any]) -> dict[str, Any]:
     """Return the variables of the template, except figures."""
     legs = calibration.legs
     methods = _by_number_of_values(calibration.methods, calibration.estimates)
@@ -115,28 +106,25 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     return [group for group in groups if group[2]]
 
 
-def _by_number_of_values(methods: dict[str, MethodResult],
-                         estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
+def _by_number_of_values(methods: dict[str, result.MethodResult],
+                         estimates: dict[str, result.Estimate]) -> dict[str, result.MethodResult]:
     """Return methods in order of the number of values that the result has from them."""
     count = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -count[item[0]]))
 
 
-def _budgets(methods: dict[str, MethodResult],
-             legs: tuple[LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
+def _budgets(methods: dict[str, result.MethodResult],
+             legs: tuple[result.LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
     """Return (method, error budget) of the methods that have one."""
-    local = has_local_positions(legs)
+    local = result.has_local_positions(legs)
     budgets = [(tables.label(name), tables.budget_table(m, local)) for name, m in methods.items()]
     return [(name, table) for name, table in budgets if table]
 
 
 def _draw_figures(
-        calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
-    """
-    Return the content of each leg, the figure of all legs, and the legs without figures.
-
-    If figures exceed MOST_BYTES, only those of the newest legs are shown.
-    """
+        calibration: result.Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
+    """Return the content of each leg, the figure of all legs, and the legs without figures."""
+    # if figures exceed MOST_BYTES, only those of the newest legs are shown
     from odocal_ros.output.plots import leg_figures
     from odocal_ros.output.scale_plots import comparison_figure
     numbered, size = list(enumerate(calibration.legs, 1)), 0
@@ -160,7 +148,8 @@ def _draw_figures(
     return legs, comparison, [number for number in with_track if number not in figures]
 
 
-def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> dict[str, Any]:
+def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
+         several: bool) -> dict[str, Any]:
     """Return the section of a leg; several : the page has more legs."""
     rows, findings = tables.left_out(leg)
     methods = _by_number_of_values(leg.methods, leg_estimates(leg))
@@ -178,13 +167,13 @@ def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> 
             'normalised': _smoothed(leg).get('residuals', {}).get('normalised')}
 
 
-def _smoothed(leg: LegResult) -> dict[str, Any]:
+def _smoothed(leg: result.LegResult) -> dict[str, Any]:
     """Return the details of the smoother for a leg, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
 
 
-def _relative(leg: LegResult) -> float | None:
+def _relative(leg: result.LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
     scale = known(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None

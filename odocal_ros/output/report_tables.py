@@ -10,18 +10,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib import result
-from odocal_ros.output import tables
+from odocal_ros.output import tables, value_text as texts
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
-from odocal_ros.output.value_text import (
-    beyond_one,
-    COUNTS,
-    inverse,
-    known,
-    length,
-    share,
-    two_digits,
-    with_sigma,
-)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
@@ -48,16 +38,16 @@ def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
         return UNDETERMINED, '', ''
-    native = with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
+    native = texts.with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
     if unit == 'rad':
-        return f'{with_sigma(value, sigma, DEG, signed=True)} deg', native, ''
+        return f'{texts.with_sigma(value, sigma, DEG, signed=True)} deg', native, ''
     if unit == 'rad/s':
-        return f'{with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', native, ''
+        return f'{texts.with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', native, ''
     if unit == 's':
-        return f'{with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
+        return f'{texts.with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
     if name.startswith('scale'):
-        relative = share(sigma / abs(value)) if sigma and value else ''
-        other = inverse(estimate) if unit in COUNTS else beyond_one(value, sigma)
+        relative = texts.share(sigma / abs(value)) if sigma and value else ''
+        other = texts.inverse(estimate) if unit in texts.COUNTS else texts.beyond_one(value, sigma)
         return native, other, relative
     return native, '', ''
 
@@ -66,7 +56,7 @@ def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
     rows, local = [], result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
-        estimate = known(calibration.estimates, name)
+        estimate = texts.known(calibration.estimates, name)
         if estimate.value is None:
             continue
         first, other, relative = in_units(name, estimate)
@@ -82,11 +72,12 @@ def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     lines = []
     for name, text in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
                        ('pitch_mounting_angle', 'pitch mounting')):
-        first, other, relative = in_units(name, known(calibration.estimates, name))
+        first, other, relative = in_units(name, texts.known(calibration.estimates, name))
         lines.append((text, first, f'± {relative}' if relative else other))
     for longest in tables.in_pieces(calibration.legs)[-1:]:
-        lines.append((f'track error in {length(longest.length)}', length(longest.after),
-                      f'{tables.before_label(calibration.legs)}: {length(longest.before)}'))
+        lines.append((f'track error in {texts.length(longest.length)}',
+                      texts.length(longest.after),
+                      f'{tables.before_label(calibration.legs)}: {texts.length(longest.before)}'))
     return lines
 
 
@@ -96,7 +87,7 @@ def undetermined(calibration: result.Calibration) -> list[str]:
     local = result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
         # the ratio requires a nominal scale, not another drive
-        if known(calibration.estimates, name).value is None and name != 'scale_ratio':
+        if texts.known(calibration.estimates, name).value is None and name != 'scale_ratio':
             quantity, _, axis = name.rpartition('_')
             has_axis = axis in ('x', 'y', 'z')
             axes.setdefault(label(quantity if has_axis else name, local), []).extend(
@@ -106,20 +97,16 @@ def undetermined(calibration: result.Calibration) -> list[str]:
 
 def method_table(methods: dict[str, result.MethodResult],
                  legs: tuple[result.LegResult, ...]) -> dict[str, Any] | None:
-    """
-    Return a table of methods: heads, verdicts, rows of (name, cells), reasons.
-
-    legs : those of the values.
-    """
+    """Return a table of the methods of legs: heads, verdicts, rows (name, cells), reasons."""
     if not methods:
         return None
     names = dict.fromkeys(n for m in methods.values() for n in m.estimates if n != 'scale_ratio'
-                          or known(m.estimates, n).value is not None)
+                          or texts.known(m.estimates, n).value is not None)
     rows = []
     for name in names:
         cells = []
         for method in methods.values():
-            first, other, _ = in_units(name, known(method.estimates, name))
+            first, other, _ = in_units(name, texts.known(method.estimates, name))
             cells.append(('-', '') if name not in method.estimates else (first, other))
         rows.append((label(name, result.has_local_positions(legs)), cells))
     return {'heads': [label(m) for m in methods],
@@ -137,8 +124,8 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
     table = method.details.get('budget') or {}
     table = {s: row for s, row in table.items() if isinstance(row, dict)}
     names = [n for n in dict.fromkeys(k for row in table.values() for k in row if k != 'shared')
-             if known(method.estimates, n).value is not None]
-    heads, factors = zip(*(_column(n, known(method.estimates, n)) for n in names),
+             if texts.known(method.estimates, n).value is not None]
+    heads, factors = zip(*(_column(n, texts.known(method.estimates, n)) for n in names),
                          strict=True) if names else ((), ())
     variances = [sum(_number(row, n)**2 for row in table.values()) for n in names]
     rows, small = [], []
@@ -149,10 +136,10 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
         if max(shares, default=0.0) < least_share:
             small.append(label(source, local))
             continue
-        cells = [None if part < least_share else (two_digits(_number(row, n) * factor), part)
+        cells = [None if part < least_share else (texts.two_digits(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
-    totals = [two_digits(math.sqrt(variance) * factor)
+    totals = [texts.two_digits(math.sqrt(variance) * factor)
               for variance, factor in zip(variances, factors, strict=True)]
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
 

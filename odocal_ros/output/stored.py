@@ -54,11 +54,7 @@ class Stored:
 
 
 def read_stored(path: Path) -> Stored:
-    """
-    Return the calibration in a file, or in the calibration.json of a folder.
-
-    Raises BadUsage: missing, unreadable, or no calibration of this schema.
-    """
+    """Return the calibration in a file or folder; BadUsage: missing, unreadable, other schema."""
     path = Path(path)
     name = str(path)
     try:
@@ -109,11 +105,7 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
 
 
 def known_imu(config: Config) -> CarriedInformation | None:
-    """
-    Return the IMU information of the result at ``imu.constants``, None without one.
-
-    Raises BadUsage: it cannot be read, has no IMU constants, or is of another vehicle or IMU.
-    """
+    """Return the IMU information of the result at ``imu.constants``, if any; raises BadUsage."""
     if not config.imu.constants:
         return None
     try:

@@ -11,25 +11,7 @@ import numpy as np
 
 from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, PLANAR
-from odocal_ros.output import tables
-from odocal_ros.output.value_text import (
-    ANGLES,
-    beyond_one,
-    columns,
-    counted,
-    COUNTS,
-    inverse,
-    known,
-    length,
-    lines_of_bags,
-    MAIN_VALUES,
-    reason_lines,
-    share,
-    time_span,
-    WIDTH,
-    with_sigma,
-    with_unit,
-)
+from odocal_ros.output import tables, value_text as texts
 from odocal_ros.reasons import Verdict
 
 DEG = math.degrees(1.0)    # definition
@@ -44,7 +26,7 @@ MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the 
            Verdict.REJECTED: 'do not use these values'}
 
 
-def screen(calibration: result.Calibration, styled: bool = False, width: int = WIDTH,
+def screen(calibration: result.Calibration, styled: bool = False, width: int = texts.WIDTH,
            rows: int | None = None, brief: bool = False) -> str:
     """
     Return the summary of a calibration as plain text.
@@ -63,7 +45,7 @@ def screen(calibration: result.Calibration, styled: bool = False, width: int = W
                  tables.search_lines(calibration.legs),
                  tables.track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
-                 reason_lines(calibration.reasons, width, brief=not notes)]
+                 texts.reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
         if rows is None or text.count('\n') < rows:
             break
@@ -73,29 +55,29 @@ def screen(calibration: result.Calibration, styled: bool = False, width: int = W
 def sentence(calibration: result.Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
     used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
-    legs = f'{used} of {counted(len(calibration.legs), "leg")} usable'
+    legs = f'{used} of {texts.counted(len(calibration.legs), "leg")} usable'
     return f'{calibration.verdict.value}: {values_in_words(calibration.estimates)}; {legs}'
 
 
 def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
-    scale = known(estimates, 'scale_factor')
+    scale = texts.known(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
         parts.append('scale factor not determined')
     else:
-        counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
-        parts.append(f'scale factor {with_unit(scale)}{counts}')
+        counts = f' ({texts.inverse(scale)})' if scale.unit in texts.COUNTS else ''
+        parts.append(f'scale factor {texts.with_unit(scale)}{counts}')
     labels = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
     for name, label in (labels | {'track_width': 'track width'}).items():
-        wheel = known(estimates, name)
+        wheel = texts.known(estimates, name)
         if wheel.value is not None:
-            parts.append(f'{label} {with_unit(wheel)}')
+            parts.append(f'{label} {texts.with_unit(wheel)}')
     for name, label in _angles_of(estimates).items():
-        angle = known(estimates, name)
+        angle = texts.known(estimates, name)
         parts.append(f'{label} mounting ' + (
             'not determined' if angle.value is None else
-            f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
+            f'{texts.with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
     return ', '.join(parts)
 
 
@@ -110,65 +92,67 @@ def _head(calibration: result.Calibration, styled: bool) -> list[str]:
 def driven(legs: tuple[result.LegResult, ...]) -> str:
     """Return the number of legs, their length and duration, as text."""
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
-    return f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}'
+    number = texts.counted(len(legs), 'leg')
+    return f'{number}, {texts.length(distance)} in {texts.time_span(duration)}'
 
 
 def _values(calibration: result.Calibration, width: int) -> list[str]:
     """Return a line for each value."""
     estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
-    scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
+    scale, ratio = (texts.known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
-    if scale.value and scale.unit in COUNTS:
-        lines.append(_line('', inverse(scale)))
+    if scale.value and scale.unit in texts.COUNTS:
+        lines.append(_line('', texts.inverse(scale)))
     if ratio.value is not None:
-        lines.append(_line('  ratio to nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
-                           f'({beyond_one(ratio.value, ratio.sigma)})'))
-    sent = known(estimates, result.AS_SENT)
+        lines.append(_line('  ratio to nominal', f'{texts.with_sigma(ratio.value, ratio.sigma)}   '
+                           f'({texts.beyond_one(ratio.value, ratio.sigma)})'))
+    sent = texts.known(estimates, result.AS_SENT)
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
     lines.append(_path_ratio(calibration, scale, sent))
     for name, label in _angles_of(estimates).items():
-        lines.append(_line(f'{label} mounting', _angle_text(known(estimates, name), width)))
+        lines.append(_line(f'{label} mounting', _angle_text(texts.known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
     wheels = _wheels(estimates)
     lines += wheels.values()
     for name in estimates:
-        estimate = known(estimates, name)
-        if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *ANGLES, *BIASES, *wheels) \
-                and name[:-2] not in ARMS and estimate.value is not None:
-            text = with_unit(estimate)
+        estimate = texts.known(estimates, name)
+        if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
+                        *wheels) and name[:-2] not in ARMS and estimate.value is not None:
+            text = texts.with_unit(estimate)
             if name == 'heading_error':
                 text = _angle_text(estimate, 0) + (
-                    '   heading error minus yaw mounting' if width >= WIDTH else '')
+                    '   heading error minus yaw mounting' if width >= texts.WIDTH else '')
             lines.append(_line(tables.source_label(name), text))
     lines += [_arm(estimates, name, result.name_antenna(label, local), width)
               for name, label in ARMS.items()]
     lines.append(_gyro_scale(calibration))
-    biases = [known(estimates, name) for name in BIASES]
+    biases = [texts.known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
-        shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
+        shown = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
+                          for bias in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
     if rpy := rotation_text(calibration, width):
         lines.append(_line('IMU on the vehicle', rpy))
     return [line for line in lines if line]
 
 
-def rotation_text(calibration: result.Calibration, width: int = WIDTH) -> str:
+def rotation_text(calibration: result.Calibration, width: int = texts.WIDTH) -> str:
     """Return roll, pitch and yaw of the IMU on the vehicle, empty without them."""
     angles = ', '.join(f'{angle * DEG:z.3f}' for angle in calibration.imu_rotation_rpy or ())
-    note = f'   ({not_estimated(calibration)} as configured)' * (width >= WIDTH)
+    note = f'   ({not_estimated(calibration)} as configured)' * (width >= texts.WIDTH)
     return angles and f'roll, pitch, yaw {angles} deg{note}'
 
 
 def not_estimated(calibration: result.Calibration) -> str:
     """Return the mounting angles that are not estimated; the roll never is."""
-    pitch = known(calibration.estimates, 'pitch_mounting_angle').value
+    pitch = texts.known(calibration.estimates, 'pitch_mounting_angle').value
     return 'roll and pitch' if pitch is None else 'roll'
 
 
 def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return the mounting angles that the method estimates; the planar method estimates none."""
-    return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
+    return {} if texts.known(estimates, 'scale_factor').method == PLANAR else texts.ANGLES
 
 
 def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
@@ -176,13 +160,13 @@ def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     lines: dict[str, str] = {}
     for name in result.wheel_factors(estimates):
         wheel = name.removeprefix(result.FACTOR)
-        positions = {f'{axis}_position_{wheel}': texts for axis, texts in SIDE_TEXTS.items()}
+        positions = {f'{axis}_position_{wheel}': sides for axis, sides in SIDE_TEXTS.items()}
         if any(position in estimates for position in positions):
-            shown = [f'{abs(e.value):.3f} m {texts[e.value < 0]}'
-                     for position, texts in positions.items()
-                     if (e := known(estimates, position)).value is not None]
-            lines |= dict.fromkeys(positions, '') | {
-                name: _line(f'wheel {wheel}', '   '.join((with_unit(estimates[name]), *shown)))}
+            shown = [f'{abs(e.value):.3f} m {sides[e.value < 0]}'
+                     for position, sides in positions.items()
+                     if (e := texts.known(estimates, position)).value is not None]
+            text = '   '.join((texts.with_unit(estimates[name]), *shown))
+            lines |= dict.fromkeys(positions, '') | {name: _line(f'wheel {wheel}', text)}
     return lines
 
 
@@ -203,20 +187,20 @@ def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
 
 def _gyro_scale(calibration: result.Calibration) -> str:
     """Return the factor for the turn rates of the gyro, '' if it is near 1."""
-    method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
+    method = calibration.methods.get(texts.known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
     least_error = 0.005
     if not error or abs(error['value']) < max(least_error, 3 * error['sigma']):
         return ''
-    return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
+    return _line('gyro scale z', texts.with_sigma(1 - error['value'], error['sigma']))
 
 
 def _arm(estimates: dict[str, result.Estimate], arm: str, label: str, width: int) -> str:
     """Return the line with the known coordinates of a lever arm, '' without any."""
     known_axes = {axis: e for axis in 'xyz'
-                  if (e := known(estimates, f'{arm}_{axis}')).value is not None}
-    shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in known_axes.values())
-    note = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= WIDTH)
+                  if (e := texts.known(estimates, f'{arm}_{axis}')).value is not None}
+    shown = ', '.join(texts.with_sigma(e.value, e.sigma, signed=True) for e in known_axes.values())
+    note = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= texts.WIDTH)
     axes = ', '.join(known_axes)
     if len(f'{label} {axes}') > LABEL_WIDTH:
         shown = f'{axes}: {shown}'
@@ -227,16 +211,17 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, label: str, width: int
 
 def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
-    texts = []
-    for name, short in MAIN_VALUES.items():
-        estimate = known(calibration.estimates, name)
+    largest = []
+    for name, short in texts.MAIN_VALUES.items():
+        estimate = texts.known(calibration.estimates, name)
         source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
             label = tables.source_label(source, result.has_local_positions(calibration.legs))
-            texts.append(f'{short}: {label} ({100 * part:.0f} %)')
+            largest.append(f'{short}: {label} ({100 * part:.0f} %)')
     # lines are broken between the values only
-    lines = textwrap.wrap('; '.join(texts).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
+    lines = textwrap.wrap('; '.join(largest).replace(' ', '\xa0').replace(';\xa0', '; '),
+                          width - 22)
     return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
             for k, line in enumerate(lines)]
 
@@ -249,15 +234,16 @@ def _scale_text(scale: result.Estimate) -> str:
     if scale.value is None:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
-        f'   ({share(scale.sigma / abs(scale.value))})')
-    return with_unit(scale) + relative
+        f'   ({texts.share(scale.sigma / abs(scale.value))})')
+    return texts.with_unit(scale) + relative
 
 
 def _angle_text(angle: result.Estimate, width: int) -> str:
     if angle.value is None:
         return 'not determined'
-    rad = f'   ({with_sigma(angle.value, angle.sigma, signed=True)} rad)' if width >= WIDTH else ''
-    return f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
+    rad = '' if width < texts.WIDTH else (
+        f'   ({texts.with_sigma(angle.value, angle.sigma, signed=True)} rad)')
+    return f'{texts.with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
 
 
 def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
@@ -265,30 +251,30 @@ def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
                                     'scale factor', 'yaw, deg', 'verdict')]
     rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
         zip(legs, tables.leg_verdicts(legs), strict=True), 1)]
-    if width < WIDTH:        # without the date, the duration and the number of fixes
+    if width < texts.WIDTH:        # without the date, the duration and the number of fixes
         rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
                 for row in rows]
-    return columns(rows) + lines_of_bags(legs, width) if legs else []
+    return texts.columns(rows) + texts.lines_of_bags(legs, width) if legs else []
 
 
 def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
     estimates = leg_estimates(leg)
-    scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
+    scale, yaw = (texts.known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)
-    return (f'{started:%m-%d %H:%M:%S}', length(leg.distance), f'{minutes}:{seconds:02d}',
+    return (f'{started:%m-%d %H:%M:%S}', texts.length(leg.distance), f'{minutes}:{seconds:02d}',
             str(leg.fixes),
-            '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
-            '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
+            '-' if scale.value is None else texts.with_sigma(scale.value, scale.sigma),
+            '-' if yaw.value is None else texts.with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
 def _budget(calibration: result.Calibration, width: int, small: bool) -> list[str]:
     estimates = calibration.estimates
-    scale = known(estimates, 'scale_factor')
+    scale = texts.known(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
     if method is None or not scale.value:
         return []
-    hidden = {name for name in estimates if known(estimates, name).value is None}
+    hidden = {name for name in estimates if texts.known(estimates, name).value is None}
     least_share = 0.01    # of a variance: smaller sources have no line
     return tables.budget_lines(method.details.get('budget'), scale.value, least_share, hidden,
                                width, small, result.has_local_positions(calibration.legs))

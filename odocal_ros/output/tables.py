@@ -3,34 +3,17 @@
 
 """Tables of legs, error budget and tracks, for terminal, report and spreadsheet."""
 
+from collections.abc import Sequence
 import csv
 import io
 import math
 import textwrap
 from typing import Any
 
+from odocal_ros.calib import result
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import (
-    Calibration,
-    Estimate,
-    LegResult,
-    MethodResult,
-    name_antenna,
-    PerDistance,
-    TrackCheck,
-    wheel_factors,
-)
-from odocal_ros.output.value_text import (
-    ANGLES,
-    columns,
-    iso,
-    known,
-    length,
-    table_row,
-    two_digits,
-    with_sigma,
-)
+from odocal_ros.output import value_text as texts
 from odocal_ros.pipeline.combination import overlapping_legs
 from odocal_ros.reasons import Verdict, verdict_of
 from odocal_ros.safe_io.text_formats import for_table
@@ -48,7 +31,8 @@ CHECKS = 'before', 'after'      # the calibration: fields of LegResult
 LABEL, CELL = 22, 9      # judgement: columns
 
 
-def leg_table(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
+def leg_table(calibration: result.Calibration, config: Config,
+              content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty without legs."""
     if not calibration.legs:
         return {}
@@ -65,20 +49,20 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
+def _row(number: int, leg: result.LegResult, calibration: result.Calibration) -> dict[str, Any]:
     """Return a row; missing values of a leg are empty cells."""
     used = {e.method for e in calibration.estimates.values() if e.value is not None}
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
                                if m.name in used or not used)]
-    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': iso(leg.start_ns),
+    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': texts.iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,
            'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,
            'rejected_fixes': leg.rejected_fixes, 'verdict': leg.verdict.value,
            'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
-    wheels = dict.fromkeys(wheel_factors(calibration.estimates), '') | {
+    wheels = dict.fromkeys(result.wheel_factors(calibration.estimates), '') | {
         name: 'm' for name in calibration.estimates if name.startswith('track_width')}
-    for name, unit in (SCALES | wheels | dict.fromkeys(ANGLES, 'rad')).items():
+    for name, unit in (SCALES | wheels | dict.fromkeys(texts.ANGLES, 'rad')).items():
         if name in calibration.estimates:
             unit = unit or calibration.estimates[name].unit
             estimate = _estimate(leg, calibration, name)
@@ -90,13 +74,14 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
     return row
 
 
-def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
+def _estimate(leg: result.LegResult, calibration: result.Calibration,
+              name: str) -> result.Estimate:
     """Return a leg's value by the method that gives the calibration's value, else by any."""
     method = leg.methods.get(calibration.estimates[name].method)
-    return known(leg_estimates(leg) if method is None else method.estimates, name)
+    return texts.known(leg_estimates(leg) if method is None else method.estimates, name)
 
 
-def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
+def search_lines(legs: tuple[result.LegResult, ...]) -> list[str]:
     """Return a table of each leg's search, empty without one."""
     lines = []
     for k, leg in enumerate(legs, 1):
@@ -121,7 +106,7 @@ def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
     return lines
 
 
-def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
+def shown_verdict(method: result.MethodResult, legs: tuple[result.LegResult, ...]) -> str:
     """
     Return the verdict of a method's values, followed by '(leg)' if it is that of the leg.
 
@@ -138,35 +123,37 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
 
 
-def method_lines(calibration: Calibration) -> list[str]:
+def method_lines(calibration: result.Calibration) -> list[str]:
     """Return the lines of a table of methods, none for a single one."""
     methods = calibration.methods
     if len(methods) < 2:
         return []
     rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
     for name, method in methods.items():
-        scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
-        rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
+        scale, *angles = (texts.known(method.estimates, n)
+                          for n in ('scale_factor', *texts.ANGLES))
+        rows.append((name, '-' if scale.value is None
+                     else texts.with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else
-                       with_sigma(a.value, a.sigma, math.degrees(1.0), signed=True)
+                       texts.with_sigma(a.value, a.sigma, math.degrees(1.0), signed=True)
                        for a in angles),
                      shown_verdict(method, calibration.legs) + _refused(method)))
-    return columns(rows)
+    return texts.columns(rows)
 
 
-def _refused(method: MethodResult) -> str:
+def _refused(method: result.MethodResult) -> str:
     """Return the first code for which a method is rejected, '' if it is not."""
     codes = [r.code.name for r in method.reasons if r.code.severity is Verdict.REJECTED]
     return f': {codes[0]}' if codes else ''
 
 
-def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
+def leg_verdicts(legs: tuple[result.LegResult, ...]) -> list[str]:
     """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
     repeated = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
     return ['not used' if leg in repeated else leg.verdict.value for leg in legs]
 
 
-def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
+def largest_source(method: result.MethodResult | None, name: str) -> tuple[str, float]:
     """Return the largest source of an estimate's error ('' if none), and its share of variance."""
     if method is None or name not in method.parameters:
         return '', 0.0
@@ -178,7 +165,7 @@ def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
 
 def source_label(name: str, local: bool = False) -> str:
     """Return an error source or estimate in words; local : positions in a local frame."""
-    return name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
+    return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
 def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_share: float,
@@ -196,7 +183,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
         return []
     factor = {PARAMETERS[0]: 1e6 / scale}
     variances = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in PARAMETERS]
-    lines = [table_row(BUDGET_HEAD, WIDTHS)]
+    lines = [texts.table_row(BUDGET_HEAD, WIDTHS)]
     small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
@@ -206,9 +193,9 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
             small.append(source_label(name, local))
             continue
         cells = ['-' if share < least_share else
-                 f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
+                 f'{texts.two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
-        lines.append(table_row([source_label(name, local), *cells], WIDTHS)
+        lines.append(texts.table_row([source_label(name, local), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))
     if not (small and name_small):
         return lines
@@ -217,26 +204,23 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
                                  subsequent_indent='    ')
 
 
-def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
-    """
-    Return one check for many legs, each (check, fixes), None without one.
-
-    rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
-    """
+def overall(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackCheck | None:
+    """Return one check for many legs, each (check, fixes), None without one."""
+    # rms and mean are pooled over fixes; max, end and percent are those of the worst leg
     known_checks = [(check, n) for check, n in checks if check is not None and n]
     if not known_checks:
         return None
     total = sum(n for _, n in known_checks)
-    return TrackCheck(
+    return result.TrackCheck(
         rms=math.sqrt(sum(n * check.rms**2 for check, n in known_checks) / total),
         mean=sum(n * check.mean for check, n in known_checks) / total,
         **{name: max(getattr(check, name) for check, _ in known_checks)
            for name in ('max', 'end', 'percent_of_distance')})
 
 
-def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance]:
+def in_pieces(legs: Sequence[result.LegResult]) -> list[result.PerDistance]:
     """Return the error per distance driven of all legs, pooled over sections."""
-    by_distance: dict[float, list[PerDistance]] = {}
+    by_distance: dict[float, list[result.PerDistance]] = {}
     for error in (x for leg in legs for x in leg.per_distance):
         by_distance.setdefault(error.length, []).append(error)
     pooled = []
@@ -244,18 +228,19 @@ def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance
         count = sum(x.pieces for x in errors)
         before, after = (math.sqrt(sum(x.pieces * getattr(x, name)**2 for x in errors) / count)
                          for name in CHECKS)
-        pooled.append(PerDistance(distance, before, after, count))
+        pooled.append(result.PerDistance(distance, before, after, count))
     return pooled
 
 
-def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
+def before_label(legs: Sequence[result.LegResult]) -> str:
     """Return the label of the track before calibration."""
     configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
                      for leg in legs for m in leg.methods.values())
     return 'as configured' if configured else 'uncalibrated'
 
 
-def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def check_table(
+        legs: tuple[result.LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
     pieces = in_pieces(legs)
     rows = []
@@ -264,19 +249,19 @@ def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str,
         if check is not None:
             share = check.percent_of_distance
             rows.append((label, [
-                *(length(getattr(x, name)) for x in pieces), length(check.rms),
-                length(check.max), length(check.mean), length(check.end),
+                *(texts.length(getattr(x, name)) for x in pieces), texts.length(check.rms),
+                texts.length(check.max), texts.length(check.mean), texts.length(check.end),
                 f'{share:.{3 if share < 100 else 0}f} %']))
     heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
              for x in pieces]
     return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows
 
 
-def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
+def track_lines(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     """Return the table of dead reckoning against the fixes, limited to the width."""
     heads, rows = check_table(legs)
     if not rows:
         return []
     most = (width - LABEL) // CELL
-    return [table_row([label, *cells[:most]], [LABEL - 2, *[CELL] * len(cells[:most])])
+    return [texts.table_row([label, *cells[:most]], [LABEL - 2, *[CELL] * len(cells[:most])])
             for label, cells in (('track against fixes', heads), *rows)]

@@ -28,11 +28,7 @@ OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
-    """
-    Return 'value ± sigma', both times ``factor``, with the digits that the sigma determines.
-
-    A sigma of 100 or more is rounded to two digits, too: -32000 ± 15000.
-    """
+    """Return value ± sigma times ``factor`` by the digits of sigma, such as -32000 ± 15000."""
     if value is None or not math.isfinite(value):
         return 'unknown'
     value *= factor

@@ -109,11 +109,7 @@ class _EvenTimes:
 
 
 def _is_smoother(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
-    """
-    Return True if values are significantly smoother at even times than at stamps.
-
-    stamps, even : (m, 5) s, times of tested rows and their neighbours.   columns : (m, 5) values.
-    """
+    """Return True if (m, 5) values are significantly smoother at even times than at stamps, s."""
     weights = _weights(stamps), _weights(even)
     gain = np.zeros(len(stamps))
     for values in columns:

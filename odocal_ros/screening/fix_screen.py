@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 Selection of usable fixes and GNSS velocities, and the uncertainty of each fix.
@@ -48,11 +47,7 @@ SPANS_LISTED = 3           # judgement: number of spans in a reason
 
 def usable_fixes(fix: FixSamples, received: int,
                  gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
-    """
-    Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons.
-
-    received : number of fixes in the leg, for the reasons; some have no row in ``fix``.
-    """
+    """Return usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, reasons; received: count."""
     no_fix = fix.status < gnss.min_status
     most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
     invalid = ~has_position(fix) | (abs(fix.height) > most_height)
@@ -186,8 +181,7 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
     # motion in a gap of the velocity, or of the fixes, is not measured
     gaps_before = running_sum(np.diff(t) > VELOCITY_GAP)
     begin, end = np.searchsorted(t, ends[:-1], side='right') - 1, np.searchsorted(t, ends[1:])
-    complete = (gaps_before[begin] == gaps_before[end]) & (
-        np.diff(ends) < 2 * DISPLACEMENT_WINDOW)
+    complete = (gaps_before[begin] == gaps_before[end]) & (np.diff(ends) < 2 * DISPLACEMENT_WINDOW)
     V, D = V[complete], D[complete]
     power = float((abs(V)**2).sum())
     if not power:

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 Orientation of an IMU in the vehicle by its accelerations, and checks of its units and axes.
@@ -140,8 +139,7 @@ def corrected_forward_axis(found: ImuOrientation | None, f: Floats) -> Floats:
     """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
     yaw, pitch = mounting_from_forward(f)
     least_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
-    if found is None or abs(float(wrap(found.yaw - yaw))) < max(least_difference,
-                                                                3 * found.sigma):
+    if found is None or abs(float(wrap(found.yaw - yaw))) < max(least_difference, 3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 

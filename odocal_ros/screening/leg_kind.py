@@ -41,11 +41,7 @@ def has_accelerometer(f_i: Floats) -> bool:
 
 
 def missing_force_cause(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
-    """
-    Return the reason why the accelerations of a leg cannot be used, '' if they can.
-
-    Levelling needs turn rates about all axes: an axis that is always zero has no gyro.
-    """
+    """Return the reason why accelerations are unusable, else '': an axis at zero has no gyro."""
     if not has_accelerometer(imu.f_i):
         return 'publishes turn rates but no acceleration'
     with np.errstate(all='ignore'):

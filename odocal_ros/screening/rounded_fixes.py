@@ -59,11 +59,7 @@ def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, t
 
 
 def common_step(angle: Floats) -> float:
-    """
-    Return the step of which all differences of values are multiples, (n,) rad; 0: none.
-
-    It is their greatest common divisor, by Euclid's algorithm with a tolerance.
-    """
+    """Return the greatest common divisor of differences of values, (n,) rad; 0: none."""
     differences = np.diff(np.unique(angle))
     differences = differences[differences > FINEST_ANGLE]
     if len(differences) < FEWEST_DIFFERENCES:

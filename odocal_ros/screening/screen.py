@@ -19,14 +19,8 @@ from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySampl
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening import clocks
 from odocal_ros.screening.axles import usable_axles
-from odocal_ros.screening.clocks import (
-    clock_reasons,
-    late_clocks,
-    shift_stamps,
-    stamp_offsets,
-    without_clock_steps,
-)
 from odocal_ros.screening.even_imu_times import even_imu_times
 from odocal_ros.screening.fix_screen import dead_reckoned_fixes, usable_fixes, velocity_reasons
 from odocal_ros.screening.glitches import (
@@ -61,8 +55,8 @@ def screen(leg: Leg, config: Config,
     found: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
     found += _missing(leg, found)
     if check_faults:
-        leg, clock_steps = without_clock_steps(leg)
-        found += [*clock_steps, *clock_reasons(leg, config)]
+        leg, clock_steps = clocks.without_clock_steps(leg)
+        found += [*clock_steps, *clocks.clock_reasons(leg, config)]
     rows = _usable(leg, config, check_faults, found)
     inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
@@ -88,12 +82,12 @@ def screen(leg: Leg, config: Config,
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
     """Return a leg with all stamps on the clock of the IMU, its inputs, and all reasons."""
     inputs, reasons = screen(leg, config)
-    found, late_by = [], dict(late_clocks(inputs, locate_fixes(inputs, config)))
+    found, late_by = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
     for clock, late in late_by.items():
         slots = [slot for slot, one in INPUTS.items() if one.clock == clock]
         by_ns = -round(late * 1e9)
         leg = leg.with_rows(**{
-            slot: shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
+            slot: clocks.shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
         found.append(Reason(
             Code.DELAY_SEEN, f'{INPUTS[slots[0]].label} stamps are about {abs(late):.1f} s '
             f'{"late" if late > 0 else "early"} relative to the IMU (estimated from the '
@@ -126,7 +120,7 @@ class UsableTopics:
 
 
 def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> UsableTopics:
-    offset = stamp_offsets(config)
+    offset = clocks.stamp_offsets(config)
 
     def rows(slot: str) -> UsableRows:
         sent, t = usable_rows(slot, leg, config, offset[slot], found)

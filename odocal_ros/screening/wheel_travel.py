@@ -184,11 +184,8 @@ class Wheels:
 
 def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
                      found: list[Reason]) -> Wheels:
-    """
-    Return the travel of the wheels of a leg.
-
-    rows : returns the usable rows of a slot and their times, s.   found : reasons are added.
-    """
+    """Return the travel of the wheels of a leg; reasons are added to ``found``."""
+    # rows(slot) gives usable rows and their times, s
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
     samples, t = rows(slots[0])

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 Draw a realistic vehicle: first its properties, then effects of its sensors (docs/zoo.md).
@@ -67,8 +66,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     return SimOptions(**options | given, real=Real(**real | fixed)), tuple(present)
 
 
-def _base_vehicle(seed: int, kind: str, grade: str,
-                  alone: bool) -> tuple[Vehicle, dict[str, Any]]:
+def _base_vehicle(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:
     """Return the vehicle and its options before any effect."""
     rng, grade_index = make_rng(seed, 'vehicle'), GRADES.index(grade)
     roll, pitch, yaw = (math.radians(sigma) * rng.standard_normal()

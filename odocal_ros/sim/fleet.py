@@ -57,7 +57,7 @@ class FleetVehicle:
     changes: tuple[FleetChange, ...] = field(default=())
 
     def broken(self, bag: int) -> bool:
-        """Return whether the odometer counter is broken in a bag."""
+        """Return True if the odometer counter is broken in a bag."""
         return any(change.value == 'counter' and change.bag <= bag for change in self.changes)
 
 

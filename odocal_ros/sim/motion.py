@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 True motion of a vehicle on the WGS 84 ellipsoid, from a speed and a turn-rate profile.
@@ -118,8 +117,7 @@ class Motion:
         self._latitude = latitude
         self._longitude = self.start.longitude + running_sum(longitude)
         # moving east turns the local level relative to the Earth by dlon * sin(lat)
-        self._turned = running_sum(
-            turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
+        self._turned = running_sum(turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
 
     def _section(self, t: Floats, h: Floats) -> list[Floats]:
         """Return m east, north, up and rad of rotation relative to the level, from t to t + h."""

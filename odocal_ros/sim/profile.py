@@ -100,11 +100,7 @@ def chain(pieces: Iterable[Piece]) -> Profile:
 
 
 def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
-    """
-    Return acceleration pieces that gain m/s in ``duration`` s.
-
-    blend : s of linear rise and of fall, 0: at once; at most half of the duration.
-    """
+    """Return acceleration pieces that gain m/s in ``duration``; blend: s of rise and fall."""
     blend = min(blend, duration / 2)
     peak = gain / (duration - blend)
     return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]

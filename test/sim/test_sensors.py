@@ -183,7 +183,7 @@ def test_slip_spins_only_while_moving_and_as_much_as_said():
     _, t = sensors.stamps(drive.duration, 200.0)
     state = drive.at(t)
     steps = np.diff(sensors.slip(state, options))
-    moving = state.speed[1:] > sensors.AT_REST
+    moving = state.speed[1:] > sensors.MOTION_LIMIT
     assert (steps[~moving] == 0).all()
     assert steps[moving].var() * 200 / 0.01**2 == pytest.approx(1, rel=sure(moving.sum()))
     spins = resolved(replace(TOWN, slip_events=300.0, slip_size=0.2))
@@ -201,7 +201,7 @@ def test_a_wheel_slips_after_each_start_and_not_elsewhere():
     _, t = sensors.stamps(drive.duration, 50.0, sensors.PHASE['odometer'])
     state = drive.at(t)
     spun = sensors.slip(state, options)
-    moving = state.speed > sensors.AT_REST
+    moving = state.speed > sensors.MOTION_LIMIT
     starts = t[1:][moving[1:] & ~moving[:-1]]
     assert len(starts) > 1
     for start in starts:

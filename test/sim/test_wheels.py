@@ -16,7 +16,14 @@ from odocal_ros.sim import wheels
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import motion_of, simulate
-from odocal_ros.sim.wheels import effective_width, robot_path, SIDEWAYS, SPOT_RATIO, STRAIGHT_RATIO, wheels_of
+from odocal_ros.sim.wheels import (
+    effective_width,
+    robot_path,
+    SIDEWAYS,
+    SPOT_RATIO,
+    STRAIGHT_RATIO,
+    wheels_of,
+)
 
 pytestmark = pytest.mark.core
 
@@ -153,8 +160,8 @@ def test_tyres_slip_by_the_force_over_the_load():
     a, b = (np.flatnonzero(state.t == x)[0] for x in (65.0, 80.0))
     push = 12 / 24                                    # m/s^2 between the blends of its ramp
     way = state.travel[b] - state.travel[a]
-    air = wheels.AIR * (state.speed[a:b + 1]**2 * np.gradient(state.travel[a:b + 1])).sum()
-    want = 2 / 30 * ((push / 9.81 + wheels.REST) * way + air)
+    air = wheels.AIR_DRAG * (state.speed[a:b + 1]**2 * np.gradient(state.travel[a:b + 1])).sum()
+    want = 2 / 30 * ((push / 9.81 + wheels.ROLLING_RESISTANCE) * way + air)
     assert spun[b] - spun[a] == pytest.approx(want, rel=2e-3)      # the ends of the sum
     braked = wheels.tyre_slip(state, Real(tyre_slip=1 / 30, driven=False))
     assert braked[b] == 0

@@ -1,5 +1,4 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
 
 """
 Error model of dead reckoning: the end point error by attitude errors and gyro drift.
@@ -140,8 +139,7 @@ def _fill(S: Floats, path: Path, epochs: slice, intervals: slice, radius: float 
           drift_b: Floats) -> None:
     """Write [A | B] of intervals into S; epochs: those at their edges."""
     dt = np.diff(path.t[epochs])[:, None, None]
-    latitude, height = ((a[:-1] + a[1:]) / 2
-                        for a in (path.latitude[epochs], path.height[epochs]))
+    latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude[epochs], path.height[epochs]))
     Fdt = coefficients(latitude, height, path.velocity_n[intervals], radius) * dt
     # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
     S[..., :6] = Fdt + Fdt @ Fdt / 2

@@ -46,11 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def planar_leg(fix_noise: str, seed: int, **others: Any) -> 'PlanarLeg':
-    """
-    Return the drive of the embodiment, ten minutes of town, with the errors that it states.
-
-    others : options of the simulation that replace these.
-    """
+    """Return the embodiment's drive, ten minutes of town; others: options that replace these."""
     from odocal_reproductions.patent.embodiment import FOUND, RADIUS
     from odocal_ros.pipeline.prepare import prepare
     from odocal_ros.pipeline.smoother_run import planar_input
