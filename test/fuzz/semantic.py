@@ -15,7 +15,7 @@ import struct
 
 import numpy as np
 
-from odocal_ros.messages.cdr import FRAME_AT, layout_of
+from odocal_ros.messages.cdr import FRAME_OFFSET, layout_of
 from odocal_ros.messages.message_fields import FIX, IMU
 
 SAME = (1.0, 1.0)
@@ -96,8 +96,9 @@ def second_imu(rng, rows):
     which = slice(0, None, rng.choice([2, 2, 3, 10]))
     for fields in (RATES[:2], FORCES[:2]):
         put_all(rows, IMU, fields, lambda x, y: (c * x - s * y, s * x + c * y), which)
-    rows[IMU][which] = [(t, data[:FRAME_AT] + bytes([data[FRAME_AT] ^ 1]) + data[FRAME_AT + 1:])
-                        for t, data in rows[IMU][which]]
+    rows[IMU][which] = [
+        (t, data[:FRAME_OFFSET] + bytes([data[FRAME_OFFSET] ^ 1]) + data[FRAME_OFFSET + 1:])
+        for t, data in rows[IMU][which]]
     return SAME
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from odocal_ros.library.arguments import parse_leg
 from odocal_ros.live.journal import replay_command
-from odocal_ros.messages.cdr import FRAME_AT
+from odocal_ros.messages.cdr import FRAME_OFFSET
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 GAP = (100.0, 103.0)       # s of the drive
@@ -135,7 +135,8 @@ def test_the_command_marks_the_leg_to_the_microsecond_on_any_clock(start_ns):
 def test_two_imus_on_a_topic_are_said_by_both_nodes_and_reject_the_leg(tmp_path):
     types, sent = messages_of(straight(imu_grade='industrial'))
     other = {one.stamp_ns for one in [one for one in sent if one.slot == 'imu'][1::2]}
-    sent = [Sent(one.stamp_ns, one.slot, one.raw[:FRAME_AT] + b'r' + one.raw[FRAME_AT + 1:])
+    sent = [Sent(one.stamp_ns, one.slot,
+                 one.raw[:FRAME_OFFSET] + b'r' + one.raw[FRAME_OFFSET + 1:])
             if one.slot == 'imu' and one.stamp_ns in other else one for one in sent]
     odometry = NodeProcess(*given({
         'result.scale_factor': 1.0, 'result.scale_factor_sigma': 0.001, 'result.valid': True}),
