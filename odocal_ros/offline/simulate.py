@@ -253,7 +253,7 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
     from odocal_ros.sim.truth import settings
     drive = simulate(drive_options(vehicle, number, bag, options))
     name = f'{vehicle.name}/bag_{bag + 1:02d}'
-    recorded = with_broken_counter(drive) if vehicle.broken(bag) else drive
+    recorded = with_broken_counter(drive) if vehicle.has_broken_counter(bag) else drive
     write_bag(out / name, drive_topics(recorded), args.storage, args.compression, args.force)
     config = f'{vehicle.model.name}.yaml'
     if number < len(MODELS) and not bag:      # one of each model

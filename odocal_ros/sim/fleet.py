@@ -52,11 +52,11 @@ class FleetVehicle:
     model: Model
     scale: np.ndarray    # (bags,) m/pulse
     yaw: np.ndarray      # (bags,) rad
-    pitch: float
-    odometer_km: np.ndarray
+    pitch: float         # rad
+    odometer_km: np.ndarray    # (bags,) on the dashboard
     changes: tuple[FleetChange, ...] = field(default=())
 
-    def broken(self, bag: int) -> bool:
+    def has_broken_counter(self, bag: int) -> bool:
         """Return True if the odometer counter is broken in a bag."""
         return any(change.value == 'counter' and change.bag <= bag for change in self.changes)
 
