@@ -109,8 +109,7 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
     found = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
     found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
               if travel.at(a) != travel.at(b)]      # some counters send nothing at rest
-    return tuple((name, float(a), float(b)) for name, a, b in found
-                 if a < span[1] and b > span[0])
+    return tuple((name, float(a), float(b)) for name, a, b in found if a < span[1] and b > span[0])
 
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:

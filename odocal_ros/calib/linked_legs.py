@@ -47,8 +47,7 @@ class LinkedEquations:
     def log_determinant(self) -> float:
         """Return the log determinant of H."""
         eigenvalues, _, scale = self._eigen
-        return float(np.log(np.maximum(eigenvalues, LEG_ROUNDING)).sum()
-                     - 2 * np.log(scale).sum())
+        return float(np.log(np.maximum(eigenvalues, LEG_ROUNDING)).sum() - 2 * np.log(scale).sum())
 
     def least_cost(self) -> float:
         """Return the weighted sum of squares at the solution."""
@@ -168,8 +167,7 @@ class LinkedLegs:
         J, k = len(legs.D), self.drifting
         common = np.delete(np.arange(len(self.names)), k)
         T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
-        offset = np.stack([b.point - self.marginals[-1].point
-                           for b in self.marginals]) / self.unit
+        offset = np.stack([b.point - self.marginals[-1].point for b in self.marginals]) / self.unit
         g_legs = gradient + (legs.D @ offset[:, :, None]
                              - T @ (np.swapaxes(DA, 1, 2) @ offset[:, :, None]))[:, :, 0]
         cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())

@@ -188,8 +188,7 @@ def raise_on_overflow() -> np.errstate:
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
 
-def failed(unknown: Callable[[Reason], MethodResult], name: str,
-           error: Exception) -> MethodResult:
+def failed(unknown: Callable[[Reason], MethodResult], name: str, error: Exception) -> MethodResult:
     """Return the result of a method that raised: no values, the reason, and the trace."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     text = ' '.join(str(error).split())[:200]

@@ -61,8 +61,7 @@ class Chord:
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 
 
-def solve(chord: Chord, up_scale: float = 1.0,
-          limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
+def solve(chord: Chord, up_scale: float = 1.0, limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
     """
     Return f of M f = c, (3,) m per unit of travel, and True if the pitch is known: (T3), (T4).
 

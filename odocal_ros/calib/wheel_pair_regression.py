@@ -96,8 +96,7 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
 
     width, sigma : track width by the regression, m.   track_width : as configured, m; 0: unknown.
     """
-    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
-                                                     track_width / 2):
+    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least, track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
                        f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '
                        'sent twice'),)

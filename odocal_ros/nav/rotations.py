@@ -4,9 +4,8 @@
 """
 Rotations: matrices, quaternions (x y z w, as in ROS) and fixed-axis roll, pitch, yaw; angles.
 
-Heading is from north, clockwise; yaw is from east, counter-clockwise.
-``q_nb`` and ``C_nb`` rotate a vector from b to n. All functions accept (..., 3), (..., 4) or
-(..., 3, 3) arrays.
+Heading is from north, clockwise; yaw is from east, counter-clockwise. ``q_nb`` and ``C_nb`` rotate
+a vector from b to n. All functions accept (..., 3), (..., 4) or (..., 3, 3) arrays.
 """
 
 import numpy as np

@@ -46,8 +46,7 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     leg = replace(leg, uncertain_t=np.append(leg.uncertain_t, t_slip),
                   uncertain_sigma=np.append(leg.uncertain_sigma, metres / prepared.rough))
     passes = count(1)
-    method = smooth(leg, prepared.config,
-                    lambda *state: report_pass(next(passes), state[-1]))
+    method = smooth(leg, prepared.config, lambda *state: report_pass(next(passes), state[-1]))
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
     if prepared.config.method == 'patent':

@@ -54,8 +54,7 @@ def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], 
     scale = (initial.left + initial.right) / 2
     prior_mean, prior = priors(run, known, initial.left, initial.right, initial.width)
     c, state = prior_mean.copy(), np.zeros((len(run.t), 5))
-    state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
-                                for axis in run.position.T)
+    state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis) for axis in run.position.T)
     state[:, 2] = initial.heading
     levels, passes, converged = dict(LEVELS), 0, False
     student_weights = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}

@@ -132,8 +132,7 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
                         _details(fit, estimates, tuple(quantities), sources))
 
 
-def _compute_values(fit: Fit, quantities: dict[str, Quantity],
-                    slopes: float) -> dict[str, Value]:
+def _compute_values(fit: Fit, quantities: dict[str, Quantity], slopes: float) -> dict[str, Value]:
     """Return the quantities of a fit by name."""
     constants = dict(zip(fit.names, fit.value.tolist(), strict=True))
     # a fit that has not converged has twice the sigma

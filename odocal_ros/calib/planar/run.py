@@ -16,8 +16,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.settings.config import MECANUM, OMNI, SKID
 
 # definition: rows of wheels, metres rolled per metre forward, per metre left, and per turn that
-# moves a wheel at the lever (half the track width; for mecanum plus half the wheelbase) by a
-# metre
+# moves a wheel at the lever (half the track width; for mecanum plus half the wheelbase) by a metre
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])

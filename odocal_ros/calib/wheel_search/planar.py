@@ -88,8 +88,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     """
     t_start, start_n = start
     tracks = track_left, track_right
-    reach = (max(t_start, *(track.t[0] for track in tracks)),
-             min(track.t[-1] for track in tracks))
+    reach = (max(t_start, *(track.t[0] for track in tracks)), min(track.t[-1] for track in tracks))
     use = (t_fix >= reach[0]) & (t_fix <= reach[1])
     t, fixes = t_fix[use], np.ascontiguousarray(fixes_n[use, :2])
     forward, origin = forward_b(0.0, pitch), np.array(float(t_start))
