@@ -45,12 +45,7 @@ COMPARED = {
 
 def deciding_methods(method_setting: str | tuple[str, ...], shown: bool = False) -> tuple[str,
                                                                                           ...]:
-    """
-    Return the methods whose values may be the result, the first choice first.
-
-    method_setting : the setting ``method``, or such methods.   shown : add those shown for
-    comparison.
-    """
+    """Return the methods that may give the result, the best first; shown: and those to compare."""
     if not isinstance(method_setting, str):
         return method_setting
     if method_setting in ('auto', 'all'):

@@ -80,11 +80,7 @@ def newest(results: Sequence[MethodResult],
 
 def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """
-    Return mean, variance without shared errors, shared effects, and reasons: (T15), (T16).
-
-    i : row of the parameter in the sources.   results : of J legs with a value.   walked : (J,).
-    """
+    """Return mean, unshared variance, shared effects, and reasons of parameter i: (T15), (T16)."""
     is_scale = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x

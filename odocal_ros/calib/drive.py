@@ -86,11 +86,7 @@ def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                    t_stop: float, least: float) -> tuple[Reason, ...]:
-    """
-    Return the reason if wheels or fixes do not move between the marks, () if both do.
-
-    t_fix, fixes_n : (k,) s, (k, 2 or more) m.   least : smallest significant motion of fixes, m.
-    """
+    """Return the reason if wheels or fixes do not move between the marks; least: of fixes, m."""
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t, fixes = t_fix[rows], fixes_n[rows, :2]
     if len(fixes) < 2:
@@ -146,11 +142,7 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 
 def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
-    """
-    Return begin and end of motion of the fixes while the wheels stand, as on a ferry: (k, 2) s.
-
-    The odometer counts again afterwards.
-    """
+    """Return intervals in which fixes move and wheels stand, as on a ferry, (k, 2) s."""
     spans = []
     for distance, begin, end in _motion_without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))

@@ -53,12 +53,7 @@ class WrongAxis(NamedTuple):
 
 
 def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
-    """
-    Return the axes of a sensor, levelled, and their names.
-
-    Rows e1, e2, up, (3, 3), right-handed, and the sensor axis nearest to each, as "-y".
-    up : (3,) unit vector in the sensor's frame.
-    """
+    """Return level e1, e2 and up as rows, (3, 3), and the sensor axis nearest to each, as "-y"."""
     k = int(np.argmax(np.abs(up)))
     first, second = np.eye(3)[(k + 1) % 3], np.sign(up[k]) * np.eye(3)[(k + 2) % 3]
     e1 = first - (first @ up) * up

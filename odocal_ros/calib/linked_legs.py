@@ -199,11 +199,7 @@ class LinkedLegs:
 
     def combined_information(self, point: Floats, scatter: dict[str, float],
                              likelihood: dict[str, Floats]) -> MarginalInformation:
-        """
-        Return the information of all legs at a point, as that of one leg at the last.
-
-        likelihood : log likelihood of the scatter, by constant.
-        """
+        """Return the information of all legs as one leg at a point; likelihood: of the scatter."""
         equations = self.equations(self.information(), scatter, prior=False)
         D, gradient = equations.eliminate_others(self.indices(len(self.marginals) - 1))
         D, gradient = D / np.multiply.outer(self.unit, self.unit), gradient / self.unit
@@ -215,10 +211,8 @@ class LinkedLegs:
         """
         Return the chi-square of the legs with common constants, and its degrees of freedom: (S36).
 
-        Only of directions determined at least as well as by the priors: the equations of a leg
-        need not be linear over larger changes. Priors bound what no leg determines: otherwise two
-        legs that determine half of the constants each, in different directions, would always
-        agree.
+        Only of directions determined at least as well as by the priors, in which legs are linear.
+        Priors bound the others: two legs that each determine one half would always agree.
         """
         return self.equations(self.information(1.0), scatter).misfit()
 

@@ -29,8 +29,7 @@ class MarginalInformation:
     """
     Log likelihood of a leg as a quadratic function of m constants x: docs/method.md (S33).
 
-    It is gradient (x - point) - (x - point)' information (x - point) / 2, up to a constant. A
-    combination adds the priors once. The units are those of the constants: 1 (ln K), rad, m, s.
+    gradient (x - point) - (x - point)' information (x - point) / 2, in ln K, rad, m, s.
     """
 
     names: tuple[str, ...]   # of the constants
@@ -70,12 +69,7 @@ class MarginalInformation:
                        gradient=self.gradient - T @ (A.T @ self.gradient))
 
     def with_errors(self, effects: Floats) -> 'MarginalInformation':
-        """
-        Return the information reduced by further errors of the estimate: (S33a).
-
-        effects : (m, L) of L independent unit errors; the covariance with the relaxed priors
-        increases by effects effects'.
-        """
+        """Return the information with the covariance larger by E E', effects E (m, L): (S33a)."""
         weight = 1 / self.relaxed_sigma**2
         G = (self.information + np.diag(weight)) @ effects
         T = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
@@ -108,13 +102,10 @@ class MarginalInformation:
 def eliminate_leg_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats,
                                                                             Floats]:
     """
-    Return T, DA and A of the elimination of errors of k constants: (..., m, k) each, (S34).
+    Return T, DA and A, (..., m, k), that eliminate errors of k constants in each leg: (S34).
 
-    It reduces the information D by T DA' and the gradient h by T A' h, with A the unit vectors
-    times the sigmas, and T = DA (1 + A' DA)^-1.
-
-    D : (..., m, m).   at, sigmas : (k,) indices of the constants, and sigmas of their errors in
-    this leg; inf: unbounded.
+    The information D is reduced by T DA', the gradient h by T A' h.   D : (..., m, m).
+    at, sigmas : (k,) indices of the constants and sigmas of their errors; inf: unbounded.
     """
     bounded, diagonal = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., at]
     # the column of an unbounded error may have any length

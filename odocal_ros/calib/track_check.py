@@ -269,12 +269,10 @@ def _is_opposite(heading_error: Floats) -> Bools:
 
 def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
     """
-    Return True if the fixes stay behind after a run of pieces, as after a reversal.
+    Return True if the fixes stay behind after a run of pieces (indices), as after a reversal.
 
     Over FIX_ERROR_DURATION to each side, the displacement of the fixes is then nearer to that of
     the track with the run reversed; after a fix error, which disappears, to that of the track.
-
-    run, forward : indices of the pieces of the run, and of those driven forward.
     """
     t, error = pieces.t, pieces.heading_error
     about = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)

@@ -107,11 +107,7 @@ def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
 
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
                  width: float) -> tuple[list[Event], list[Event]]:
-    """
-    Return the steps of the residual that end, and those that may be a change of the ratio.
-
-    residual : (n,) m.   quantum_m : of the mean of both wheels, m.   width : track width, m.
-    """
+    """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
     mean = (total[regression.MEAN_STEPS:] - total[:-regression.MEAN_STEPS]) / regression.MEAN_STEPS
@@ -187,11 +183,7 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
 
 def _measure_jump(pair: WheelPair, residual: Floats,
                   windows: list[tuple[int, Floats, Floats, Bools]], a: int, b: int) -> Event:
-    """
-    Return the event within steps a to b, by its best window.
-
-    windows : (span, jump, limit, True where significant) of each length.
-    """
+    """Return the event in steps a to b, by its best window: (span, jump, limit, significant)."""
     found = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
     for span, jump, limit, far in windows:
         low, high = max(0, a - regression.MEAN_STEPS), max(0, b - span + 1)

@@ -68,11 +68,7 @@ def _smooth(x: Floats, reach: int) -> Floats:
 
 def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
                 ) -> tuple[Floats, Floats] | tuple[None, None]:
-    """
-    Return the coefficients (k,) of the regressors, fitted to cells of a second, and covariance.
-
-    signals : (n, k) as ``regressors``, further ones have no prior. None if few cells have motion.
-    """
+    """Return coefficients, (k,), of (n, k) regressors by cells of a second, and covariance."""
     at = np.arange(0, len(pair.t), MEAN_STEPS)
     A, y = np.diff(signals[at], axis=0), np.diff(pair.right[at])
     keep = np.logical_and.reduceat(pair.known, at[:-1])[:len(y)]
@@ -91,11 +87,7 @@ def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
 
 def side_reasons(pair: WheelPair, width: float, sigma: float,
                  track_width: float) -> tuple[Reason, ...]:
-    """
-    Return the reason if the sides of the wheels are wrong or cannot be tested.
-
-    width, sigma : track width by the regression, m.   track_width : as configured, m; 0: unknown.
-    """
+    """Return the reason if the sides are wrong or untested; width: by the regression, m."""
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least, track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
                        f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '

@@ -58,12 +58,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """
-    Level and turn rate before heading is known.
-
-    The frame L is level at the position p of the vehicle, its x axis the projection of b's. C_np
-    is the rotation from ENU at p to n.
-    """
+    """Level and turn rate before heading is known; L is level, its x the projection of b's x."""
 
     t: float               # s since the start mark
     C_Lb: Floats           # (3, 3) b to L
@@ -71,6 +66,7 @@ class Level:
     mean_rate_b: Floats    # (3,) rad/s over the standstill, zero in motion
     rate_sigma: float      # rad/s, of the mean as bias at t
     standstill: tuple[float, float] | None    # begin and end, s; None: in motion
+    # (3, 3) ENU at the position p of the vehicle to n
     C_np: Floats = field(default_factory=lambda: np.eye(3))
 
 

@@ -78,7 +78,11 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
     coarse = None
     if form.quantity == 'rate':
         speed = value.astype(float, copy=False)
-        coarse = _find_coarse_speed(t, -speed if reversed_counts else speed)
+        signed = -speed if reversed_counts else speed
+        coarse, held = find_coarse_speed(t, signed), find_held_speed(t, signed)
+        # a held speed takes precedence over a finer grid
+        if held and (coarse is None or coarse.step < held.step / 2):
+            coarse = held
         if isinstance(coarse, HeldSpeed):
             speed = -coarse.value if reversed_counts else coarse.value
         step = (speed[:-1] + speed[1:]) / 2 * np.diff(t)
@@ -98,12 +102,6 @@ def _quantum(step: Floats) -> float:
     if not changes or (size % 1).any() or size.max() > 2**53:
         return 1.0
     return float(np.gcd.reduce(size.astype(np.int64)))
-
-
-def _find_coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
-    """Return the grid of a speed; a held speed takes precedence over a finer grid."""
-    coarse, held = find_coarse_speed(t, value), find_held_speed(t, value)
-    return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
 
 def mean_travel(travels: Sequence[Travel]) -> Travel:

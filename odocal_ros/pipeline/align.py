@@ -155,11 +155,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                     config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """
-    Return yaw of the x axis of L and sigma, rad, its source, True if shared by legs, and reasons.
-
-    The source ``course`` has the yaw 0 and the sigma pi: it is estimated later.
-    """
+    """Return yaw and sigma of L's x axis, rad, source, True if shared by legs, and reasons."""
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
@@ -170,6 +166,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nomina
             return *result, source, source != 'gyrocompass', ()
         refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
                                else Code.HEADING_UNAVAILABLE, f'heading from {source}: {refusal}'))
+    # estimated by _heading_by_course
     return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
 
 

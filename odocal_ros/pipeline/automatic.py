@@ -40,11 +40,7 @@ class Span:
 
 
 class LegSearch:
-    """
-    Search for legs in rows of IMU, odometer and fixes, fed in blocks of any size.
-
-    The legs found are ``spans``, the open one last.
-    """
+    """Search for legs in rows, in blocks of any size; ``spans`` are found, the open one last."""
 
     def __init__(self, config: Config) -> None:
         self._steps: StepReader | None = None

@@ -142,12 +142,7 @@ def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
     return missing
 
 
-def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
-    """Return the parts of a leg between IMU gaps over ``limit_s``; the leg if none or many."""
-    return _between_gaps(leg, _imu_gaps(leg, limit_s))
-
-
-def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
+def parts_between(leg: Leg, gaps: Ints) -> list[Leg]:
     """Return the parts of a leg between gaps, (k, 2) ns; the leg itself if none or many."""
     most_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < most_parts:
@@ -159,7 +154,7 @@ def _between_gaps(leg: Leg, gaps: Ints) -> list[Leg]:
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
 
 
-def _imu_gaps(leg: Leg, limit_s: float) -> Ints:
+def imu_gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
     near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
     stamps, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
@@ -200,12 +195,13 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [one for one in results if one.verdict is not Verdict.REJECTED]
 
-    good, carried_reason = usable_results(parts_of(leg, config.leg.max_gap)), None
+    good, carried_reason = usable_results(
+        parts_between(leg, imu_gaps(leg, config.leg.max_gap))), None
     if not good:
         whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
         carried_reason = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
         if carried_reason:
-            good = usable_results(_between_gaps(leg, _carried_sections(leg, config)))
+            good = usable_results(parts_between(leg, _carried_sections(leg, config)))
         if not good:
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:

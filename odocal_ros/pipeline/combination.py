@@ -124,11 +124,7 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
                     config: Config, numbers: Sequence[int] | None = None,
                     carried: CarriedInformation | None = None,
                     local: bool = False) -> MethodResult:
-    """
-    Return the result of a method for several legs, including carried ones if possible.
-
-    times_ns, numbers : of each result, when it was driven, and its number in reasons.
-    """
+    """Return the result of a method for several legs by time, and carried ones if possible."""
     if carried and all(r.marginal for r in results):
         unknown = {parameter: Estimate(None, None, e.unit)
                    for parameter, e in results[0].estimates.items()}
@@ -145,11 +141,7 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
 
 def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
                     carried: CarriedInformation | None, local: bool) -> MethodResult:
-    """
-    Return a method's combination of the legs without rejection; of all if all have one.
-
-    driven : (result, time, ns, number) of each leg.
-    """
+    """Return the combination of (result, time, number) not rejected; of all if all are."""
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,

@@ -41,12 +41,7 @@ FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
 class Paths(NamedTuple):
-    """
-    The antenna's path with the configured and with the calibrated values.
-
-    Both have the same attitude and undetermined mounting angles: they only differ in the
-    calibrated values.
-    """
+    """The path with configured and with calibrated values; undetermined angles are the same."""
 
     before: Path
     after: Path
@@ -179,10 +174,9 @@ def attitude_of(inputs: Inputs, origin: dead_reckoning.Origin, t_begin: float, q
 def configured_forward(prepared: PreparedLeg, f: Floats,
                        estimates: Mapping[str, Estimate]) -> Floats:
     """
-    Return f of the settings, scale times forward axis in b: (3,) m per unit of travel.
+    Return f of the settings, (3,) m per unit of travel; without a scale, with the path ratio.
 
-    Without a nominal scale it has the path ratio.   f : as estimated; its angles are kept if
-    ``estimates`` has no value of them.
+    f : as estimated; its angles are kept if ``estimates`` has no value of them.
     """
     determined = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in determined else angle for name, angle in zip(
@@ -212,7 +206,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
                                                                 tuple[Reason, ...]]:
     """Return tracks, checks and evidence of a leg as fields of its result, and reasons."""
     before, after = paths
-    start = _start_position(prepared, after)
+    start = prepared.mark(prepared.covered[0], after, 'start')
     if start is None:
         return {}, ()
     t = prepared.track.t[::max(1, len(prepared.track.t) // KEPT_ROWS)]
@@ -244,7 +238,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
 
 def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
     """Return the check of a method's own path as an entry of its details, and reasons."""
-    start = _start_position(prepared, path)
+    start = prepared.mark(prepared.covered[0], path, 'start')
     if start is None:
         return {}, ()
     pin, between, path_length, found = _compared_section(prepared, path, start)
@@ -253,11 +247,6 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residuals = track_check.track_residuals(path, pin, fixes)
     return {'check': asdict(track_check.track_statistics(residuals, path_length))}, found
-
-
-def _start_position(prepared: PreparedLeg, path: Path) -> MarkFix | None:
-    """Return the antenna's position at the begin of the track, None without fixes there."""
-    return prepared.mark(prepared.covered[0], path, 'start')
 
 
 def _compared_section(prepared: PreparedLeg, path: Path,

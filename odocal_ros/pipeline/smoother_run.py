@@ -20,7 +20,7 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
-from odocal_ros.calib.wheel_search.search import search, SearchResult
+from odocal_ros.calib.wheel_search.search import search
 from odocal_ros.data.arrays import Floats, release_mapped_memory
 from odocal_ros.estimator import make_smoother_leg, smooth
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
@@ -74,8 +74,13 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
 
 def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return the smoother's result with that of the patent's search in its details."""
-    search_result = run_wheel_search(prepared, method.estimates['pitch_mounting_angle'].value
-                                     or 0.0)
+    leg = planar_input(prepared, method.estimates['pitch_mounting_angle'].value or 0.0)
+    if leg is None:
+        return method
+    alignment, wheels = prepared.alignment, prepared.config.wheels
+    # the sigma of a course includes the mounting angle
+    course_sigma = None if alignment.heading_separable else alignment.heading_sigma
+    search_result = search(leg, ranges_of(wheels, course_sigma), wheels.robust)
     if search_result is None:
         return method
     # left and right may be separable by the gyro: the smoother reports that itself
@@ -138,13 +143,3 @@ def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
                       inputs.t_fix[between], prepared.fixes_n[between],
                       inputs.covariance_n[between], (start.t, start.position_n),
                       (scale, scale), pitch, prepared.lever_b)
-
-
-def run_wheel_search(prepared: PreparedLeg, pitch: float) -> SearchResult | None:
-    """Return the result of the search, None with too few fixes; pitch: mounting angle, rad."""
-    leg = planar_input(prepared, pitch)
-    if leg is None:
-        return None
-    a, wheels = prepared.alignment, prepared.config.wheels
-    course = None if a.heading_separable else a.heading_sigma     # includes the mounting angle
-    return search(leg, ranges_of(wheels, course), wheels.robust)

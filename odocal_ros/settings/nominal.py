@@ -126,9 +126,8 @@ def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuCon
     """
     Return the imu settings, with a worse grade if that fits the noise at rest better.
 
-    With too good a grade, the priors of bias and scale would be too narrow.
-
-    variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
+    With too good a grade, priors would be too narrow.   variance : white noise of 'gyro' and
+    'accel' at rest, per s; empty: not known.
     """
     if not variance:
         return imu

@@ -11,12 +11,22 @@ import pytest
 
 from odocal_ros.data.samples import take
 from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
-from odocal_ros.pipeline.calibrate import calibrate, calibrate_parts, combine, parts_of
+from odocal_ros.pipeline.calibrate import (
+    calibrate,
+    calibrate_parts,
+    combine,
+    imu_gaps,
+    parts_between,
+)
 from odocal_ros.reasons import Code, Verdict
 
 pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 GAP = (200.0, 203.0)
+
+
+def parts_of(leg):
+    return parts_between(leg, imu_gaps(leg, 0.5))
 
 
 @pytest.fixture(scope='module')
@@ -33,7 +43,7 @@ def silent(leg, *gaps):
 
 def of(leg, *gaps):
     return [((p.start_ns - leg.start_ns) * 1e-9, (p.stop_ns - leg.start_ns) * 1e-9)
-            for p in parts_of(silent(leg, *gaps), 0.5)]
+            for p in parts_of(silent(leg, *gaps))]
 
 
 def test_gaps_are_steps_beyond_a_limit_or_the_rhythm():
@@ -47,7 +57,7 @@ def test_gaps_are_steps_beyond_a_limit_or_the_rhythm():
 def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
     leg = made.leg()
     stop = (leg.stop_ns - leg.start_ns) * 1e-9
-    assert parts_of(leg, 0.5) == [leg]
+    assert parts_of(leg) == [leg]
     assert of(leg, (50.0, 50.4)) == [(0.0, stop)]
     row = 0.0201      # s, of the IMU
     assert of(leg, (50.0, 53.0), (120.0, 121.0)) == [
@@ -57,7 +67,7 @@ def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
     # silent until the stop mark: what came before is left
     assert of(leg, (stop - 5.0, stop + 100.0)) == [(0.0, pytest.approx(stop - 5.0, abs=row))]
     # silent before the start mark: the leg itself, but nothing from before the gap
-    (one,) = parts_of(silent(leg, (-8.0, -3.0)), 0.5)
+    (one,) = parts_of(silent(leg, (-8.0, -3.0)))
     assert (one.start_ns, one.stop_ns) == (leg.start_ns, leg.stop_ns)
     assert seconds(leg, one.imu).min() == pytest.approx(-3.0, abs=row)
 
@@ -93,7 +103,7 @@ def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):
     (only,) = calibrate_parts(dead, config)
     assert Code.IMU_GAP in {r.code for r in only.reasons}
     full = silent(made.leg(), *((t, t + 2.0) for t in np.arange(5.0, stop, 8.0)))
-    assert parts_of(full, 0.5) == [full]        # one that stutters is not cut to pieces
+    assert parts_of(full) == [full]        # one that stutters is not cut to pieces
     (only,) = calibrate_parts(full, config)
     assert only.verdict is Verdict.REJECTED
     assert Code.IMU_GAP in {r.code for r in only.reasons}

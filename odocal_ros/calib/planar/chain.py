@@ -46,9 +46,8 @@ class Equations:
     """
     Normal equations of the rows of one noise level, at level 1, of N nodes.
 
-    The states have the blocks ``diagonal`` and ``off_diagonal``, (N, s, s), and the gradient (N,
-    s); ``cross``, (N, s, m), is their product with the constants; the constants have
-    ``of_constants``, (m, m), and the gradient (m,).
+    Of the states: blocks ``diagonal`` and ``off_diagonal``, (N, s, s), gradient, (N, s), and the
+    product with the constants, ``cross``, (N, s, m). Of the constants: (m, m), gradient (m,).
     """
 
     def __init__(self, rows: Rows, nodes: int) -> None:
@@ -74,11 +73,7 @@ class Equations:
 
 
 class Solution:
-    """
-    Solution of the weighted sum of equations: steps of the states (N, s) and constants (m,).
-
-    ``information``, (m, m), is that of the constants, with the states eliminated.
-    """
+    """Solution of the weighted sum of equations: steps of the states (N, s) and constants (m,)."""
 
     def __init__(self, equations: list[Equations], weight: Floats, prior: Floats,
                  prior_gradient: Floats) -> None:

@@ -98,11 +98,7 @@ def _windows(path: Floats) -> Ints:
 
 
 class _Alignment:
-    """
-    Least-squares fit of dead-reckoned paths to positions, in w windows: rotation, scale, shift.
-
-    It holds the terms that do not depend on width and ratio of the wheels.
-    """
+    """Fit of dead-reckoned paths to positions in w windows: rotation, scale and shift."""
 
     def __init__(self, run: Run, position: Complexes, windows: Ints, scale_guess: float) -> None:
         forward, side, wheel_difference = run.wheels.body(run.wheels.count).T

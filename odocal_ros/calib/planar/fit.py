@@ -31,9 +31,7 @@ ESTIMATED = tuple(LEVELS)[:-1]       # the level of the gyro is its specificatio
 # judgement: sigmas of the hyperpriors of the logarithm of a variance
 WIDE_HYPERPRIOR, HYPERPRIOR_SIGMAS = 3.0, dict.fromkeys(('along', 'turn', 'spin'), 1.0)
 # degrees of freedom of Student's distribution of white errors and of steps of correlated ones,
-# for outliers and loop closures. Judgement; 16 SLAM runs each: rms of error over sigma of the
-# scale 0.79, 0.98 and 1.12 (wheels, skid, mecanum); with a normal distribution and a drift_length
-# of 5 m 1.08, 1.39 and 1.63
+# for outliers and loop closures. Judgement, measured: docs/decisions/0024
 STUDENT_FREEDOM = 4.0
 # m/s, added to the speed of wheels, moving and at rest, for noise that grows with time. Judgement
 SPEED_IN_MOTION, SPEED_AT_REST = 0.1, 1e-3
@@ -44,12 +42,7 @@ CONVERGED = 0.02    # largest last step: sigmas of a constant, logarithm of a le
 
 def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], None] = lambda
             *_: None) -> Fit:
-    """
-    Return the estimate of a run.
-
-    after_pass : called after each pass with its number and the largest step of a constant, in
-    sigmas.
-    """
+    """Return the estimate of a run; after_pass gets the pass and the largest step in sigmas."""
     initial = first_values(run, known.width)
     scale = (initial.left + initial.right) / 2
     prior_mean, prior = priors(run, known, initial.left, initial.right, initial.width)

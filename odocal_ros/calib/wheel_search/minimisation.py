@@ -122,12 +122,7 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
 
 
 class _BoxSearch:
-    """
-    The state of one search, in n search coordinates: the box of fitted points, and the range.
-
-    q, w : (n,) middle and half width of the box.   half : (3,) half range of x.   least : value of
-    the criterion at q.   on_edge : (n,) True where the minimum is on the edge of the range.
-    """
+    """State of a search: middle q and half width w of the box, (n,); half range of x, (3,)."""
 
     def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
                  x: Floats) -> None:

@@ -119,15 +119,16 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     space = Space(fixed_difference)
     if fixed_difference:
         direct = least_squares(leg, x[best], space, robust)
-    refined = _refined(leg, x[best], ranges, space, robust)
-    refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
+    refined = _refine(leg, x[best], ranges, space, robust)
+    refined_set, direct_set = (sets_of(leg, found.x)[0] for found in (refined, direct))
+    refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
     return SearchResult(
         (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, fixed_difference,
         refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
         score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, fixed_difference))
 
 
-def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
+def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
     """Minimise the mean square; robust: then Huber's mean, a cone far from its minimum."""
     def by(robust: bool) -> Callable[..., Any]:
         return lambda x: score(leg, sets_of(leg, x), robust, course=False).loss
@@ -138,10 +139,6 @@ def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bo
     again = refine(by(True), refined.x, ranges.step / 10, refined.half, space)
     return replace(again, widened=refined.widened or again.widened, first=refined.first,
                    iterations=refined.iterations + again.iterations)
-
-
-def _wrapped(parameters: Floats) -> Floats:
-    return np.array([*parameters[:2], wrap(parameters[2])])
 
 
 def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
