@@ -134,18 +134,15 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     """
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
-    The vertical errors of the marks are part of fix_start and fix_end; ``height`` is the height
-    error common to both, which scales the chord as a larger Earth would. ``projection`` is listed
-    although it is zero: the chord is in space, not in a plane.
+    ``height`` is the height error common to both marks, which scales the chord as a larger Earth
+    would. ``projection`` is zero: the chord is in space, not in a plane.
 
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
-    start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the
-    alignment or the start mark to the end mark.   alignment : level, heading and gyro sigmas.
-    quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas by
-    the residuals, east, north, up.   time_sigma : unknown delay of fixes, s.
+    start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from alignment
+    or start mark to end mark.   quantum : size of an odometer count, m.   fix_scale : (3,) factor
+    on the stated sigmas, east, north, up.   time_sigma, odometer_time_sigma : unknown delays, s.
     velocity_change : (3,) velocity at the end mark minus that at the start, m/s; zero between
-    standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown delay of
-    the odometer, s.
+    standing marks.   lever_arm_sigma : m, each axis.
     """
     forward = D[-1] / np.linalg.norm(D[-1])
     at_start = int(np.searchsorted(t, start.t - 1e-9))

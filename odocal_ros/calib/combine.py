@@ -65,8 +65,7 @@ def newest(results: Sequence[MethodResult],
     """
     Return the values of a single leg (gyro bias) from the last leg that has them.
 
-    Legs with one counter have no estimates of two wheels. The heading error in older results
-    applies to the start of a leg: a combination has none.
+    The heading error in older results applies to the start of a leg: a combination has none.
     """
     found: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):

@@ -175,9 +175,8 @@ def path_and_chord(t_fix: Floats, fixes_n: Floats,
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
-    The path connects fixes at least ten times their white noise apart: with closer ones noise
-    would accumulate. Fixes out of reach of a vehicle are left out.   least : smallest motion of
-    fixes that is significant, m.
+    The path connects fixes at least ten times their white noise, and ``least`` m, apart, so that
+    noise does not accumulate. Fixes out of reach of a vehicle are left out.
     """
     p = fixes_n[find_reachable(t_fix, fixes_n), :2]
     if len(p) < 2:

@@ -65,12 +65,10 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     """
     Return the plot data of a leg, at most KEPT_ROWS of each series.
 
-    leg : with all received fixes.   inputs : the screened leg.   track : epochs and attitude.
-    fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool, fixes without gross
-    errors; those within the time span of the track are shown.   pin : mark whose position the
-    paths are set to.   paths : the antenna's path as configured and as calibrated.   config :
-    settings in force.   t_fit : end of the fitted data, s.   covered : begin and end of the time
-    with an odometer, s.
+    leg, inputs : raw and screened.   fixes_n : (k, 3) m, at inputs.t_fix.   kept : (k,) fixes
+    without gross errors; those within the time of the track are shown.   pin : mark whose position
+    the paths are set to.   paths : as configured and as calibrated.   t_fit : end of the fitted
+    data, s.   covered : begin and end of the time with an odometer, s.
     """
     inside = (track.t >= covered[0]) & (track.t <= min(inputs.t_stop, covered[1]))
     t = track.t[inside]

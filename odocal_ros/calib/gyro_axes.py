@@ -185,9 +185,7 @@ def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
                sigma: float, least: float = GNSS_MOVES) -> float | None:
     """
-    Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
-
-    None if the drive hardly turns or the two are not correlated.
+    Return turns by the gyro over turns of the course by fixes, None without correlation.
 
     t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
     2 or more), float s, m, and m horizontally.   least : least significant motion of fixes, m.

@@ -220,8 +220,7 @@ class LinkedLegs:
         """
         Return the normalised residual of each leg's constants against the others': (J, m) sigmas.
 
-        The gradient of the leg at the joint estimate, over its sigma, for each constant: the test
-        of one additional unknown, as if the leg were left out (Baarda 1968), (S37).
+        The gradient of the leg at the joint estimate over its sigma (Baarda 1968), (S37).
         """
         x, C = self.solve()
         out = np.zeros((len(self.marginals), len(self.names)))

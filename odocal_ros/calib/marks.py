@@ -132,12 +132,11 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
            displacement_n: Callable[[Floats], Floats], correlation_time: float,
            window: float) -> MarkFix | None:
     """
-    Return the antenna position at a mark.
+    Return the antenna position at a mark at t_mark, s.
 
-    t_mark : s.   span : (begin, end) of the standstill at the mark, s; None in motion.
-    fixes : (t, position_n, covariance_n) of the leg.   displacement_n : function of (n,) times to
-    the (n, 3) motion of the antenna from the mark, m, dead reckoned.   correlation_time : as in
-    mean_fix.   window : seconds each side of a mark in motion.
+    span : (begin, end) of the standstill at the mark, s; None in motion.   fixes : (t, position_n,
+    covariance_n) of the leg.   displacement_n : function of (n,) times to the (n, 3) motion from
+    the mark, m.   correlation_time : as in mean_fix.   window : s each side of a mark in motion.
     """
     t, position_n, covariance_n = fixes
     low, high = span if span else (t_mark - window, t_mark + window)
@@ -158,10 +157,9 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
 
 def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:
     """
-    Return the means of columns over windows of SLOW_WINDOW with enough rows, and their counts.
+    Return counts, numbers and column means, (k,) each, of windows of SLOW_WINDOW with enough rows.
 
-    t : (n,) s; windows begin at the first.   columns : (n,) each.   Returns (k,) numbers of rows
-    in a window, (k,) window numbers, and a list of (k,) means.
+    t : (n,) s; windows begin at the first.   columns : (n,) each.
     """
     window = ((t - t[0]) / SLOW_WINDOW).astype(int)
     count = np.bincount(window)
@@ -176,12 +174,10 @@ def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
 
     It is by means of the residuals over windows, in which white errors average down. A slow part
     of a fifth of the variance is not observable in the scatter at a mark, but dominates its mean.
-    Only residuals along the chord are used, because gyro drift acts across it; a straight line
-    over the path, the effect of the errors of the two marks, is removed.
+    A straight line over the path, the effect of the errors of the two marks, is removed.
 
-    t, along, place : (n,) times, s, corrected track minus fixes along the chord, m, and position
-    along it, m.   variance : (n,) stated, m^2.   drift : possible track error by gyro drift along
-    the chord, m, which is subtracted.
+    t, along, place : (n,) s, corrected track minus fixes along the chord, m, and position there,
+    m.   variance : (n,) stated, m^2.   drift : possible track error by gyro drift along it, m.
     """
     count, number, (means, places) = window_means(t, along, place)
     if len(count) < 5:      # after mean and slope, a variance by five has a sigma of 80 %

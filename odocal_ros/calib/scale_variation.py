@@ -63,10 +63,8 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
     The dead-reckoned section is rotated, scaled and shifted onto its fixes by least squares. The
-    sigma is by the residuals, because most of the stated error is common to both ends of a
-    section. Fix errors are time-correlated: a first-order process is matched to power and
-    correlation of the residuals of all sections, as means of a few fixes. Errors that change more
-    slowly than over a section are not included.
+    sigma is by the residuals of all sections, as means of a few fixes, whose power and correlation
+    a first-order process matches. Errors that are constant in a section are not included.
 
     path : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
     fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
@@ -129,10 +127,9 @@ def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
 @lru_cache(maxsize=32)
 def _residual_properties(n: int) -> Floats:
     """
-    Return properties of a straight line fitted to n rows of a first-order process: (4, c).
+    Return properties of a line fitted to n rows of a first-order process, by CORRELATIONS: (4, c).
 
-    For each of CORRELATIONS and unit variance: mean square of the residuals, variance of the
-    slope, correlations of the residuals at BLOCK_LAGS.
+    Mean square of residuals and variance of the slope per variance, correlations at BLOCK_LAGS.
     """
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
     x /= np.linalg.norm(x, axis=0)
@@ -219,10 +216,9 @@ def _window_ratio(t: Floats, fix: Floats, dead: Floats,
 @dataclass(frozen=True, eq=False)
 class SpeedScale:
     """
-    Ratio of the distances of fixes and odometer by speed, with a fit (value, sigma).
+    Scale by speed, with a fit: fixes = factor * odometer + offset * time, the odometer late.
 
-    reference = factor * odometer + offset * time, with the odometer late by the lag; None if the
-    speeds do not determine them.
+    Each of the fit is (value, sigma), None if the speeds do not determine it.
     """
 
     bins: Floats  # (b, 4) speed m/s, ratio in m per unit, its sigma, number of cells

@@ -185,12 +185,10 @@ def medians(x: Floats) -> Floats:
 
 def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Floats]]:
     """
-    Return the number of rows in each bin, and the mean of each vector there.
+    Return the number of rows in each bin, (m,), and the mean of each vector there, (m, k).
 
     t : (n,) times of the rows, rising.   edges : (m + 1,) of the bins, in the same unit; a bin
-    includes its upper edge.   vectors : (n, k) values of the rows.
-
-    Returns (m,) counts, (m, k) means; 0 in an empty bin.
+    includes its upper edge.   vectors : (n, k) values of the rows; 0 in an empty bin.
     """
     first = np.searchsorted(t, edges, side='right')
     count = np.diff(first)

@@ -46,8 +46,7 @@ class Leg:
 
     Each topic has the rows from ``start_ns`` minus the pre-roll to the first row after
     ``stop_ns``, unchanged, in order of arrival. ``odometer`` is the only wheel or the first of
-    several; ``form_right`` is the meaning of the values of ``odometer_right``, None if it is that
-    of the first.
+    several; ``form_right`` is the form of ``odometer_right``, None: that of the first.
     """
 
     start_ns: int
@@ -107,12 +106,7 @@ class LegRecorder:
         return self._rows[slot].all()
 
     def snapshot(self) -> 'LegRecorder':
-        """
-        Return a recorder with the rows so far, which another thread may close.
-
-        This recorder continues unchanged: ``close`` joins the blocks of the copy, and joined
-        blocks can no longer be released one by one.
-        """
+        """Return a copy of the rows so far, for another thread; this one continues unchanged."""
         copy = LegRecorder()
         copy.form, copy.form_right = self.form, self.form_right
         copy._rows = {slot: rows.snapshot() for slot, rows in self._rows.items()}

@@ -116,8 +116,7 @@ class FixSamples(Samples):
     """
     GNSS fixes, or positions in a local frame with the status LOCAL.
 
-    A local frame has a fictitious place on the Earth (``nav/geodesy.py``): x, y and z are
-    treated as east, north and up, but its y axis does not point to north.
+    A local frame has a fictitious place on the Earth (``nav/geodesy.py``); y is not north.
     """
 
     latitude: Floats = column()                     # rad

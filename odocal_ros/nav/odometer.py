@@ -39,9 +39,8 @@ class Travel:
         """
         Return travel with the rounding of counts averaged, by parabolas over SMOOTHED.
 
-        The slope between two rounded rows is no speed: each step of the delay would give other
-        rounding errors, and a fit with few other errors would not converge. Rows beside gaps and
-        at the ends are kept.
+        The slope between rounded rows is no speed: rounding would change with the delay, and a fit
+        with few other errors would not converge. Rows beside gaps and at the ends are kept.
         """
         step = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
         m = int(SMOOTHED / step)        # rows to each side

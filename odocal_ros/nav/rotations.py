@@ -26,8 +26,7 @@ def arctan2(y: ArrayLike, x: ArrayLike) -> Floats:
     """
     Return np.arctan2, independent of the memory layout of the arguments.
 
-    numpy 1.26 (Jazzy) rounds the result for columns of a matrix depending on their addresses: live
-    and replay would differ in the last digits.
+    numpy 1.26 (Jazzy) rounds columns of a matrix by their addresses: live and replay would differ.
     """
     return np.arctan2(np.copy(y), np.copy(x))
 

@@ -23,10 +23,9 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     """
     Return begin and end of the standstills in order: (k, 2) s.
 
-    t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates with bias, rad/s.   travel : odometer
-    travel.   metres_per_unit : its approximate scale, above 0.   shortest : least duration, s.
-    The edges are inside the true standstill by up to the window; if a slow start needs longer than
-    that for REST_TRAVEL, or for a count and a half, its begin is included.
+    t_imu, w_b : (n,), (n, 3) s, and turn rates with bias, rad/s.   metres_per_unit : approximate
+    scale, above 0.   shortest : least duration, s.   The edges are inside the true standstill by
+    up to the window; a start that is too slow for the window is included.
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
         return np.empty((0, 2))

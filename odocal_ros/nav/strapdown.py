@@ -164,11 +164,9 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     """
     Return times (m,), s, and attitudes (m, 4), unit quaternions, propagated by gyro samples.
 
-    t : (n,) sample times, s, rising.   w_b : (n, 3) turn rate of b relative to inertial space,
-    rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
-    earth_rate_n : (3,) Earth rate in n, rad/s (n is fixed to the Earth).   every : keep one epoch
-    in this many: t[0], t[every], ... and the last sample.   bias : (3,) of the gyro, subtracted,
-    rad/s.
+    t : (n,) s, rising.   w_b : (n, 3) turn rate of b relative to inertial space, rad/s.   q_nb0 :
+    (4,) attitude at t[0], x y z w.   earth_rate_n : (3,) rad/s (n is fixed to the Earth).
+    every : keep one epoch in this many, and the last.   bias : (3,) of the gyro, rad/s.
     """
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     if not len(t):

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Alignment of a leg at its start: choice of the standstill and of the heading source.
-
-The computations are those of ``nav/alignment.py``.
-"""
+"""Alignment of a leg: choice of the standstill and of the heading source."""
 
 from collections.abc import Iterable
 from dataclasses import replace

@@ -30,9 +30,8 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     """
     Return a method's result with an error in the sigmas of its scales.
 
-    method, prepared : the result, and the leg.   name : of the source.   relative : relative
-    1 sigma of each of SCALES; for a wheel by default that of the scale factor.   shared : the same
-    in every leg of the vehicle.
+    name : of the source.   relative : relative 1 sigma of each of SCALES; for a wheel by default
+    that of the scale factor.   shared : the same in every leg of the vehicle.
     """
     if not method.estimates['scale_factor'].value:
         return method

@@ -38,9 +38,8 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     """
     Return a leg prepared for the methods, None if none can be run on it, and all reasons.
 
-    leg, inputs, config : raw and screened leg, and the settings in force.   reasons : those found
-    so far.   alignment : used instead of the leg's own.   holdout : hold the last fifth of the
-    distance out of the fit.
+    reasons : those found so far.   alignment : used instead of the leg's own.   holdout : hold the
+    last fifth of the distance out of the fit.
     """
     located = locate_fixes(inputs, config)
     release_mapped_memory()

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The smoother on one leg, with the paths by its estimates.
-
-It uses all samples and needs no external heading. With the method ``patent`` the search of two
-wheels of CN104359492A is added.
-"""
+"""The smoother on one leg, its paths, and the search of two wheels of patent CN104359492A."""
 
 from collections.abc import Mapping
 from dataclasses import replace

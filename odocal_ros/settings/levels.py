@@ -4,11 +4,9 @@
 """
 Limits that several packages use: sigmas of reasons, and motions of land vehicles.
 
-The comment on a level is the two-sided probability of exceeding it by chance.
-
 The comment on a number states its origin: physical, with its source; statistical, with its
-frequency by chance; tuned, with the benchmark; judgement, if nothing was measured; format, of a
-specification; or definition: a unit, a layout, a quadrature, a convention of a source.
+two-sided frequency by chance; tuned, with the benchmark; judgement, if nothing was measured;
+format, of a specification; or definition: a unit, a layout, a convention of a source.
 """
 
 from dataclasses import dataclass

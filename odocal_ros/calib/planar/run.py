@@ -28,9 +28,8 @@ def wheel_rows(kind: str, count: int, offset: float = 0.0) -> Floats:
     """
     Return the rows of the wheels of a drive: (w, 3).
 
-    kind : as odometer.drive.   count : of omni wheels, counter-clockwise.   offset : rad from the
-    x axis to the first, as in omni_wheel_drive_controller: positive wheel motion is clockwise
-    about the middle, seen from above.
+    kind : as odometer.drive.   count : of omni wheels, counter-clockwise.   offset : rad from x to
+    the first; positive motion is clockwise about the middle, as in omni_wheel_drive_controller.
     """
     if kind == MECANUM:
         return MECANUM_ROWS
