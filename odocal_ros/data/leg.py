@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A leg: the samples between two marks, and the recorder that collects them.
-
-The recorder is used live and in replay.
-"""
+"""A leg: the samples between two marks, and the recorder that collects them live and in replay."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -66,15 +62,18 @@ class Leg:
         return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(self.rows(slot).stamp_ns)))
 
     def rows(self, slot: str) -> Any:
+        """Return the samples of a slot."""
         rows = self.others.get(slot) if slot in OTHERS else getattr(self, slot)
         return EMPTY[slot]() if rows is None else rows
 
     def with_rows(self, **rows: Samples) -> 'Leg':
+        """Return the leg with other samples in some slots."""
         others = {slot: rows.pop(slot) for slot in OTHERS if slot in rows}
         changed: dict[str, Any] = {'others': {**self.others, **others}, **rows}
         return replace(self, **changed)
 
     def form_of(self, slot: str) -> OdometerForm:
+        """Return the meaning of the values of a wheel."""
         return self.form_right or self.form if slot == WHEELS[1] else self.form
 
 
@@ -92,10 +91,10 @@ class LegRecorder:
         if len(block.stamp_ns):
             self._rows[slot].feed(block)
 
-    def adopt(self, slot: str, other: 'LegRecorder', own: str) -> None:
+    def adopt(self, slot: str, other: 'LegRecorder', other_slot: str) -> None:
         """Use the rows of a slot of another recorder, if it has any."""
-        if len(other.rows(own).stamp_ns):
-            self._rows[slot] = other._rows[own].snapshot()
+        if len(other.rows(other_slot).stamp_ns):
+            self._rows[slot] = other._rows[other_slot].snapshot()
 
     def newest_ns(self, slot: str) -> int:
         """Return the stamp of the last row fed, 0 before the first."""
@@ -116,7 +115,7 @@ class LegRecorder:
         """Drop blocks that are completely before a stamp, to limit memory."""
         for slot in slots:
             self._rows[slot].forget(
-                lambda block: _placed(block.stamp_ns, block.received_ns) < stamp_ns)
+                lambda block: _order_ns(block.stamp_ns, block.received_ns) < stamp_ns)
 
     def clear(self) -> None:
         """Drop everything, as after a jump of time."""
@@ -151,12 +150,14 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns).with_rows(**rows)
 
 
-def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
+def _order_ns(stamp_ns: Ints, received_ns: Ints) -> Ints:
+    """Return the stamps, and the arrival of rows without one: (n,) ns."""
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
 def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
-    key = by_row(_placed, samples.stamp_ns, samples.received_ns)
+    """Return the rows between two stamps, and up to the first one after them."""
+    key = by_row(_order_ns, samples.stamp_ns, samples.received_ns)
     after_ns = 600 * 10**9    # a first row later than that after a mark has no information on it
     after = key[(key > stop_ns) & (key <= stop_ns + after_ns)]
     last_ns = after.min() if len(after) else stop_ns

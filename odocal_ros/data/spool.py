@@ -30,21 +30,22 @@ MOVED_BYTES = 2**20     # judgement: bytes written at a time
 class Rows:
     """The rows of one topic, in order of arrival."""
 
-    def __init__(self, nothing: Callable[[], Samples]) -> None:
-        self._nothing, self.newest_ns = nothing, 0     # stamp of the last row fed
-        self._blocks: list[Samples] = []           # after those of the file
-        self._fresh: list[Samples] = []            # small ones, after the blocks
-        self._size = self._fresh_size = 0     # bytes of both, of the small ones
-        self._file: _Columns | None = None
-        self._stop = 0                    # number of this object's rows in the file
-        self._writes = True
+    def __init__(self, make_empty: Callable[[], Samples]) -> None:
+        self._make_empty, self.newest_ns = make_empty, 0     # stamp of the last row fed
+        self._file: _Columns | None = None    # the first rows
+        self._stop = 0                        # number of this object's rows in the file
+        self._blocks: list[Samples] = []      # after those of the file
+        self._small: list[Samples] = []       # small blocks, after the blocks
+        self._size = self._small_size = 0     # bytes of both, and of the small blocks
+        self._writes = True                   # False: the file is not written
 
     def feed(self, block: Samples) -> None:
+        """Append a block."""
         size, self.newest_ns = _size(block), int(block.stamp_ns[-1])
-        self._fresh.append(block)
-        self._fresh_size += size
+        self._small.append(block)
+        self._small_size += size
         self._size += size
-        if self._fresh_size >= MERGED_BYTES or size >= LARGE_BYTES:
+        if self._small_size >= MERGED_BYTES or size >= LARGE_BYTES:
             self._merge()
             if self._size > (MEMORY_BYTES if self._file is None else TAIL_BYTES):
                 self._to_file()
@@ -56,7 +57,7 @@ class Rows:
             self._to_file()
         parts = [*([self._file.rows(self._stop)] if self._file else []), *self._blocks]
         if not parts:
-            return self._nothing()
+            return self._make_empty()
         if len(parts) > 1:
             self._hold([join(parts)])
             return self._blocks[0]
@@ -67,9 +68,9 @@ class Rows:
         if self._file is not None:
             self._merge()
             self._to_file()
-        copy = Rows(self._nothing)
+        copy = Rows(self._make_empty)
         copy._writes = False              # only this object writes to the file
-        copy._hold([*self._blocks, *self._fresh])
+        copy._hold([*self._blocks, *self._small])
         copy._file, copy._stop, copy.newest_ns = self._file, self._stop, self.newest_ns
         return copy
 
@@ -82,23 +83,23 @@ class Rows:
             kept = slice(late[0], None) if len(late) else slice(0, 0)
             self._hold([take(rows, np.arange(len(rows.stamp_ns))[kept])])
         if self._file is None:
-            blocks, keep = [*self._blocks, *self._fresh], 0
+            blocks, keep = [*self._blocks, *self._small], 0
             while keep < len(blocks) and before(blocks[keep]).all():
                 keep += 1
             large = max(0, len(self._blocks) - keep)
             self._size -= sum(map(_size, blocks[:keep]))
-            self._fresh_size -= sum(map(_size, blocks[len(self._blocks):keep]))
+            self._small_size -= sum(map(_size, blocks[len(self._blocks):keep]))
             self._blocks = self._blocks[len(self._blocks) - large:]
-            self._fresh = blocks[keep + large:]
+            self._small = blocks[keep + large:]
 
     def _hold(self, blocks: list[Samples]) -> None:
-        self._blocks, self._fresh, self._file, self._stop = blocks, [], None, 0
-        self._size, self._fresh_size = sum(map(_size, blocks)), 0
+        self._blocks, self._small, self._file, self._stop = blocks, [], None, 0
+        self._size, self._small_size = sum(map(_size, blocks)), 0
 
     def _merge(self) -> None:
-        if self._fresh:
-            self._blocks.append(join(self._fresh))
-            self._fresh, self._fresh_size = [], 0
+        if self._small:
+            self._blocks.append(join(self._small))
+            self._small, self._small_size = [], 0
 
     def _to_file(self) -> None:
         """Move the blocks to the file, as far as the disk has space."""
@@ -122,6 +123,7 @@ class _Columns:
             (unnamed_file(), column.dtype, column.shape[1:]) for column in columns_of(like)]
 
     def write(self, block: Samples, at: int) -> int:
+        """Write a block from row ``at`` on; return the row after it."""
         for (file, dtype, shape), column in zip(self._files, columns_of(block), strict=True):
             data = np.ascontiguousarray(column, dtype).reshape(-1).view(np.uint8).data
             offset, done = at * dtype.itemsize * math.prod(shape), 0
@@ -137,6 +139,7 @@ class _Columns:
             for file, dtype, shape in self._files))
 
     def row(self, at: int) -> Samples:
+        """Return one row, read."""
         return of_columns(self._kind, *(
             np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
             for file, dtype, shape in self._files

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Combination of the results of legs to the calibration of a vehicle.
-
-Selects the usable legs, combines each method, chooses the method of each value, and collects the
-reasons, including those against legs of different vehicles.
-"""
+"""Combination of the results of legs to a calibration: usable legs, methods, values, reasons."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

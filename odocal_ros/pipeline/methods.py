@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The methods, each a pure function of a prepared leg, and the result of the leg from theirs.
-
-``run_leg`` runs the methods that the settings select, and compares their tracks with the fixes.
-"""
+"""The methods, each a pure function of a prepared leg, and the result of the leg from theirs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

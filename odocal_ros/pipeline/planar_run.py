@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The planar estimator on one leg: wheels without an IMU, skid steering, mecanum and omni wheels.
-
-Input is the raw leg; wheels and positions are put on common times, nodes.
-"""
+"""The planar estimator on a leg: wheels without an IMU, skid steering, mecanum, omni wheels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

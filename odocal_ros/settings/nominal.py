@@ -13,7 +13,7 @@ from odocal_ros.settings.config import Config, ImuConfig
 
 
 def nominal_scale(config: Config, unit: str) -> float:
-    """Return K0: as configured, from the wheel's size, or 1 for speeds; 0 unknown."""
+    """Return K0: as configured, from the size of the wheel, or 1 for speeds; 0: unknown."""
     if config.odometer.nominal_scale:
         return config.odometer.nominal_scale
     wheels = config.wheels
@@ -25,7 +25,7 @@ def nominal_scale(config: Config, unit: str) -> float:
 
 
 def nominal_yaw(config: Config) -> float:
-    """Return the yaw mounting angle as set, 0 where it is not, rad."""
+    """Return the yaw mounting angle as configured, rad; 0 if it is not."""
     yaw = config.imu.nominal_yaw
     return 0.0 if isnan(yaw) else yaw
 
@@ -115,7 +115,7 @@ def grade_with_turn_on_bias(imu: ImuConfig) -> Grade:
     return dataclasses.replace(grade_of(imu), accel_bias=turn_on_bias(imu)[1])
 
 
-# setting of a figure, if its name differs
+# figure of a Grade: its setting, if the name differs
 SETTING_OF_FIGURE = {'gyro_scale_error': 'gyro_scale_sigma',
                      'accel_scale_error': 'accel_scale_sigma',
                      'misalignment': 'misalignment_sigma',
