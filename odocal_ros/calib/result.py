@@ -18,8 +18,8 @@ from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
 NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
-                    'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
-                    'pitch_mounting_angle_housing_sigma'})
+                           'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
+                           'pitch_mounting_angle_housing_sigma'})
 AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps
 FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
 TRACE = 'trace'      # key of the details of a method that raised: its traceback

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib import slip, wheel_pair_regression as regression
+from odocal_ros.calib.wheel_pair_regression import MEAN_STEPS, WHOLE_DRIVE_SIGMAS
 from odocal_ros.data.arrays import Bools, Floats, running_sum, runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
@@ -51,7 +52,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     count : number of wheels in the mean.
     """
     pair = wheels_on_grid(axle, imu, between, slip.SLIP_GRID,
-                         np.empty(0) if uncertain_t is None else uncertain_t)
+                          np.empty(0) if uncertain_t is None else uncertain_t)
     if pair is None or not metres_per_unit:
         return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)
@@ -110,19 +111,19 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
     """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
-    mean = (total[regression.MEAN_STEPS:] - total[:-regression.MEAN_STEPS]) / regression.MEAN_STEPS
+    mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
     unknown = running_sum(~pair.known)
     significant = np.zeros(len(pair.t), bool)
     windows = []
-    for span in (gap + regression.MEAN_STEPS for gap in SLIP_SPANS):
+    for span in (gap + MEAN_STEPS for gap in SLIP_SPANS):
         jump = mean[span:] - mean[:-span]
         if len(jump) < span:
             continue
         limit = _jump_limits(pair, jump, span, quantum_m * (pair.quantum > 0), width)
         far = np.abs(jump) > limit
-        far &= unknown[span + regression.MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
+        far &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
         for k in np.flatnonzero(far):
-            significant[k + regression.MEAN_STEPS:k + span] = True
+            significant[k + MEAN_STEPS:k + span] = True
         windows.append((span, jump, limit, far))
     finished: list[Event] = []
     slow: list[Event] = []
@@ -162,7 +163,7 @@ def _mean_path(pair: WheelPair) -> Floats:
 def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
                  width: float) -> Floats:
     """Return the limit of jumps between two means that occur by chance, m: (n,)."""
-    n, ends = len(jump), span + regression.MEAN_STEPS - 1
+    n, ends = len(jump), span + MEAN_STEPS - 1
     path = _mean_path(pair)
     total_turn = running_sum(np.abs(np.diff(pair.turn)))
     distance = path[ends:][:n] - path[:n]
@@ -171,13 +172,12 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
         usual = robust_sigma(jump[distance > 0])
         scatter = usual * np.maximum(1.0, distance / np.median(distance[distance > 0]))
     turn = TURN_SHARE * width * (total_turn[ends:][:n] - total_turn[:n])
-    n_mean = regression.MEAN_STEPS
-    counts = (path[n_mean - 1:] - path[:len(path) - n_mean + 1]) / max(pair.quantum, 1e-9)
-    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, n_mean)
+    counts = (path[MEAN_STEPS - 1:] - path[:len(path) - MEAN_STEPS + 1]) / max(pair.quantum, 1e-9)
+    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
     # rounding is bounded: at most one count at both ends of both wheels
-    rounding = np.minimum(regression.WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
+    rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
                           (2 * quantum_m)**2)
-    return np.sqrt(regression.WHOLE_DRIVE_SIGMAS**2 * (scatter**2 + GROUND_SIGMA**2 + turn**2)
+    return np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (scatter**2 + GROUND_SIGMA**2 + turn**2)
                    + rounding)
 
 
@@ -186,20 +186,20 @@ def _measure_jump(pair: WheelPair, residual: Floats,
     """Return the event in steps a to b, by its best window: (span, jump, limit, significant)."""
     found = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
     for span, jump, limit, far in windows:
-        low, high = max(0, a - regression.MEAN_STEPS), max(0, b - span + 1)
+        low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
         at = low + np.flatnonzero(far[low:high])
         if len(at):
             k = int(at[np.argmax(np.abs(jump[at]))])
             # a longer window is better only if its jump is larger by more than its noise
-            noise = limit[k] / regression.WHOLE_DRIVE_SIGMAS
+            noise = limit[k] / WHOLE_DRIVE_SIGMAS
             if abs(jump[k]) > abs(found[0]) + bool(found[1]) * noise:
                 found = (float(jump[k]), float(limit[k]), k, span)
     size, _, k, span = found
-    inner = residual[k:k + span + regression.MEAN_STEPS]
-    share = (inner - inner[:regression.MEAN_STEPS].mean()) / size if size else inner
+    inner = residual[k:k + span + MEAN_STEPS]
+    share = (inner - inner[:MEAN_STEPS].mean()) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
     late = np.flatnonzero(share >= 0.9)
-    late = late[late >= regression.MEAN_STEPS // 2]
+    late = late[late >= MEAN_STEPS // 2]
     end = int(late[0]) if len(late) else len(inner) - 1
     return float(pair.t[k + min(begin, end)]), float(pair.t[k + max(begin, end)]), size
 

@@ -144,7 +144,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     methods = {name: run.result for name, run in runs.items()}
     found = [*reasons_on_data(runs, prepared), *choice.disagreements(methods)]
     found += choice.rejected_method_reasons(methods, selected_method,
-                                     {r.code for r in (*prepared.reasons, *found)})
+                                            {r.code for r in (*prepared.reasons, *found)})
     estimates, _ = choice.choose(methods, selected_method)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
