@@ -39,7 +39,7 @@ class Columns(NamedTuple):
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
 
 
-Block = list[Chunk | Damaged]
+Block = list[Chunk | Damaged]      # chunks of a block; the damage of those not readable
 ReadChunks = Callable[[Sequence[ChunkIndex]], Block]     # reads adjacent chunks
 # returns time, channel and bytes of each message, or raises Damaged
 ScanChunk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]

@@ -4,13 +4,13 @@
 """An mcap file, read by its index, or record by record if that is missing or invalid."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+import heapq
 from operator import itemgetter
 from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio import mcap_records as mcap
+from odocal_ros.bagio import bag_file, mcap_records as mcap
 from odocal_ros.bagio.bag_file import BagFile, Batch, Channel, FileBytes, FORMATS
 from odocal_ros.bagio.mcap_columns import batches
 from odocal_ros.safe_io.limits import Allowance, Damaged, LATEST_NS
@@ -82,21 +82,29 @@ class McapFile(BagFile):
         return True
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
-        """Yield the messages of some topics (name -> type), chunk by chunk."""
+        """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
         channels = self._channels_of(topics)
-        for time_ns, key, raw in self._all_entries():
-            if key in channels:
-                yield channels[key], time_ns, raw
+        self._allowance.restart()
+        entries = self._by_time(channels) if self._chunks else (
+            entry for entry in self._scan_records() if entry[1] in channels)
+        for time_ns, key, raw in entries:
+            yield channels[key], time_ns, raw
         self._recount()
 
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
         """Return the messages in batches; None if the index is missing or of other chunks."""
         channels = self._channels_of(topics)
-        chunks = [chunk for chunk in self._chunks
-                  if not chunk.channels or chunk.channels & channels.keys()]
-        is_valid = all(self._file[chunk.offset + 9:chunk.offset + 25] == mcap.TIMES.pack(
-            chunk.start_ns, chunk.end_ns) for chunk in chunks)
-        return self._indexed_batches(chunks, channels) if self._chunks and is_valid else None
+        chunks = self._chunks_with(channels)
+        if not self._chunks or any(
+                self._file[chunk.offset + 9:chunk.offset + 25] != mcap.TIMES.pack(
+                    chunk.start_ns, chunk.end_ns) for chunk in chunks):
+            return None
+        return self._indexed_batches(chunks, channels)
+
+    def _chunks_with(self, channels: Mapping[int, Channel]) -> list[mcap.ChunkIndex]:
+        """Return the chunks that may have messages of some channels."""
+        return [chunk for chunk in self._chunks
+                if not chunk.channels or chunk.channels & channels.keys()]
 
     def _indexed_batches(self, chunks: list[mcap.ChunkIndex],
                          channels: Mapping[int, Channel]) -> Iterator[Batch]:
@@ -131,25 +139,37 @@ class McapFile(BagFile):
             self._count()
             self._counted_damage = self.damage
 
-    def _messages_of(self, index: mcap.ChunkIndex) -> list[Entry]:
+    def _by_time(self, channels: Mapping[int, Channel]) -> Iterator[Entry]:
+        """Yield messages in order of time, with the chunks that overlap unpacked at once."""
+        for group in bag_file.group_overlapping(self._chunks_with(channels)):
+            yield from self._merged(group, channels)
+
+    def _merged(self, chunks: list[mcap.ChunkIndex],
+                channels: Mapping[int, Channel]) -> Iterator[Entry]:
+        def lazily(chunk: mcap.ChunkIndex) -> Iterator[Entry | tuple[int]]:
+            yield (chunk.start_ns,)        # the chunk is unpacked at its start time
+            yield from self._messages_of(chunk, channels)
+        return (entry for entry in heapq.merge(*map(lazily, chunks), key=itemgetter(0))
+                if len(entry) > 1)
+
+    def _messages_of(self, index: mcap.ChunkIndex, channels: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; [] if it is damaged."""
         try:
             (chunk,) = self._read_chunks([index])
             if isinstance(chunk, Damaged):
                 raise chunk
-            return self._messages_by_scan(chunk)
+            found = self._messages_by_scan(chunk)
         except Damaged as error:
             self._report_damage(error)
             return []
+        return [entry for entry in found if entry[1] in channels]
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        return ((key, time_ns) for time_ns, key, _ in self._all_entries())
-
-    def _all_entries(self) -> Iterator[Entry]:
-        """Return every message, chunk by chunk: of the index, or of a scan without one."""
         self._allowance.restart()
-        return chain.from_iterable(map(self._messages_of, self._chunks)) if self._chunks \
-            else self._scan_records()
+        entries = (entry for chunk in self._chunks
+                   for entry in self._messages_of(chunk, self._channels)
+                   ) if self._chunks else self._scan_records()
+        return ((key, time_ns) for time_ns, key, _ in entries)
 
     def _scan_records(self) -> Iterator[Entry]:
         """Yield every message from the first record on, chunk by chunk."""

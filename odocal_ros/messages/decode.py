@@ -35,8 +35,8 @@ from odocal_ros.settings.config import Config
 
 # judgement: unreadable messages after which messages without a layout are skipped
 UNREADABLE_LIMIT = 20_000
-Deserialize = Callable[[bytes], object]
-Feed = Callable[[str, Samples], None]
+Deserialize = Callable[[bytes], object]      # CDR to an object of rclpy or rosbags
+Feed = Callable[[str, Samples], None]        # receives a slot and its samples
 
 
 class RowReader(Protocol):

@@ -139,7 +139,7 @@ GEODETIC = (FIX, *GPS_FIXES)
 # format: status of a GPSFix with satellite corrections; others above 2: base station, as 2
 WAAS_FIX = 33
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-Pairs = list[tuple[str, samples.Samples]]
+Pairs = list[tuple[str, samples.Samples]]      # slot and samples
 Build = Callable[..., samples.Samples]  # function of stamps, arrivals and the columns of a sensor
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
 NOT_SENT_BITS = np.float64(-1).view(np.int64)

@@ -19,8 +19,8 @@ from odocal_ros.data.samples import FRAME_BYTES, OtherImuSamples
 from odocal_ros.messages import cdr
 
 Bytes = bytes | bytearray | memoryview
-Rows = Ints | Bools | slice
-Table = NDArray[np.uint8]
+Rows = Ints | Bools | slice      # selected messages: numbers, mask or slice
+Table = NDArray[np.uint8]      # (n, size): a message in each row
 # judgement: layouts per message length; messages of further ones are read one by one
 MAX_LAYOUTS = 16
 FEW_ROWS = 8      # judgement: messages up to which single reads take less time than a table
