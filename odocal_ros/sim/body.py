@@ -79,7 +79,7 @@ def sprung_response(static_tilt: Floats, step: float) -> tuple[Floats, Floats]:
     """
     Return value and rate, (n,) each, of ``y'' + 2 z w y' + w^2 y = w^2 u`` from rest.
 
-    push : (n,) u, the static tilt, rad, linear between rows.   step : s, between rows.
+    static_tilt : (n,) u, rad, linear between rows.   step : s, between rows.
     """
     w, z = FREQUENCY, DAMPING
     damped = w * np.sqrt(1 - z**2)      # frequency, rad/s

@@ -149,7 +149,7 @@ def tyre_slip(state: State, real: Real) -> Floats:
 
 
 def leg_factor(state: State, real: Real, slipped: Floats) -> float:
-    """Return the true path over that of the count with a cold wheel; spun: slip at starts, m."""
+    """Return the true path over that of the count with a cold wheel; slipped: at starts, m."""
     if not (real.speed_law or real.warming or real.tyre_slip or slipped.any()):
         return 1.0
     path_length = np.diff(state.travel)
