@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Encoding of samples as ROS 2 messages (CDR, little endian), for simulated bags.
-
-Messages of one topic all have the same length (one frame_id, one set of joint names), so a block
-of them is one structured array in numpy; no message objects are created.
-"""
+"""Encoding of samples as ROS 2 messages (CDR), in numpy: those of a topic have one length."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

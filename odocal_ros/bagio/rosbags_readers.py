@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What the package rosbags reads: message types defined in a bag, and rosbag1 files.
-
-rosbags trusts a file, so both are limited: a definition is parsed in bounded time, and the sizes
-that a rosbag1 file states for its index and chunks are checked.
-"""
+"""Message types defined in a bag, and rosbag1 files: read by rosbags, within limits."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

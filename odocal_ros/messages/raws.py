@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Serialised messages in one buffer, grouped into tables of equal layout, and selected by frame_id.
-
-A table, (n, size) bytes, has one message in each row, so that numpy reads a field of all at once.
-"""
+"""Serialised messages in one buffer; as tables of equal layout, a message in each row."""
 
 from collections.abc import Callable, Iterator, Sequence
 import struct

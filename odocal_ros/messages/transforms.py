@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-TF as a position reference: positions of a robot from the transforms on /tf and /tf_static.
-
-The transform from ``reference.frames[0]`` to ``[1]`` may consist of several, which different nodes
-send at different times; ``nav/frame_chain.py`` interpolates and multiplies them.
-"""
+"""TF as position reference: positions of a robot from the transforms on /tf and /tf_static."""
 
 from collections.abc import Callable, Container, Mapping, Sequence
 import struct
