@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Cold start: level, gyro bias, scale, heading and yaw mounting angle, without initial values.
+Cold start: the first state of a fit, from samples alone.
+
+Estimated are tilt, gyro bias, scale, heading and yaw mounting. The frame L is level, with the
+heading of the IMU at the first keyframe; n has east and north. Horizontal vectors are complex,
+x + i y or east + i north: a factor exp(i a) rotates by a.
 
 The gyro gives the attitude relative to the first keyframe. The mean specific force of the drive is
 up; its apparent rotation is the gyro bias about the horizontal axes. The fit of the odometer's
@@ -11,7 +15,6 @@ change of this angle is the gyro bias about up. The heading alone is the rotatio
 force to the accelerations of the track. A gyro warms up: a long leg is divided into sections.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,20 +27,22 @@ from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import Intervals, preintegrate
 from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.nav.alignment import level_frame
+from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.rotations import exp_so3, skew, wrap
 from odocal_ros.nav.time_series import fit_robust_line
 
-SECTION_LENGTH = 600.0      # s, judgement: in which one bias levels a gyro that warms up
+SECTION_LENGTH = 600.0      # s, judgement: a gyro that warms up has one bias for this time
 
 
 class FittedTrack:
     """
-    The odometer's track in the level frame, x of b taken as forward, fitted to the fixes.
+    The track of the odometer, with the x axis of b as forward axis, fitted to the fixes.
 
-    X : (N,) travel units, complex.   K : m per unit.   chi : rad, rotation to the fixes at the
-    first keyframe.   slope : rad/s, its change, None without fixes.   place : (N,) m, east + i
-    north.   height : (N,) m.   scatter : m, of the fixes about the track.
+    X : (N,) scale units, complex, in L.   K : metres per unit.   chi : rad, rotation from X to the
+    fixes at the first keyframe.   slope : rad/s, its change with time, None without fixes.
+    chi_at : (N,) rad, at the keyframes.   place : (N,) m, complex, in n.   height : (N,) m.
+    scatter : m, of the fixes about the track.
     """
 
     def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
@@ -77,22 +82,22 @@ class FittedTrack:
         self.scatter = max(float(scatter) / 1.18, 1e-3)
 
     def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
-        """Return the track plus the smoothed difference from the fixes: (N,) m, east + i north."""
+        """Return the track plus the smoothed difference from the fixes: (N,) m, complex, in n."""
         steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
-        off = z - np.interp(t_fix, t, path)
-        east, north = (_window_medians(t, t_fix, x) for x in (off.real, off.imag))
+        difference = z - np.interp(t_fix, t, path)
+        east, north = (_window_medians(t, t_fix, x) for x in (difference.real, difference.imag))
         return path + east + 1j * north
 
 
 def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
-    """Return medians over windows of 20 s, interpolated to t, without the effect of outliers."""
+    """Return medians of y over windows of 20 s, interpolated to t; zeros without fixes: (N,)."""
     if not len(y):
         return np.zeros(len(t))
-    cells = np.floor((t_fix - t_fix[0]) / 20.0).astype(int)
-    at = np.unique(cells)
-    middle = [np.median(t_fix[cells == c]) for c in at]
-    out: Floats = np.interp(t, middle, [np.median(y[cells == c]) for c in at])
+    window = np.floor((t_fix - t_fix[0]) / 20.0).astype(int)
+    masks = [window == k for k in np.unique(window)]
+    out: Floats = np.interp(t, [np.median(t_fix[mask]) for mask in masks],
+                            [np.median(y[mask]) for mask in masks])
     return out
 
 
@@ -101,20 +106,20 @@ class _Section:
     """A section of a leg."""
 
     t: Floats           # (n,) s, of its keyframes
-    C_Lk: Floats        # (n, 3, 3) attitudes in its level frame
-    bias: Floats        # (3,) rad/s
+    C_Lk: Floats        # (n, 3, 3) attitudes, from b to its frame L
+    bias: Floats        # (3,) rad/s, of the gyro
     track: FittedTrack
-    psi: float          # rad, rotation from the level frame to n by accelerations
-    sigma: float        # rad
+    psi: float          # rad, rotation from L to n, by accelerations
+    sigma: float        # rad, of psi
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state and its uncertainty; its sections give the state for another yaw."""
+    """A first state and its uncertainty, and what is needed for the state with another yaw."""
 
     state: State
-    yaw_sigma: float        # rad, of the heading by acceleration
-    fix_scatter: float       # m, scatter of the fixes about the track
+    yaw_sigma: float        # rad, of the heading by accelerations
+    fix_scatter: float      # m, scatter of the fixes about the track
     leg: SmootherLeg
     sections: list[_Section]
     scale: float            # metres per unit of travel
@@ -129,8 +134,8 @@ def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     """
     Return the first state of a cold start.
 
-    leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
-    initial yaw mounting, rad, instead of the one estimated from accelerations.
+    imu : IMU steps of the leg.   priors : of the gyro bias.   yaw : initial yaw mounting, rad,
+    instead of the one estimated from accelerations.
     """
     sections = _estimate_sections(leg, imu, priors)
     K = float(np.average([section.track.K for section in sections],
@@ -139,16 +144,16 @@ def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     weight = np.array([1 / section.sigma**2 for section in sections])
     sigma = 1 / np.sqrt(weight.sum()) if weight.any() else np.inf
     if yaw is None:       # rad: beyond this sigma, the heading is ambiguous
-        turned = [np.exp(1j * (section.psi - section.track.chi)) for section in sections]
-        yaw = float(np.angle(weight @ turned)) if sigma <= 0.2 else 0.0
+        rotations = [np.exp(1j * (section.psi - section.track.chi)) for section in sections]
+        yaw = float(np.angle(weight @ rotations)) if sigma <= 0.2 else 0.0
     return Start(_join_sections(leg, sections, K, yaw), float(sigma),
                  float(np.median([section.track.scatter for section in sections])), leg, sections,
                  K)
 
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
-    """Return the sections of a leg, of about SECTION_LENGTH each, with biases of their own."""
-    # one whose heading no fixes determine is joined with the next, at the end with the one before
+    """Return the sections of a leg, each of about SECTION_LENGTH or longer."""
+    # without enough fixes for a heading, it is joined with the next, the last with the one before
     count = max(1, round(float(np.ptp(imu.t[imu.key])) / SECTION_LENGTH))
     ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
     sections, firsts = list[_Section](), [0]
@@ -177,13 +182,13 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
     bias = before if rest is None else rest
     sigma = np.maximum(priors.gyro_bias_sigma, 1e-3) if rest is None else np.full(3, 2e-4)
     K, change = len(imu.key) - 1, np.zeros(3)
-    found, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
-                            np.array([1.0, 0.0, 0.0]), np.empty(0))
-    sums, C_0k = change_gyro_bias(found, change)
+    at_bias, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
+                              np.array([1.0, 0.0, 0.0]), np.empty(0))
+    sums, C_0k = change_gyro_bias(at_bias, change)
     for _ in range(2):
-        up, more = _find_level(leg, sums, C_0k, sigma)
-        change = change + more
-        sums, C_0k = change_gyro_bias(found, change)
+        up, correction = _find_level(leg, sums, C_0k, sigma)
+        change = change + correction
+        sums, C_0k = change_gyro_bias(at_bias, change)
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
     t = imu.t[imu.key]
@@ -191,19 +196,19 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
         change = change - track.slope * up_b / np.linalg.norm(up_b)
-        sums, C_0k = change_gyro_bias(found, change)
+        sums, C_0k = change_gyro_bias(at_bias, change)
         C_Lk = level_frame(up) @ C_0k
         track = FittedTrack(leg, t, C_Lk, sums)
     return _Section(t, C_Lk, bias + change, track, *_find_heading(leg, t, C_Lk, sums, track))
 
 
 def change_gyro_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
-    """Return sums for a gyro bias changed by (3,), to first order, and the attitudes C_0k."""
-    by = slice(0, 3)
+    """Return sums with a gyro bias increased by ``change``, and the attitudes C_0k: (N, 3, 3)."""
+    bias = slice(0, 3)
     S = sums.S.copy()
-    S[:, :, 0] += sums.S_by_gyro[:, :, by] @ change
-    sums = replace(sums, R=exp_so3(-sums.R_by_gyro[:, :, by] @ change) @ sums.R,
-                   dv=sums.dv + sums.dv_by_gyro[:, :, by] @ change, S=S)
+    S[:, :, 0] += sums.S_by_gyro[:, :, bias] @ change
+    sums = replace(sums, R=exp_so3(-sums.R_by_gyro[:, :, bias] @ change) @ sums.R,
+                   dv=sums.dv + sums.dv_by_gyro[:, :, bias] @ change, S=S)
     C = np.empty((len(sums.T) + 1, 3, 3))
     C[0] = np.eye(3)
     for k, R in enumerate(sums.R):
@@ -216,8 +221,8 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     """Return up in the frame of the first keyframe and the change of the gyro bias: (3,) each."""
     C, T = C_0k[:-1], sums.T
     force = np.einsum('kij,kj->ki', C, sums.dv) / T[:, None]
-    turned = np.cumsum(C @ sums.A, axis=0)       # of one rad/s of bias, at interval ends
-    turned = turned - C @ sums.A / 2
+    # rotation by a bias of one rad/s, at mid interval
+    rotation = np.cumsum(C @ sums.A, axis=0) - C @ sums.A / 2
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
     up = up / np.linalg.norm(up)
@@ -226,7 +231,7 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     change = np.zeros(3)
     for _ in range(3):
         J = np.concatenate([np.broadcast_to(np.eye(3) * g, (len(T), 3, 3)),
-                            -g * skew(up) @ turned], axis=2) * weight[:, None, None]
+                            -g * skew(up) @ rotation], axis=2) * weight[:, None, None]
         r = (force - g * up) * weight[:, None]
         H = np.einsum('kri,krj->ij', J, J) + np.diag(np.r_[np.zeros(3), 1 / bias_sigma**2])
         x = np.linalg.solve(H, np.einsum('kri,kr->i', J, r))
@@ -238,20 +243,20 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
 
 def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
                   track: FittedTrack) -> tuple[float, float]:
-    """Return the rotation from the level frame to n from accelerations, rad, and its sigma."""
-    # change of velocity along the track = a times the integral of specific force in the level
-    # frame, plus a tilt (constant in that frame) and an accelerometer bias (constant in b)
+    """Return the rotation from L to n by accelerations, rad, and its sigma."""
+    # least squares: change of velocity along the track = x_0 times the integral of the specific
+    # force in L, plus a tilt (constant in L) and an accelerometer bias (constant in b)
     direction = C_Lk[:, 0, 0] + 1j * C_Lk[:, 1, 0]
     direction = direction / np.maximum(np.abs(direction), 1e-9)
     v = track.K * odometer_speed(leg.travel.at, t) * direction * np.exp(1j * track.chi_at)
     F = (C_Lk[:-1] @ sums.dv[:, :, None])[:, :, 0]
     F = F[:, 0] + 1j * F[:, 1]
-    bend = np.exp(1j * (track.chi_at[:-1] - track.chi))
+    drift = np.exp(1j * (track.chi_at[:-1] - track.chi))
     T = sums.T
     lag = min(3, len(T))
     kernel = np.ones(lag)
     columns = [np.convolve(c, kernel, 'valid')
-               for c in (F * bend, T.astype(complex), T * direction[:-1] * bend)]
+               for c in (F * drift, T.astype(complex), T * direction[:-1] * drift)]
     y = v[lag:] - v[:-lag]
     A = np.stack(columns, -1)
     w = np.ones(len(y))
@@ -264,32 +269,28 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
         usual = max(np.median(r) / 1.18, 1e-3)
         w = np.minimum(1.0, 2 * usual / np.maximum(r, 1e-9))
         sigma = usual * np.sqrt(lag * np.linalg.inv(H)[0, 0].real) / max(abs(x[0]), 1e-9)
-    if abs(x[0]) < 0.5:
-        sigma = np.inf
-    return float(np.angle(x[0])), float(sigma)
+    return float(np.angle(x[0])), float(sigma) if abs(x[0]) >= 0.5 else np.inf
 
 
 def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
     """Return the state of a section with scale and yaw mounting of the leg."""
     t, track, N = section.t, section.track, len(section.t)
-    turned = np.exp(1j * (track.chi_at + yaw))
-    c, s = turned.real, turned.imag
-    spin = np.zeros((N, 3, 3))
-    spin[:, 0, 0], spin[:, 0, 1], spin[:, 1, 0], spin[:, 1, 1], spin[:, 2, 2] = c, -s, s, c, 1.0
-    C_nb = spin @ section.C_Lk
+    C_nL = np.zeros((N, 3, 3))
+    C_nL[:, 0, 0] = C_nL[:, 1, 1] = np.exp(1j * (track.chi_at + yaw)).real
+    C_nL[:, 1, 0] = np.exp(1j * (track.chi_at + yaw)).imag
+    C_nL[:, 0, 1], C_nL[:, 2, 2] = -C_nL[:, 1, 0], 1.0
+    C_nb = C_nL @ section.C_Lk
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
-    ahead = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
-    v_n = (C_nb @ ahead) * (K * odometer_speed(leg.travel.at, t))[:, None]
+    v_n = (C_nb @ forward_b(yaw, 0.0)) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
     return State(t, p_n, v_n, C_nb, np.tile(section.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
                  np.zeros((N, 3)), constants)
 
 
-def _join_sections(leg: SmootherLeg, sections: 'Sequence[_Section]', K: float,
-                   yaw: float) -> State:
-    """Return the states of adjacent sections as one; each begins where the one before ends."""
+def _join_sections(leg: SmootherLeg, sections: list[_Section], K: float, yaw: float) -> State:
+    """Return the states of adjacent sections as one; their common keyframes appear once."""
     states = [_state(leg, section, K, yaw) for section in sections]
     columns = [one.keyframe_arrays() for one in states]
     return replace(states[0], **{name: np.concatenate([

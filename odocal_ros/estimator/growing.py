@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The fit of a leg that grows, in windows of ten minutes.
+The fit of a leg that is still being driven, repeated as it grows.
 
-A finished window contributes its marginal information on the constants, (S33). Only the window in
-progress is fitted: an update after an hour costs no more than one after ten minutes. It starts
-from the previous fit, with keyframes that keep their times and the state extended by dead
-reckoning: new samples change the earlier states only a little, so few passes are enough.
+The leg is divided into windows of ten minutes. A finished window contributes its marginal
+information on the constants, (S33) of docs/method.md. Only the window in progress is fitted: an
+update after an hour costs no more than one after ten minutes. It starts from the previous fit,
+with keyframes that keep their times and the state extended by dead reckoning: new samples change
+the earlier states only a little, so few passes are enough.
 """
 
 from collections.abc import Callable
@@ -39,19 +40,19 @@ from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 
-# s, judgement: length from which a window is finished, once the next has this length
+# s, judgement: length of a window, and of the next one before the window is no longer fitted
 LONG_WINDOW, NEXT_WINDOW = 600.0, 120.0
-UPDATE_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
+UPDATE_PASSES = 2       # judgement: from the last fit; WARM_START_PASSES more without convergence
 COLD_START_GROWTH = 1.5       # judgement: growth of the window after which a fit is a cold start
 DRIVING_SPEED = 0.5     # m/s; judgement: slower motion does not count as driving
 
 
 @dataclass(frozen=True, eq=False)
 class RunningEstimate:
-    """The running estimate."""
+    """The result of a leg so far, and figures of its motion for forecasts."""
 
     method: MethodResult  # result if the leg ended here
-    sigmas: Floats        # (3,) of ln scale, yaw, pitch, also of undetermined ones; inf: fixed
+    sigmas: Floats        # (3,) of ln K, yaw, pitch, also of undetermined ones; inf: fixed
     distance: float       # m
     agility: float        # m^2/s^3, integral of the squared horizontal acceleration
     speed: float          # m/s, median while driving
@@ -61,17 +62,17 @@ class GrowingFit:
     """
     The fit of one leg while it grows.
 
-    cpu_s : returns the CPU time used so far, s.   ``cold_start_cpu_s`` : CPU time of the last fit
-    if it was a cold start; these become rarer as a window grows.
+    cpu_s : returns the CPU time used so far, s.   ``cold_start_cpu_s`` : CPU time, s, of the last
+    fit if it was a cold start after an earlier fit, else 0.
     """
 
     def __init__(self, cpu_s: Callable[[], float]) -> None:
         self._cpu_s = cpu_s
         self.cold_start_cpu_s = 0.0
         self._last: WarmStart | None = None
-        self._per_effective: dict[str, float] = {}
-        self._cold_at = 0.0      # s, length of the window at its last cold start
-        # the finished windows, and with the one in progress, and where they end, s
+        self._rows_per_independent: dict[str, float] = {}
+        self._cold_start_length = 0.0      # s, length of the window at its last cold start
+        # estimate and end, s: of the finished windows, and of these with the long one in progress
         self._past: tuple[RunningEstimate, float] | None = None
         self._next: tuple[RunningEstimate, float] | None = None
 
@@ -83,9 +84,9 @@ class GrowingFit:
         """
         Return the running estimate.
 
-        view : the leg so far: the earlier leg in the same frame, and more.   trace : called
-        between passes; its exceptions are passed on.   Raises BadData without a fit and without a
-        finished window; the next fit is then a cold start.
+        view : the leg so far, in the same frame as before.   trace : called between passes; its
+        exceptions are passed on.   Raises BadData if the fit fails and no window is finished; the
+        next fit is then a cold start.
         """
         self.cold_start_cpu_s = 0.0
         if self._next is not None and view.t_stop - self._next[1] > NEXT_WINDOW:
@@ -108,6 +109,7 @@ class GrowingFit:
 
     def _window(self, last: WarmStart | None, view: SmootherLeg, config: Config,
                 trace: Trace) -> RunningEstimate:
+        """Return the estimate of the window in progress; raises BadData."""
         try:
             with raise_on_overflow():
                 problem = make_problem(view, config, make_imu_steps(view, SPACING))
@@ -118,23 +120,25 @@ class GrowingFit:
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = best.summary()
-        self._per_effective = problem.rows_per_independent
+        self._rows_per_independent = problem.rows_per_independent
         return RunningEstimate(method, _parameter_sigmas(method), *_motion_summary(best.state))
 
     def _fit(self, last: WarmStart | None, problem: Problem, config: Config, trace: Trace) -> Fit:
-        problem.rows_per_independent = self._per_effective
+        """Return the fit of a window, from the last fit if there is one and it can be extended."""
+        problem.rows_per_independent = self._rows_per_independent
         duration = problem.leg.t_stop - problem.leg.t_begin
-        grown = duration > COLD_START_GROWTH * self._cold_at
-        begun = None if last is None or grown else extend_warm_start(last, problem)
-        if begun is None:
-            begin, self._cold_at = self._cpu_s(), duration
+        has_grown = duration > COLD_START_GROWTH * self._cold_start_length
+        start = None if last is None or has_grown else extend_warm_start(last, problem)
+        if start is None:
+            cpu_s, self._cold_start_length = self._cpu_s(), duration
             best = best_fit(problem, config, trace)
-            self.cold_start_cpu_s = self._cpu_s() - begin if last is not None else 0.0
+            self.cold_start_cpu_s = self._cpu_s() - cpu_s if last is not None else 0.0
             return best
         # the levels are kept until the state of the new section is estimated as well
-        near = fit(problem, begun.state, begun.levels, 1, frozen=True, warm_start=begun,
-                   trace=trace).summary()
-        best = fit(problem, near.state, near.levels, UPDATE_PASSES, warm_start=near, trace=trace)
+        first = fit(problem, start.state, start.levels, 1, frozen=True, warm_start=start,
+                    trace=trace).summary()
+        best = fit(problem, first.state, first.levels, UPDATE_PASSES, warm_start=first,
+                   trace=trace)
         if not best.converged or best.slowly_converging:
             best = fit(problem, best.state, best.levels, WARM_START_PASSES, warm_start=best,
                        trace=trace)
@@ -156,9 +160,8 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
         now.method, estimates=now.method.estimates | whole.estimates, marginal=whole.marginal,
         reasons=tuple(reasons.values()),
         sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
-    return RunningEstimate(method, sigmas, past.distance + now.distance, past.agility
-                           + now.agility,
-                           now.speed)
+    return RunningEstimate(method, sigmas, past.distance + now.distance,
+                           past.agility + now.agility, now.speed)
 
 
 def _parameter_sigmas(method: MethodResult) -> Floats:
@@ -181,19 +184,19 @@ def _information(method: MethodResult) -> MarginalInformation:
 
 
 def _motion_summary(state: State) -> tuple[float, float, float]:
-    """Return distance, agility and speed of a window, as ``RunningEstimate`` has them."""
+    """Return ``distance``, ``agility`` and ``speed`` of a window, see ``RunningEstimate``."""
     T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
     moving = steps > DRIVING_SPEED * T
-    gained = np.diff(state.v_n[:, :2], axis=0)
-    return (max(float(steps.sum()), 1.0), float((gained**2).sum(axis=1) @ (1 / T)),
+    change = np.diff(state.v_n[:, :2], axis=0)
+    return (max(float(steps.sum()), 1.0), float((change**2).sum(axis=1) @ (1 / T)),
             float(np.median((steps / T)[moving])) if moving.any() else 0.0)
 
 
 def make_imu_steps(view: SmootherLeg, spacing: float) -> ImuSteps:
     """
-    Return the steps of a leg whose keyframes keep their times as it grows.
+    Return the IMU steps of a leg, with keyframes that keep their times as it grows.
 
-    They lie at multiples of ``spacing``; first and last row are keyframes too.
+    Keyframes are at multiples of ``spacing``, s, and at the first and the last sample.
     """
     first, t = imu_rows(view)
     k = nearest_samples(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
@@ -206,22 +209,22 @@ def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
     """
     Return the start from the last fit, extended to new keyframes.
 
-    None if keyframes differ, or the constants in use: a sensor started to publish.
+    None if earlier keyframes differ, or the number of used constants: a sensor started to publish.
     """
     t, old = problem.imu.t[problem.imu.key], last.state.t
     rounding = 1e-6     # s
     at = np.clip(np.searchsorted(old, t - rounding), 0, len(old) - 1)
     same = np.abs(old[at] - t) < rounding
-    n = len(t) if same.all() else int(np.argmin(same))
-    # s at the end, in which rows may have arrived late
+    n = len(t) if same.all() else int(np.argmin(same))      # keyframes that the last fit has
+    # samples of the last 3 s may have arrived late
     if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
         return None
     at = at[:n]
     state = replace(last.state, **{
         name: value[at] for name, value in last.state.keyframe_arrays().items()})
-    slipped = [last.variance_factors[a:b].mean(axis=0) for a,
-               b in zip(at[:-1], at[1:], strict=True)]
-    variance_factors = np.concatenate([slipped, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
+    earlier = [last.variance_factors[first:end].mean(axis=0)
+               for first, end in zip(at[:-1], at[1:], strict=True)]
+    variance_factors = np.concatenate([earlier, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
     levels = problem.initial_levels.replaced(**last.levels.values)
     return WarmStart(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
                      last.priors, problem.priors, variance_factors)
@@ -233,24 +236,24 @@ def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     key = imu.key[n - 1:]
     rows = replace(imu, key=key)
     K, c = len(key) - 1, state.constants
-    on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
-          for name, value in state.keyframe_arrays().items()}
-    t = on['t'] = imu.t[imu.key]
-    on['travel_error'][n:] = 0.0
+    out = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
+           for name, value in state.keyframe_arrays().items()}
+    t = out['t'] = imu.t[imu.key]
+    out['travel_error'][n:] = 0.0
     f = state.scale * state.forward
-
     travel = as_rolled(leg.travel, c)
-    sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
-                           f, np.empty(0), c)
+    sums, _ = preintegrate(rows, out['gyro_bias'][n:], out['accel_bias'][n:], travel, f,
+                           np.empty(0), c)
+    C = out['C_nb']
     for k in range(K):
-        on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
-    C = on['C_nb']
+        C[n + k] = C[n + k - 1] @ sums.R[k]
     arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
     steps = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
-    on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(steps, axis=0)
-    on['v_n'][n:] = (C[n:] @ f) * odometer_speed(travel, t[n:])[:, None]
-    gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
-        on['p_n'][n:], leg.origin)
-    for late in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
-        on['v_n'][n + late] = on['v_n'][n + late - 1] + gained[late]
-    return State(**on, constants=c)
+    out['p_n'][n:] = out['p_n'][n - 1] + np.cumsum(steps, axis=0)
+    out['v_n'][n:] = (C[n:] @ f) * odometer_speed(travel, t[n:])[:, None]
+    change = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
+        out['p_n'][n:], leg.origin)
+    # after the last odometer reading by the IMU
+    for i in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
+        out['v_n'][n + i] = out['v_n'][n + i - 1] + change[i]
+    return State(**out, constants=c)

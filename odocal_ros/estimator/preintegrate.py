@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Preintegration: dR, dv, dp and S of each interval, and up to times within it, docs/method.md (S4).
+Preintegration: sums of the IMU steps over each interval, and up to times in it, (S4).
 
-All values are in the body frame at the start of the interval, independent of the position of the
-vehicle. R is the attitude since then, dv and dp the single and double integral of R f, S the sum
-of R over travel (dR, dv, dp: Forster et al. 2017). IMU errors d are constant within a step: they
-rotate R by -A d, with A the integral of R, and change the force accordingly. There is no loop over
-steps: rotations are prefix products, the other values cumulative sums, in chunks of intervals.
+``preintegrate`` returns them at given biases and IMU constants, with their derivatives by these
+(docs/method.md; Forster et al. 2017). All values are in the axes of b at the start of the
+interval, independent of the state there. R is the rotation since then, dv and dp the single and
+double integral of R f with the specific force f, S the integral of R over the odometer's travel.
+
+IMU errors d are constant within a step: they rotate R by -A d, with A the integral of R, and turn
+the force. Rotations are prefix products, the other values cumulative sums, in chunks of intervals.
 """
 
 from collections.abc import Callable
@@ -33,34 +35,35 @@ from odocal_ros.nav.strapdown import prefix_product
 
 # judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
-# definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f
-# with its bias): the g-sensitivity of the gyro has the latter, so that b_a does not turn
+# definition: indices of the signals that errors of gyro and accelerometer multiply, of: 1, turn
+# rate (3), specific force (3), x and y of the force with its bias. The g-sensitivity of the gyro
+# has the latter, so that an accelerometer bias does not turn the attitude
 OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Sums over K intervals of length T, s; (K, ...) in the body frame at each begin."""
+    """Sums over K intervals, in the axes of b at their starts; g, a : constants GYRO, ACCEL."""
 
-    T: Floats        # (K,)
+    T: Floats        # (K,) s, length
     R: Floats        # (K, 3, 3) attitude at the end
     dv: Floats       # (K, 3) m/s
     dp: Floats       # (K, 3) m
-    A: Floats        # (K, 3, 3) integral of R (1 - M_a), s: d dv = -A d ba
-    AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
-    F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
-    #                  less their biases: d dv = -F d constants; A times the mean force may be
-    #                  millimetres off, which would determine a scale that is not observable
-    FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
-    # by the gyro bias (3) and by the constants of GYRO (g)
-    R_by_gyro: Floats     # (K, 3, 3 + g) an error d of them turns the end by -R_by_gyro d
-    dv_by_gyro: Floats    # (K, 3, 3 + g) derivative of dv
+    A: Floats        # (K, 3, 3) s, integral of R (1 - M_a): minus the derivative of dv by the bias
+    AA: Floats       # (K, 3, 3) s^2, its integral: minus the derivative of dp
+    # (K, 3, a) minus the derivative of dv by ACCEL. By the force of each step: with the mean
+    # force, millimetres would determine a scale that is not observable
+    F: Floats
+    FF: Floats       # (K, 3, a) its integral: minus the derivative of dp
+    # by gyro bias and GYRO: minus the rotation of the end, and derivatives of dv, dp, S @ forward
+    R_by_gyro: Floats     # (K, 3, 3 + g)
+    dv_by_gyro: Floats    # (K, 3, 3 + g)
     dp_by_gyro: Floats    # (K, 3, 3 + g)
-    S: Floats        # (K, 3, 3) sum of R over travel, scale units
-    S_by_gyro: Floats     # (K, 3, 3 + g) derivative of S @ forward
-    mean_rate: Floats   # (K, 3) mean measured turn rate less its bias, rad/s
-    mean_force: Floats  # (K, 3) mean measured specific force less its bias, m/s^2
-    longest_step: Floats   # (K,) longest gap between IMU rows, s
+    S: Floats             # (K, 3, 3) integral of R over travel, scale units
+    S_by_gyro: Floats     # (K, 3, 3 + g)
+    mean_rate: Floats     # (K, 3) rad/s, measured turn rate minus its bias
+    mean_force: Floats    # (K, 3) m/s^2, measured specific force minus its bias
+    longest_step: Floats  # (K,) s, longest time between IMU samples
 
     def take(self, rows: slice) -> 'Intervals':
         """Return the intervals of a slice."""
@@ -69,10 +72,10 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Sums from the begin of an interval to m times within it."""
+    """Sums from the start of an interval to m times in it; see ``Intervals``."""
 
     interval: Ints   # (m,)
-    tau: Floats      # (m,) s since the begin
+    tau: Floats      # (m,) s since the start
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)
     R: Floats        # (m, 3, 3)
@@ -83,10 +86,10 @@ class Points:
     R_by_gyro: Floats     # (m, 3, 3 + g)
     dv_by_gyro: Floats    # (m, 3, 3 + g)
     dp_by_gyro: Floats    # (m, 3, 3 + g)
-    force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
-    rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
-    spin: Floats     # (m, 3) rad/s^2, its rate of change
-    measured: Floats    # (m, 6) turn rate and specific force less their biases, means of the step
+    force: Floats    # (m, 3) m/s^2, specific force at the time, in the axes at the start
+    rate: Floats     # (m, 3) rad/s, turn rate at the time, in the axes at this time
+    rate_change: Floats    # (m, 3) rad/s^2, its rate of change
+    measured: Floats    # (m, 6) turn rate and specific force minus their biases, means of the step
 
     def take(self, index: Ints) -> 'Points':
         """Return the points selected by an index."""
@@ -102,47 +105,42 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     """
     Return the sums over all intervals, and up to points within them.
 
-    imu : steps.   gyro_bias, accel_bias : (K, 3) taken out, one for each interval.   travel : (m,)
-    times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by_gyro.
-    t_points : (m,) times of fixes, rising, within the keyframes.   constants : (M,) of which GYRO
-    and ACCEL are taken out.
+    gyro_bias, accel_bias : (K, 3) of each interval, subtracted.   travel : function of times, (m,)
+    s, in scale units.   forward : (3,) scale times forward axis, for S_by_gyro.   t_points : (m,)
+    sorted times between the first and the last keyframe.   constants : (M,), errors GYRO and ACCEL
+    of which are subtracted.
     """
     out: list[Intervals] = []
     points: list[Points] = []
     t, K = imu.t, len(imu.key) - 1
-    owner = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
-    per = max(1, int(STEPS_AT_A_TIME * K / len(t)))
-    for first in range(0, K, per):
-        last = min(first + per, K)
-        mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
-        part = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
-        steps = part.steps_of(t_points[mine], owner[mine] - first)
-        part.cut(steps)
-        out.append(part.intervals(travel, forward))
-        points.append(part.points(t_points[mine], steps, owner[mine] - first, first))
+    interval = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
+    size = max(1, int(STEPS_AT_A_TIME * K / len(t)))
+    for first in range(0, K, size):
+        last = min(first + size, K)
+        inside = slice(np.searchsorted(interval, first), np.searchsorted(interval, last))
+        chunk = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
+        steps = chunk.steps_of(t_points[inside], interval[inside] - first)
+        chunk.cut(steps)
+        out.append(chunk.intervals(travel, forward))
+        points.append(chunk.points(t_points[inside], steps, interval[inside] - first, first))
         release_mapped_memory()
     return _joined(Intervals, out), _joined(Points, points)
 
 
 def _joined(cls: type[Some], parts: list[Some]) -> Some:
-    if len(parts) == 1:
-        return parts[0]
-    return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts])
-                  for f in fields(cls)})
+    return parts[0] if len(parts) == 1 else cls(**{
+        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
 def _cross(a: Floats, M: Floats) -> Floats:
     """Return [a x] M: (n, 3), (n, 3, 3)."""
     x, y, z = (a[:, i, None] for i in range(3))
-    out = np.empty_like(M)
-    out[:, 0] = y * M[:, 2] - z * M[:, 1]
-    out[:, 1] = z * M[:, 0] - x * M[:, 2]
-    out[:, 2] = x * M[:, 1] - y * M[:, 0]
-    return out
+    return np.stack([y * M[:, 2] - z * M[:, 1], z * M[:, 0] - x * M[:, 2],
+                     x * M[:, 1] - y * M[:, 0]], axis=1)
 
 
-def _by(step: Floats, signals: Floats) -> Floats:
-    """Return the columns of (n, 3, 3) times each of signals (n, s): (n, 3, 3, s)."""
+def _times(step: Floats, signals: Floats) -> Floats:
+    """Return matrices (n, 3, 3) times each of the signals (n, s): (n, 3, 3, s)."""
     return step[:, :, :, None] * signals[:, None, None, :]
 
 
@@ -154,14 +152,14 @@ class _Chunk:
         key = imu.key[first:last + 1]
         rows = slice(key[0], key[-1])
         self.t, self.key = imu.t[key[0]:key[-1] + 1], key - key[0]
-        self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
+        self.interval = np.repeat(np.arange(len(key) - 1), np.diff(key))    # of each step
         self.dt = np.diff(self.t)
         self.longest, dt = imu.longest[rows], self.dt[:, None]
-        biases = np.concatenate([gyro_bias, accel_bias], axis=1)[self.own] * dt
-        # signals that biases and constants of gyro and accelerometer multiply
+        biases = np.concatenate([gyro_bias, accel_bias], axis=1)[self.interval] * dt
+        # integrals over each step of the signals of OF_GYRO and OF_ACCEL
         self.signals = np.concatenate([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]],
                                       axis=1)
-        # shares of the signals that are errors, docs/method.md (S3)
+        # M_g and M_a of docs/method.md (S3)
         self.by_gyro, self.by_accel = np.zeros((3, 5)), np.zeros((3, 3))
         if constants is not None:
             self.by_gyro[layout.GYRO_AXIS, layout.GYRO_SIGNAL] = constants[layout.GYRO]
@@ -176,10 +174,10 @@ class _Chunk:
         q = quat_multiply(quat_from_rotvec(-rotate(self.G, gyro)),
                           quat_from_rotvec(imu.turn[rows]))
         q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
-        back = quat_conjugate(q[self.key[:-1]])[self.own]
+        back = quat_conjugate(q[self.key[:-1]])[self.interval]
         self.R = matrix_from_quat(quat_multiply(back, q[:-1]))
         self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
-        # a rotation that grows over the step multiplies the force times the time since its start
+        # an error that rotates the step uniformly turns a force by its time since the start
         self.grows = np.eye(3) + skew(self.turn) / 3
         dv, dp, turned = imu.dv[rows], imu.dp[rows], rotate(self.grows, gyro)
         dv, dp = (dv - np.cross(turned, dv - dp / dt) - rotate(self.G, accel),
@@ -189,12 +187,13 @@ class _Chunk:
         self.p, self.dp = self._running(self.v * dt + self.step_p)
         # integrals of R over a step, single and double
         self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        self.since = self.t[:-1] - self.t[self.key[:-1]][self.own]      # s, begin of the interval
+        # s, from the start of the interval to that of the step
+        self.since = self.t[:-1] - self.t[self.key[:-1]][self.interval]
 
     def _gyro(self, x: Floats) -> Floats:
         """Return the effects of a gyro's bias and constants, (n, 3, 3 + g), from (n, 3, 3, 6)."""
-        signals = [0, 0, 0, *np.add(layout.GYRO_SIGNAL, 1)]
-        out: Floats = x[:, :, [0, 1, 2, *layout.GYRO_AXIS], signals]
+        out: Floats = x[:, :, [0, 1, 2, *layout.GYRO_AXIS],
+                        [0, 0, 0, *np.add(layout.GYRO_SIGNAL, 1)]]
         out[:, :, :3] = out[:, :, :3] @ (np.eye(3) - self.by_gyro[:, :3])
         return out
 
@@ -204,11 +203,11 @@ class _Chunk:
                 x[:, :, layout.ACCEL_AXIS, np.add(layout.ACCEL_SIGNAL, 1)])
 
     def _running(self, step: Floats) -> tuple[Floats, Floats]:
-        """Return the sum before each step since the interval's begin, and each interval's sum."""
+        """Return the sums since the start of the interval before each step, and over intervals."""
         total = np.cumsum(step, axis=0)
         before = total - step
         start = before[self.key[:-1]]
-        return before - start[self.own], total[self.key[1:] - 1] - start
+        return before - start[self.interval], total[self.key[1:] - 1] - start
 
     def _sum(self, step: Floats) -> Floats:
         """Return the sum of each interval."""
@@ -221,27 +220,27 @@ class _Chunk:
 
     def cut(self, steps: Ints) -> None:
         """
-        Sum the effects of errors in each step, from the interval start to its end and to steps.
+        Sum the effects of IMU errors in the steps up to each cut: interval starts and ``steps``.
 
         An error in a step acts on the rest of the interval: a rotation on the rest of dv and dp, a
         force for the remaining time. Terms that depend on the end are factors of the sums
         (``_effects``).
         """
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
-        dt, by = self.dt[:, None], self.signals
+        dt, signals = self.dt[:, None], self.signals
         end, v, p = self.since[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
         moment, grown = self.step_v - self.step_p / dt, self.R @ self.grows
         self.sums = [self._before(*one) for one in (
-            (self.mean, by),
-            (_cross(v, self.mean) - _cross(moment, grown), by[:, OF_GYRO]),
+            (self.mean, signals),
+            (_cross(v, self.mean) - _cross(moment, grown), signals[:, OF_GYRO]),
             (_cross(p + self.step_p - v * end, self.mean)
-             + _cross(moment * end - self.step_v * (dt / 6), grown), by[:, OF_GYRO]),
-            (self.twice - self.mean * end[:, :, None], by[:, OF_ACCEL]))]
+             + _cross(moment * end - self.step_v * (dt / 6), grown), signals[:, OF_GYRO]),
+            (self.twice - self.mean * end[:, :, None], signals[:, OF_ACCEL]))]
 
     def _before(self, step: Floats, signals: Floats) -> Floats:
         """Return the sums of (n, 3, 3) times signals (n, s) before each cut and up to the last."""
         out = np.zeros((len(self.cuts) + 1, 3, 3, signals.shape[1]))
-        np.add.reduceat(_by(step, signals), self.cuts, out=out[1:])
+        np.add.reduceat(_times(step, signals), self.cuts, out=out[1:])
         return np.cumsum(out, axis=0, out=out)
 
     def _effects(self, begin: Ints, end: Ints, dv: Floats, dp: Floats,
@@ -258,42 +257,44 @@ class _Chunk:
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
         T, ds = np.diff(self.t[self.key]), np.diff(travel(self.t))[:, None]
-        moved = self.mean * ds[:, :, None]
-        walked, walk = self._running(moved @ forward)
-        S_rest = walk[self.own] - walked - moved @ forward
-        cross, ahead = skew(self.turn), skew(forward)
-        own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
-        S_by_gyro = self._sum(_by(_cross(S_rest, self.mean) + self.R @ own * ds[:, :, None],
-                             self.signals[:, OF_GYRO]))
+        S = self.mean * ds[:, :, None]      # of each step
+        path_before, path = self._running(S @ forward)
+        path_after = path[self.interval] - path_before - S @ forward
+        turn_x, forward_x = skew(self.turn), skew(forward)
+        in_step = forward_x / 2 + (turn_x @ forward_x + skew(np.cross(self.turn, forward))) / 6
+        S_by_gyro = self._sum(_times(
+            _cross(path_after, self.mean) + self.R @ in_step * ds[:, :, None],
+            self.signals[:, OF_GYRO]))
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
             self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
         measured = self._sum(self.signals[:, 1:7]) / T[:, None]
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
-                         dp_by_gyro, self._sum(moved), self._gyro(S_by_gyro), measured[:, :3],
+                         dp_by_gyro, self._sum(S), self._gyro(S_by_gyro), measured[:, :3],
                          measured[:, 3:], np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
-        """Return the sums to times in steps j, a cut each: rate and force change evenly in it."""
+        """Return the sums to times t in steps j: rate and force change uniformly in a step."""
         h, dt = (t - self.t[j])[:, None], self.dt[j, None]
-        rise = (6 * self.step_v[j] - 12 * self.step_p[j] / dt) / dt**2
-        force = self.step_v[j] / dt - rise * dt / 2
-        dv = self.v[j] + force * h + rise * h**2 / 2
-        dp = self.p[j] + self.v[j] * h + force * h**2 / 2 + rise * h**3 / 6
-        spin = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
-        rate = self.turn[j] / dt - spin * dt / 2
-        R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
+        force_change = (6 * self.step_v[j] - 12 * self.step_p[j] / dt) / dt**2
+        force = self.step_v[j] / dt - force_change * dt / 2
+        dv = self.v[j] + force * h + force_change * h**2 / 2
+        dp = self.p[j] + self.v[j] * h + force * h**2 / 2 + force_change * h**3 / 6
+        rate_change = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
+        rate = self.turn[j] / dt - rate_change * dt / 2
+        R = self.R[j] @ exp_so3(rate * h + rate_change * h**2 / 2)
         tau = t - self.t[self.key[interval]]
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
             self.key[interval], j, dv, dp, tau[:, None, None])
-        # errors within the step itself
-        share, by = (h / dt)[:, None], self.signals[j]
-        own = self._gyro(_by(self.mean[j] * share, by[:, OF_GYRO]))
-        moved = self.step_v[j] * (h / dt)
-        by = by[:, OF_ACCEL]
+        # the effects of errors in the step up to the time
+        share, signals = (h / dt)[:, None], self.signals[j]
+        turn = self._gyro(_times(self.mean[j] * share, signals[:, OF_GYRO]))
+        step_dv = self.step_v[j] * (h / dt)
         (A, F), (AA, FF) = (
-            (x + y for x, y in zip(before, self._accel(_by(step, by)), strict=True))
+            (x + y for x, y in zip(before, self._accel(_times(step, signals[:, OF_ACCEL])),
+                                   strict=True))
             for before, step in (((A, F), self.mean[j] * share),
                                  ((AA, FF), self.twice[j] * share**2)))
-        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, R_by_gyro + own,
-                      dv_by_gyro + _cross(moved / 2, own), dp_by_gyro + _cross(moved * h / 6, own),
-                      force + rise * h, rate + spin * h, spin, self.signals[j, 1:7] / dt)
+        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, R_by_gyro + turn,
+                      dv_by_gyro + _cross(step_dv / 2, turn),
+                      dp_by_gyro + _cross(step_dv * h / 6, turn), force + force_change * h,
+                      rate + rate_change * h, rate_change, signals[:, 1:7] / dt)

@@ -52,11 +52,9 @@ class Problem:
     @property
     def fix_sigma(self) -> float:
         """Return the median stated sigma of a horizontal axis of the fixes, m."""
-        out: float = np.sqrt(np.median(self.leg.covariance_n[self.used_fixes][:, 0, 0]))
-        return out
+        return float(np.sqrt(np.median(self.leg.covariance_n[self.used_fixes][:, 0, 0])))
 
     @property
     def height_sigma(self) -> float:
         """Return the median stated sigma of the heights of the fixes, m."""
-        out: float = np.sqrt(np.median(self.leg.covariance_n[self.used_fixes][:, 2, 2]))
-        return out
+        return float(np.sqrt(np.median(self.leg.covariance_n[self.used_fixes][:, 2, 2])))

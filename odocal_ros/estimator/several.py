@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several legs of the smoother to one result, by their marginal information."""
+"""
+The result of several legs of one vehicle, from the marginal information of each.
+
+calib/joint.py computes the joint estimate of their constants; this module makes estimates,
+reasons, error budget and details of it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -51,7 +56,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     """
     Return the result of one fit of all legs of one vehicle, the scale as in the last leg.
 
-    results : those with ``marginal``, at least one.   times_ns : when each leg was driven.
+    results : each with ``marginal``, at least one.   times_ns : of each leg, ns since 1970.
     config : limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, by
     default 1, 2, ...; 0: legs of an earlier result.   local : positions in a local frame.
 
@@ -72,7 +77,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     wheels = combine_wheels(legs)
     estimates, refusals = _estimate(legs, fitted, wheels, config, local)
     sources = _error_sources(found.relaxed_sigma[at] * found.factor, C, common)
-    # by any leg with an accelerometer
+    # a pitch without a prior: some leg has an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.prior_sigma[at][PITCH]) else None
     details = _details(found, fitted.value, C, sources, len(legs)) | {
         'beside': additional_figures(fitted.value, C, grade)} | wheel_details(wheels)
@@ -116,22 +121,22 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants, wheels: dic
 
 
 def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInformation]:
-    """Return marginals with the same sizes of imperfections: geometric means by information."""
+    """Return marginals with equal sigmas of the imperfections: means weighted by information."""
     imperfect = set(CONSTANTS[IMPERFECTIONS])
     logs: dict[str, list[tuple[float, float]]] = {}
     for marginal in marginals:
         prior = 1 / marginal.relaxed_sigma**2
         data = 1 / np.diag(np.linalg.inv(marginal.information + np.diag(prior))) - prior
         known = data / (data + 1 / (SIZE * marginal.prior_sigma**2))        # docs/method.md (S29)
-        for name, size, weight in zip(marginal.names, marginal.relaxed_sigma, known, strict=True):
+        for name, sigma, weight in zip(marginal.names, marginal.relaxed_sigma, known, strict=True):
             if name in imperfect:
-                logs.setdefault(name, []).append((np.log(size), max(weight, 1e-9)))
-    sizes = {}
+                logs.setdefault(name, []).append((np.log(sigma), max(weight, 1e-9)))
+    means = {}
     for name, pairs in logs.items():
         log, weight = np.transpose(pairs)
-        sizes[name] = float(np.exp(np.average(log, weights=weight)))
+        means[name] = float(np.exp(np.average(log, weights=weight)))
     return [replace(marginal, relaxed_sigma=np.array([
-        sizes.get(name, sigma) for name, sigma in zip(
+        means.get(name, sigma) for name, sigma in zip(
             marginal.names, marginal.relaxed_sigma, strict=True)])) for marginal in marginals]
 
 
@@ -150,7 +155,7 @@ def _leg_name(number: int) -> str:
 
 def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
-    J, reasons = len(found.deviation), list[Reason]()
+    J, reasons = len(found.deviation), list[Reason]()      # J : number of legs
     unexplained = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
     # parameters correlated with a disputed one differ as well
     worst = max((np.abs(z).max() for n, z in unexplained.items() if n in PARAMETERS), default=0.0)
@@ -174,30 +179,32 @@ def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Rea
 
 def _largest_deviation(found: JointEstimate, numbers: list[int]) -> str:
     """Return the largest deviation of a constant without scatter between legs, as text."""
-    own = [i for i, name in enumerate(found.names) if name not in found.scatter]
-    z = found.deviation[:, own]
+    constants = [i for i, name in enumerate(found.names) if name not in found.scatter]
+    z = found.deviation[:, constants]
     j, i = np.unravel_index(np.argmax(np.abs(z)), z.shape)
     # two legs have the same deviation from each other
     of_leg = f' of {_leg_name(numbers[j])}' * (len(z) > 2)
-    text = f'{found.names[own[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
+    text = f'{found.names[constants[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
     return text if abs(z[j, i]) > REMARK_SIGMAS else f'no parameter alone explains it: {text}'
 
 
 def _common_sources(legs: Sequence[MethodResult]) -> list[Source]:
-    """Return the errors beside those of the fits that are the same in all legs: the largest."""
-    of: dict[str, Source] = {}
+    """Return errors beyond the fits that all legs share: the largest of each source."""
+    largest: dict[str, Source] = {}
     for source in (s for leg in legs for s in leg.sources if s.shared and s.name not in SHARED):
-        of[source.name] = max(source, of.get(source.name, source),
-                              key=lambda s: float(np.abs(s.effects).max()))
-    return list(of.values())
+        largest[source.name] = max(source, largest.get(source.name, source),
+                                   key=lambda s: float(np.abs(s.effects).max()))
+    return list(largest.values())
 
 
-def _error_sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:
-    """Return the budget: shared errors of the vehicle, and the effects of each leg."""
+def _error_sources(prior_sigma: Floats, C: Floats,
+                   common: Sequence[Source]) -> tuple[Source, ...]:
+    """Return the budget: shared errors of the vehicle, and all errors of single legs as one."""
     sigmas = np.sqrt(np.outer(np.diag(C)[:PARAMETER_COUNT], np.diag(C)))
     correlation = np.abs(C[:PARAMETER_COUNT] / sigmas).max(axis=0)
-    shared = [Source(name, C[:PARAMETER_COUNT, i] / used[i], True) for name, i in SHARED.items()
-              if correlation[i].max() > 1e-9]      # of a correlation: rounding
+    shared = [Source(name, C[:PARAMETER_COUNT, i] / prior_sigma[i], True)
+              for name, i in SHARED.items()
+              if correlation[i].max() > 1e-9]      # rounding of a correlation
     shared += common
     unexplained = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
     return (*shared, Source('legs', root_of(C[:PARAMETER_COUNT, :PARAMETER_COUNT] - unexplained)),

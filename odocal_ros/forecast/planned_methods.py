@@ -18,7 +18,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
-from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
+from odocal_ros.estimator.factors.heading import CONFIGURED_NOISE, Heading
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import ImuSteps, keyframes, sensor_noise
@@ -135,7 +135,7 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     """Return the external heading of the settings; none for a course or a gyrocompass."""
     source, sigma = config.alignment.source, config.alignment.heading_sigma
     if source == 'fixed':
-        t, noise = np.zeros(1), GIVEN_NOISE
+        t, noise = np.zeros(1), CONFIGURED_NOISE
     elif source in HEADING_TOPICS and sigma <= HEADING_LIMIT:
         t = _sample_times(t_begin, drive.duration, EXTERNAL_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * EXTERNAL_RATE))

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Accelerations at the axle, to which springs and tyres respond, from those at the IMU.
+Speed and acceleration of the axle at a state: signals of tyre and body effects, (S11), (S12).
 
+Springs and tyres respond to the acceleration of the axle, not to that of the IMU (docs/method.md).
 An IMU half a metre beside the axle also measures half a metre times the angular acceleration as
 forward acceleration, with opposite signs in left and right turns. With wheel slip, this would
 change the path length.
@@ -18,13 +19,13 @@ from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
 from odocal_ros.nav.rotations import rotate
 from odocal_ros.settings.nominal import G
 
-WALK_SPEED = 1.0     # m/s, below it slopes are reduced: judgement
+WALK_SPEED = 1.0     # m/s, judgement: below it, slopes are reduced towards zero
 WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
-RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
+RATE_WINDOW = 0.1    # s about a keyframe, judgement: the mean of it contains little vibration
 
 
 def mean_rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
-    """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
+    """Return turn rates at times ``at``, (N,), as means over RATE_WINDOW: (N, 3) rad/s."""
     first = np.searchsorted(t, at - RATE_WINDOW / 2)
     last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
     return np.stack([w_b[first[k]:last[k]].mean(axis=0)
@@ -33,10 +34,10 @@ def mean_rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
 
 class Axle:
     """
-    Speeds and accelerations of the origin of base_link, which does not slip sideways, at a state.
+    Motion of the origin of base_link, where the axle does not slip sideways, at a state.
 
-    v_n : (N, 3) its velocity at the keyframes, m/s.   wheel : (N,) speed along the vehicle where
-    the odometer is, m/s.
+    v_n : (N, 3) m/s, its velocity at the keyframes.   wheel : (N,) m/s, forward speed at the
+    odometer.
     """
 
     def __init__(self, problem: Problem, state: State) -> None:
@@ -58,20 +59,20 @@ class Axle:
     def _slope(self) -> Floats:
         """Return the slope of the road in each interval from the vertical velocity: (K,) rad."""
         # not by the attitude, which contains the pitch mounting angle
-        speed, rise = self._forward_speed(self.v_n), self.v_n[:, 2]
-        ahead = speed[1:] + speed[:-1]
-        return (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
+        speed, up = self._forward_speed(self.v_n), self.v_n[:, 2]
+        double_speed = speed[1:] + speed[:-1]
+        return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2,
+                                                              (2 * WALK_SPEED)**2)
 
     def accelerations(self) -> Floats:
         """
-        Return accelerations and jerks of each interval in the order of BODY_LEAN: (K, 4).
+        Return the signals of BODY_LEAN in each interval: (K, 4).
 
         Acceleration forward (including the component of gravity on a slope) and left, m/s^2, and
         their rates of change, m/s^3.
         """
         T = np.diff(self.state.t)[:, None]
-        # axes at mid interval: with those at its start, centripetal acceleration looks like
-        # braking
+        # mean axes: with those at its start, centripetal acceleration looks like braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
         force = rotate((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
         force[:, 0] += G * self._slope()
@@ -80,17 +81,17 @@ class Axle:
 
     def acceleration(self) -> Floats:
         """
-        Return the acceleration along the path plus the part of gravity on slopes: (K,) m/s^2.
+        Return the acceleration by traction and braking, positive if faster: (K,) m/s^2.
 
-        The tyres produce both. By speeds: in a turn with sideslip, the acceleration has a forward
-        component.
+        That of the speed plus the component of gravity on slopes. It is by speeds, since in a turn
+        with sideslip the centripetal acceleration has a forward component.
         """
         speed = self._forward_speed(self.v_n)
-        up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
-        return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
+        by_slope: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
+        return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope
 
     def means_by_path(self, sums: Intervals) -> Floats:
-        """Return the means of ``tyre_signals_at`` over a leg, weighted by distance: (4,)."""
+        """Return the means of ``tyre_signals_at`` over a leg, weighted by path: (4,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
@@ -100,7 +101,7 @@ class Axle:
 
 
 def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats) -> Floats:
-    """Return the signals that change the scale, as TYRES, (S11): (..., 4); t : s of the leg."""
+    """Return the signals of TYRES, x of (S11): (..., 4); t : s since the start of the leg."""
     # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
     force = acceleration_along + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))

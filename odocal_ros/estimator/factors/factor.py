@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A factor of the likelihood: the residuals of one sensor or one prior.
+The interface of a factor of the likelihood: the rows (residuals) of one sensor or one prior.
 
-It holds residuals and derivatives at one state, initial and minimum noise levels, and its terms of
-the normal equations, the cost, the variance components and the error budget. It is created
-without weights; ``weighted_copy`` returns a copy at given levels, to whose residuals
-``apply_step`` applies a step.
+A factor has the residuals at one state and their derivatives, initial and minimum noise levels,
+and its terms of the normal equations, the cost, the variance components and the error budget. It
+is created without weights; ``weighted_copy`` returns a copy at given noise levels.
 """
 
 from collections.abc import Iterable
@@ -27,9 +26,9 @@ from odocal_ros.estimator.state import Priors, State, WITH_SLOW, WITHOUT_SLOW
 
 # levels of the IMU: white noises, and random walks of its biases
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
-# variance factors of an interval: of the odometer forward, sideways and up (slips), of the noises
-# of the IMU (kerbs, aliased vibration; biases that step), and of the driving noise of the
-# correlated fix error (jumps of the receiver)
+# variance factors of an outlier interval, h of (S13): of the odometer forward, sideways and up
+# (slips), of the noises of the IMU (kerbs, aliased vibration; biases that step), and of the noise
+# that drives the correlated fix error (jumps of the receiver)
 VARIANCE_FACTORS = ('along', 'side', 'up', *IMU, 'jump')
 VARIANCE_FACTOR_COUNT, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 ACCEL_NOISE = VARIANCE_FACTORS.index('accel')
@@ -44,41 +43,39 @@ class LinearisationPoint:
 
     state: State
     intervals: Intervals
-    points: dict[str, Points]  # up to the times of the rows, by the name of their factor
+    points: dict[str, Points]  # sums up to the times of the rows, by the name of their factor
     priors: Priors
-    # (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals
+    # (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals; None: 1
     variance_factors: np.ndarray | None
-    fitted: bool = False       # as for ``Motion``
+    fitted: bool = False       # residuals are noise: see ``Motion``
 
 
 class Factor:
     """
-    Base class of the factors, without any rows. ``equations`` lists the factors.
+    Base class of the factors, without any rows. ``equations.FACTORS`` lists the factors.
 
-    A subclass implements ``__init__(problem, point)`` and overrides what differs. With rows of its
-    own it also has raw, the residuals, and ``jacobians(n)``, their derivatives by keyframes and
-    constants. ``marginals`` is the result of ``Solved.marginals``, or where stated a block of it,
-    (k, 2n + M, 2n + M).
+    A subclass implements ``__init__(problem, point)`` and overrides what differs. N keyframes of n
+    unknowns have K = N - 1 intervals; m constants are in use.
     """
 
     name: ClassVar[str]
     state: State
-    levels: Levels           # levels of a weighted factor
+    levels: Levels           # of a weighted copy, as n and m
     n: int                   # number of unknowns of a keyframe
     m: int                   # number of constants: no row depends on later ones
-    log_R: float = 0.0       # log determinant of the rows' covariance, up to a constant
+    log_R: float = 0.0       # log determinant of the covariance of the rows, plus a constant
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state = point.state
 
     @classmethod
     def is_present(cls, problem: Problem) -> bool:
-        """Return True if a leg has such rows."""
+        """Return True if a leg has rows of this factor."""
         return True
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the initial and the minimum variances, by the names of its levels."""
+        """Return initial values and lower limits of its noise levels, by name."""
         return {}, {}
 
     def is_used(self, levels: Levels) -> bool:
@@ -99,31 +96,39 @@ class Factor:
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
 
-    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Apply a step (N, n), (M,) to the residuals, to first order."""
-        self.state = reached
+    def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
+        """Apply a step (N, n), (M,) to the residuals, to first order; it leads to new_state."""
+        self.state = new_state
 
     def cost(self) -> float:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        """Return the quadratic sum and the redundancy of each level, (S26)."""
+        """Return quadratic sum Q and redundancy E of (S26), by the name of the level."""
         return {}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, marginals: JointMarginals) -> Iterable[tuple[str, Floats]]:
-        """Yield the names of error sources and the effects of their unit errors: (..., 3, k)."""
+        """
+        Yield sources of the error budget, (S32).
+
+        Each with the effects of k unit errors on ln K, yaw and pitch: (..., 3, k).
+        """
         return ()
 
-    def parameter_covariances(self, block: Floats) -> Floats:
-        """Return the cross-covariance of scale, yaw, pitch and the unknowns: (k, 3, 2n + M)."""
-        return block[:, 2 * self.n:2 * self.n + PARAMETER_COUNT, :]
+    def parameter_covariances(self, covariances: Floats) -> Floats:
+        """
+        Return the cross-covariances of ln K, yaw, pitch with all unknowns: (k, 3, 2n + m).
+
+        covariances : (k, 2n + m, 2n + m) of some intervals, from ``JointMarginals``.
+        """
+        return covariances[:, 2 * self.n:2 * self.n + PARAMETER_COUNT, :]
 
     def all_parameter_covariances(self, marginals: JointMarginals) -> Floats:
-        """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
+        """Return the cross-covariances for all intervals: (K, 3, 2n + m)."""
         # copies: a view of a few rows would keep the whole block in memory
         return np.concatenate([self.parameter_covariances(block).copy()
                                for block in marginals.blocks()])
@@ -131,30 +136,39 @@ class Factor:
 
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
               residual: Floats | float, weight: Floats | float = 1.0) -> None:
-    """Add priors of single unknowns: columns at keyframes k, a slice or one."""
+    """
+    Add priors of single unknowns: of columns at keyframes k.
+
+    residual : value minus prior mean.   weight : factor on the information, 0: no prior.
+    """
     i = np.arange(out.g.shape[1])[columns]
     keys = np.atleast_1d(np.arange(len(out.g))[k])
-    weight, pull = (np.broadcast_to(x, (len(keys), len(i)))
-                    for x in (weight / variance, weight * residual / variance))
+    information, gradient = (np.broadcast_to(x, (len(keys), len(i)))
+                             for x in (weight / variance, weight * residual / variance))
     for rows in blocks(len(keys)):
         at = keys[rows, None]
-        out.diagonal[at, i, i] += weight[rows]
-        out.g[at, i] -= pull[rows]
+        out.diagonal[at, i, i] += information[rows]
+        out.g[at, i] -= gradient[rows]
 
 
 def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
                 residual: Floats) -> None:
-    """Add a first-order process over all intervals, (K, c): x at the end less decay times x."""
+    """
+    Add a first-order process of c columns over all intervals.
+
+    residual : (K, c) value at the end minus decay times value at the start.   weight : inverse
+    variance.
+    """
     i = np.arange(out.g.shape[1])[columns]
-    all_of = np.broadcast_shapes(np.shape(residual), (len(out.upper), len(i)))
+    shape = np.broadcast_shapes(np.shape(residual), (len(out.upper), len(i)))
     terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,
              weight * residual)
-    own, end, across, pull, pull_end = (np.broadcast_to(x, all_of) for x in terms)
+    begin, end, cross, g_begin, g_end = (np.broadcast_to(x, shape) for x in terms)
     for rows in blocks(len(out.upper)):
-        out.diagonal[rows, i, i] += own[rows]
-        out.upper[rows, i, i] -= across[rows]
-        out.g[rows, i] += pull[rows]
+        out.diagonal[rows, i, i] += begin[rows]
+        out.upper[rows, i, i] -= cross[rows]
+        out.g[rows, i] += g_begin[rows]
     for rows in blocks(len(out.upper)):
         ends = slice(rows.start + 1, rows.stop + 1)
         out.diagonal[ends, i, i] += end[rows]
-        out.g[ends, i] -= pull_end[rows]
+        out.g[ends, i] -= g_end[rows]

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The factors of a GNSS receiver: position and horizontal velocity of the antenna.
+The factors of a GNSS receiver: position and horizontal velocity of its antenna.
 
 ``Fixes`` are the positions, docs/method.md (S15), (S16), ``VelocityRows`` the velocities, (S18).
+Fixes can also be positions of SLAM or motion capture.
+
 Derivatives of the velocity by turn rate and force use means over the interval. With single samples
 they would contain vibration: the sigmas of delay and axes, and the lever arm, would be too small.
 """
@@ -26,16 +28,17 @@ from odocal_ros.nav.rotations import rotate, skew, transpose
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# m/s, initial: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
+# m/s, initial sigma of a velocity, whose delay is not known yet: judgement, 2 m/s^2 times 0.25 s.
+# With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
-VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
-# 1 sigma of the delay, s, and of the squared filter time constant, s^2: physical, of receivers
-# up to 0.25 s each
+VELOCITY_SIGMA = 0.1      # m/s, if a receiver states none: physical, Doppler
+# prior sigmas of the delay of a velocity, s, and of the squared time constant of its filter, s^2:
+# physical, receivers have up to 0.25 s each
 TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
 
 
 class Fixes(PointRows):
-    """Residuals (fix less prediction) and their derivatives at one state."""
+    """Rows of the fixes: measured minus predicted position of the antenna, ENU, m."""
 
     name, source = 'fixes', 'fixes'
     levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
@@ -48,9 +51,8 @@ class Fixes(PointRows):
         k, tau = self.k, points.tau[:, None]
         self.t_fix = leg.t_fix[problem.used_fixes]
         self.C = state.C_nb[k]
-        dp = rotate(self.C, points.dp)
-        v = state.v_n[k]
-        w = leg.origin.earth_rate_n
+        dp = self.dp = rotate(self.C, points.dp)
+        v, w = state.v_n[k], leg.origin.earth_rate_n
         g = gravity_n(state.p_n[k], leg.origin)
         self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ self.arm_v
@@ -60,35 +62,35 @@ class Fixes(PointRows):
         self.share = np.clip(points.tau / T, 0.0, 1.0)
         slow = state.slow_n[k] * (1 - self.share)[:, None] \
             + state.slow_n[k + 1] * self.share[:, None]
-        self.dp = dp
         self.v_n = v + rotate(self.C, points.dv) + g * tau + rotate(
             self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
-        place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
-        raw = leg.fixes_n[problem.used_fixes] - place - self.arm_n - slow
-        # noise in these derivatives would determine accelerometer errors: decision 9
+        imu_n = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
+        raw = leg.fixes_n[problem.used_fixes] - imu_n - self.arm_n - slow
+        # derivatives by accelerometer errors use the fitted force: noise in the measured one would
+        # determine these errors (decision 9)
         fitted = rotate(transpose(self.C), np.diff(state.v_n, axis=0)[k] / T[:, None] - g)
         measured = point.intervals.dv[k] / T[:, None]
         self.signal_noise = force_signals(fitted - measured) * point.fitted
-        # of a receiver that smooths the mean age is a delay
+        # effects of a filter and of an odometer in the receiver, and their derivatives
         track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
         smoothed, self.by_lag = smoothing_error(*track, state.constants[layout.FIX_LAG2])
         added, self.by_motion, self.by_time = own_odometer_error(
             *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_MOTION_TIME])
         stated = leg.stated_sigma[problem.used_fixes]
-        # a constant error does not affect the results
+        # minus the median, as a constant error does not affect the results
         self.by_sigma = stated - np.median(stated, axis=0)
         raw[:, 2] -= state.constants[layout.HEIGHT_DRIFT] * self.t_fix
         raw -= state.constants[layout.FIX_ERROR_BY_SIGMA] * self.by_sigma
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
-        """Return the fix errors, white and correlated, at the linearisation point: (m, 3) m."""
+        """Return the fix errors, white plus correlated: (m, 3) m."""
         s, share = self.state.slow_n, self.share[:, None]
         return self.raw + s[self.k] * (1 - share) + s[self.k + 1] * share
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        # those by the correlated errors are -(1 - share) before, -share after
+        # by the correlated error of the keyframe before; J_end has that of the keyframe after
         tau = self.points.tau[:, None, None]
         m = len(tau)
         one = np.broadcast_to(np.eye(3), (m, 3, 3))
@@ -102,10 +104,10 @@ class Fixes(PointRows):
         if n > layout.WITHOUT_SLOW:
             J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
-        c[:, :, layout.YAW], c[:, :, layout.PITCH] = (
-            -self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
+        c[:, :, layout.YAW] = -self.C_t @ (by_yaw @ self.arm_v)
+        c[:, :, layout.PITCH] = -self.C_t @ (by_pitch @ self.arm_v)
         c[:, :, layout.GNSS_ARM] = -self.C_t @ self.state.C_bv
-        # stamps late by d: the position is that of d earlier
+        # a stamp that is late by d belongs to the position d earlier
         c[:, :, layout.GNSS_DELAY] = self.v_n
         c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
         c[:, 2, layout.HEIGHT_DRIFT] = -self.t_fix
@@ -124,7 +126,6 @@ class Fixes(PointRows):
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         t = problem.leg.t_fix[problem.used_fixes]
-        # the delay is that at the start mark
         out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
@@ -132,10 +133,9 @@ class Fixes(PointRows):
         return self.whitening[some] @ rows
 
     def existing_components(self) -> Bools:
-        """Return a mask of the components that exist, (m, 3); fixes without height have two."""
-        known = np.ones((len(self.k), 3), bool)
-        known[:, 2] = self.whitening[:, 2, 2] > 1e-5
-        return known
+        exists = np.ones((len(self.k), 3), bool)
+        exists[:, 2] = self.whitening[:, 2, 2] > 1e-5       # see ``whitener``
+        return exists
 
 
 def force_signals(force: Floats) -> Floats:
@@ -146,14 +146,14 @@ def force_signals(force: Floats) -> Floats:
 
 
 def antenna(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
-    """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
+    """Return position and velocity of the antenna at the keyframes: (N, 3) m, (N, 3) m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,
             state.v_n + rotate(state.C_nb, np.cross(rate, arm_b)))
 
 
 def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
-    """Return inverse Cholesky factors of covariances; without a height only horizontal rows."""
+    """Return the inverse Cholesky factors of covariances; a missing height has no weight."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
     C[no_height, 2, 2] = 1e6**2     # m^2, of a missing height
@@ -162,14 +162,14 @@ def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Velocity(ExternalSamples):
-    """Horizontal velocity of the antenna, in n: (m, 2) m/s."""
+    """Horizontal velocity of the antenna."""
 
-    velocity_n: Floats
-    sigma: Floats
+    velocity_n: Floats      # (m, 2) m/s, east and north in n
+    sigma: Floats           # (m, 2) m/s
 
 
 class VelocityRows(ExternalRows):
-    """Residuals of a velocity (sent less predicted) and their derivatives at one state."""
+    """Rows of a GNSS velocity: measured minus predicted, east and north, m/s."""
 
     name, source = 'velocity', 'fix_velocity'
     levels_of = {'velocity': slice(0, 2)}
@@ -177,43 +177,43 @@ class VelocityRows(ExternalRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
-        sent, t = inputs.external[cls.source]
-        # without an accelerometer its change between keyframes is unknown
+        samples, t = inputs.external[cls.source]
+        # without an accelerometer the change of velocity between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
             return None
         some = thinned(t)
-        t, variance = t[some], sent.variance_n[some, :2]
+        t, variance = t[some], samples.variance_n[some, :2]
         known = np.isfinite(variance) & (variance > 0)
         sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
-        v_n = (enu_to_n(inputs, t, origin) @ sent.velocity_n[some, :, None])[:, :2, 0]
+        v_n = (enu_to_n(inputs, t, origin) @ samples.velocity_n[some, :, None])[:, :2, 0]
         return Velocity(t, v_n, sigma)
 
     @staticmethod
-    def prior_sigmas(sent: Velocity, config: Config) -> Floats:
+    def prior_sigmas(samples: Velocity, config: Config) -> Floats:
         gnss = config.gnss
         return np.array([np.hypot(TIME_SIGMA, gnss.time_sigma), LAG2_SIGMA,
                          max(gnss.velocity_scale_sigma, 1e-6)])
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         leg, state, points = problem.leg, point.state, point.points['velocity']
-        sent, k = problem.external['velocity'], points.interval
-        assert isinstance(sent, Velocity)
+        samples, k = problem.external['velocity'], points.interval
+        assert isinstance(samples, Velocity)
         C, tau = state.C_nb[k], points.tau[:, None]
         C_t = C @ points.R
         arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ arm_v
         dv, g = rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
         swing = rotate(C_t, np.cross(points.rate, arm_b))
-        _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
-        faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
-        smoothed, by_lag = smoothing_error(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
+        _, v_keys = antenna(state, point.intervals.mean_rate, arm_b)
+        acceleration = (np.diff(v_keys, axis=0) / point.intervals.T[:, None])[k]
+        smoothed, by_lag = smoothing_error(state.t, v_keys, np.gradient(v_keys, state.t, axis=0),
                                            state.t[k] + points.tau,
                                            state.constants[layout.VELOCITY_LAG2])
         v = state.v_n[k] + dv + g * tau + swing + smoothed
-        # the factor is on the prediction: on the measurement it would also scale its noise, and
-        # small factors would fit best
-        times = 1 + state.constants[layout.VELOCITY_SCALE]
-        m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
+        # the scale error multiplies the prediction: on the measurement it would also multiply the
+        # noise, and a small factor would fit best
+        factor = 1 + state.constants[layout.VELOCITY_SCALE]
+        m, rate = len(k), point.intervals.mean_rate[k]
         measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
         J, c = np.zeros((m, 3, layout.WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
         J[:, :, layout.V] = -np.eye(3)
@@ -226,13 +226,14 @@ class VelocityRows(ExternalRows):
             by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
         by_yaw, by_pitch = state.C_bv_gradient
         W = C_t @ skew(rate)
-        c[:, :, layout.YAW], c[:, :, layout.PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
+        c[:, :, layout.YAW], c[:, :, layout.PITCH] = -W @ (by_yaw @ arm_v), -W @ (by_pitch @ arm_v)
         c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
-        c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = faster, -by_lag
-        c[:, :, layout.ACCEL] = C @ force_signals(rotate(transpose(C), faster - g)) * t
-        J, c = J[:, :2] * times, c[:, :2] * times
+        c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = acceleration, -by_lag
+        c[:, :, layout.ACCEL] = C @ force_signals(
+            rotate(transpose(C), acceleration - g)) * tau[:, :, None]
+        J, c = J[:, :2] * factor, c[:, :2] * factor
         c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
-        return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
+        return Rows(samples.velocity_n - factor * v[:, :2], J, c, np.asarray(1 / samples.sigma))
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -241,13 +242,12 @@ class VelocityRows(ExternalRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        # before the delay is known, residuals are larger
-        first, least = super().initial_levels(problem)
-        sent = problem.external[cls.name]
-        assert isinstance(sent, Velocity)
-        sigma = float(np.median(sent.sigma))
-        return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in first.items()}, least
+        initial, minimum = super().initial_levels(problem)
+        samples = problem.external[cls.name]
+        assert isinstance(samples, Velocity)
+        sigma = float(np.median(samples.sigma))
+        return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in initial.items()}, minimum
 
     @staticmethod
-    def least(sent: Velocity) -> dict[str, float]:
-        return {'velocity': (MIN_NOISE.velocity / float(np.median(sent.sigma)))**2}
+    def min_levels(samples: Velocity) -> dict[str, float]:
+        return {'velocity': (MIN_NOISE.velocity / float(np.median(samples.sigma)))**2}

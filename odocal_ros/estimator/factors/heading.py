@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The factor of an external heading, docs/method.md (S19): yaw of the IMU's x axis.
+The factor of an external heading, docs/method.md (S19): the yaw in n of the x axis of the IMU.
 
 Its error is a constant of the leg (mounting, declination, compass), which does not average out,
-plus white noise. A heading configured at the start mark is one message.
+plus white noise. A heading that is configured for the start mark is one sample.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ from odocal_ros.nav.rotations import arctan2, matrix_from_quat, transpose, wrap,
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# rad, white noise of a heading configured at the mark. Judgement: negligible
-GIVEN_NOISE = 1e-4
+# rad, judgement: white noise of a configured heading, negligible
+CONFIGURED_NOISE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +35,13 @@ class Heading(ExternalSamples):
     """Samples of the yaw of the IMU's x axis in n, at times ``t``."""
 
     yaw: Floats         # (m,) rad
-    noise: Floats       # (m,) rad
+    noise: Floats       # (m,) rad, sigma of the white noise
     sigma: float        # rad, of the error that is constant over the leg
     source_name: str    # the heading source, as in the settings
 
 
 class HeadingRows(ExternalRows):
-    """Residuals of a heading (sent less predicted) and their derivatives at one state."""
+    """Rows of a heading: measured minus predicted yaw, rad."""
 
     name, source = 'heading', 'heading_noise'
     levels_of = {'heading': slice(0, 1)}
@@ -52,7 +52,7 @@ class HeadingRows(ExternalRows):
         source, alignment = config.alignment.heading_source, config.alignment
         if not np.isnan(alignment.heading) and source in ('auto', 'fixed'):
             yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
-            return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN_NOISE),
+            return Heading(np.zeros(1), wrap(yaw), np.full(1, CONFIGURED_NOISE),
                            alignment.heading_sigma, 'fixed')
         if source in ('auto', 'heading_topic'):
             samples, t = inputs.external['heading']
@@ -80,7 +80,7 @@ class HeadingRows(ExternalRows):
         k = points.interval
         C = state.C_nb[k]
         x = (C @ points.R)[:, :, 0]     # x axis of the IMU in n
-        # square of its horizontal part
+        # squared length of its horizontal part
         level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
         residual = wrap(samples.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
         # derivative of the yaw by a rotation vector in n
@@ -94,7 +94,7 @@ class HeadingRows(ExternalRows):
         return Rows(residual[:, None], J, c, 1 / samples.noise[:, None])
 
     @staticmethod
-    def least(samples: Heading) -> dict[str, float]:
+    def min_levels(samples: Heading) -> dict[str, float]:
         return {'heading': (MIN_NOISE.heading / float(np.median(samples.noise)))**2}
 
 
@@ -104,8 +104,8 @@ def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, o
     """
     Return the heading of published orientations, or None if they are too few or too uncertain.
 
-    q, variance : (m, 4), (m,) rad^2 of the yaw.   offset : rad, added to the yaw.   C_ib : from b
-    to the published frame.
+    q : (m, 4) orientations.   variance : (m,) rad^2, of the yaw, NaN: not published.   offset :
+    rad, added to the yaw.   C_ib : from b to the published frame.
     """
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]

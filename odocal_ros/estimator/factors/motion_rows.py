@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The motion factor: IMU and odometer between adjacent keyframes."""
+"""
+The motion factor: IMU and odometer between adjacent keyframes.
+
+Rows and derivatives are those of ``Motion`` (motion.py), their noise that of ``IntervalNoise``.
+"""
 
 from collections.abc import Iterator, Sequence
 from weakref import ref
@@ -28,8 +32,8 @@ from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
 
-ALONG = ('along', 'along_hard')
-# sources in the budget
+ALONG = ('along', 'along_hard')     # levels of the noise along the path
+# sources in the budget, by level
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
          'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
          'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
@@ -39,9 +43,7 @@ ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
 
 class MotionRows(Factor):
     """
-    Rows of ``Motion`` with the noise of ``IntervalNoise``.
-
-    Weighted are r (K, 18) and whiten (K, 18, 18).
+    Rows of the K intervals; a weighted copy has r (K, 18), J (K, 18, 2n + m), whiten (K, 18, 18).
 
     Unit noises are recomputed when needed, some intervals at a time: stored, they would take a
     third of the memory of the derivatives.
@@ -60,20 +62,20 @@ class MotionRows(Factor):
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= white_noise_at_rest(problem.imu, problem.leg, problem.at_rest)
-        slide, road = min_sideslip(problem.total_turn)**2, 0.01**2      # m^2/s, initial
+        sideslip, road = min_sideslip(problem.total_turn)**2, 0.01**2      # m^2/s; road: initial
         return (imu | dict.fromkeys(ALONG, road)
-                | dict.fromkeys(SIDEWAYS, max(road, slide)) | {'pitching': PITCHING**2},
-                imu | dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, slide)
-                | {'up': max(slide, HEAVE**2), 'pitching': PITCHING_LEAST**2})
+                | dict.fromkeys(SIDEWAYS, max(road, sideslip)) | {'pitching': PITCHING**2},
+                imu | dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, sideslip)
+                | {'up': max(sideslip, HEAVE**2), 'pitching': PITCHING_LEAST**2})
 
     def weigh(self, levels: Levels) -> None:
-        """Whiten rows and derivatives, J (K, 18, 2n + M), by the covariance's Cholesky factor."""
-        self._found: tuple[ref[JointMarginals], Floats, Floats] | None = None
+        """Whiten rows and derivatives by the inverse Cholesky factor of their covariance."""
+        self._noise_estimates: tuple[ref[JointMarginals], Floats, Floats] | None = None
         self.whiten = work_array(len(self.raw), ROWS, ROWS)
         self.J = work_array(*self.raw.shape, 2 * self.n + self.m)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
-            units = self.noise.columns(rows) * self.roots()
+            units = self.noise.columns(rows) * self.level_sigmas()
             Q = self.noise.covariance(units, rows)
             scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
             root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
@@ -84,7 +86,7 @@ class MotionRows(Factor):
                 self.derivatives(rows, units), axis=2)[:, :, :self.J.shape[2]]
         self.log_R = -2 * logs.sum()
 
-    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
+    def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
         r, n = self.r.copy(), self.n
         for rows in blocks(len(r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
@@ -93,43 +95,42 @@ class MotionRows(Factor):
         self.r = r
 
     def derivatives(self, rows: slice, units: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
+        """Return ``Motion.jacobians`` of some intervals, with fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
         gyro = units[:, :, self.noise_mask('gyro')]
         self.signals.fit_rates(rows, constants, begin[:, :, BG], gyro)
         if self.motion.fitted:
-            found = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
-            self.signals.fit_forces(rows, constants, gyro, found)
+            estimates = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
+            self.signals.fit_forces(rows, constants, gyro, estimates)
         return begin, end, constants
 
     def add(self, out: Normal) -> None:
         n = self.n
         for rows in blocks(len(self.r)):
             ends, J = slice(rows.start + 1, rows.stop + 1), self.J[rows]
-            by = np.swapaxes(J, 1, 2)
-            own, end = by[:, :n] @ J, by[:, n:2 * n] @ J[:, :, n:]
-            border = np.ascontiguousarray(J[:, :, 2 * n:]).reshape(-1, self.m)
+            J_T = np.swapaxes(J, 1, 2)
+            begin, end = J_T[:, :n] @ J, J_T[:, n:2 * n] @ J[:, :, n:]
+            by_constants = np.ascontiguousarray(J[:, :, 2 * n:]).reshape(-1, self.m)
             g = -np.einsum('kij,ki->kj', J, self.r[rows])
-            out.diagonal[rows] += own[:, :, :n]
+            out.diagonal[rows] += begin[:, :, :n]
             out.diagonal[ends] += end[:, :, :n]
-            out.upper[rows] += own[:, :, n:2 * n]
-            out.coupling[rows] += own[:, :, 2 * n:]
+            out.upper[rows] += begin[:, :, n:2 * n]
+            out.coupling[rows] += begin[:, :, 2 * n:]
             out.coupling[ends] += end[:, :, n:]
-            out.corner += border.T @ border
+            out.corner += by_constants.T @ by_constants
             out.g[rows] += g[:, :n]
             out.g[ends] += g[:, n:2 * n]
             out.g_constants += g[:, 2 * n:].sum(axis=0)
 
     def cost(self) -> float:
-        out: float = (self.r**2).sum()
-        return out
+        return float((self.r**2).sum())
 
     def units(self, rows: slice) -> Floats:
         """Return the whitened unit noises of some intervals: (k, 18, c)."""
-        return self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+        return self.whiten[rows] @ (self.noise.columns(rows) * self.level_sigmas())
 
-    def roots(self) -> Floats:
-        """Return the standard deviation of each unit noise, (c,), per root second."""
+    def level_sigmas(self) -> Floats:
+        """Return the root of the level of each unit noise: (c,)."""
         return np.sqrt([self.levels[INTERVAL[i]] for i in self.noise.component])
 
     def noise_mask(self, *names: str) -> Bools:
@@ -137,8 +138,8 @@ class MotionRows(Factor):
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        estimates, seen = self._noises(marginals)
-        quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
+        estimates, observed = self._noises(marginals)
+        quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), observed.sum(axis=0)
         masks = {name: self.noise_mask(name) for name in INTERVAL}
         return {name: (float(quadratic[mask].sum()), float(expected[mask].sum()))
                 for name, mask in masks.items()}
@@ -159,70 +160,71 @@ class MotionRows(Factor):
     def step_sides(self, at: Ints, constants: Sequence[int]) -> tuple[Floats, Floats, Floats,
                                                                       Floats]:
         """
-        Return the right-hand sides of steps of constants from (p,) intervals on, (S27c).
+        Return the right-hand sides of L steps of constants, (S27c).
 
-        g_i by the keyframes, (N, n, c p), and by the constants, (m, c p); C' R^-1 C, (c p, c p),
-        and C' R^-1 r, (c p,), of the columns C; those of one constant are adjacent.
+        at : intervals, from each of which on each of the constants has a step; the L columns C of
+        one constant are adjacent. The result is g of the keyframes, (N, n, L), and of the
+        constants, (m, L), C' R^-1 C, (L, L), and -C' R^-1 r, (L,).
         """
         n, L = self.n, len(at) * len(constants)
-        chain, border = work_array(len(self.r) + 1, n, L), np.zeros((self.m, L))
+        g, g_constants = work_array(len(self.r) + 1, n, L), np.zeros((self.m, L))
         square, score = np.zeros((L, L)), np.zeros(L)
         for rows in blocks(len(self.r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
             after = np.arange(rows.start, rows.stop)[:, None] >= at
             columns = (J[:, :, [2 * n + i for i in constants], None] * after[:, None, None]
                        ).reshape(*J.shape[:2], L)
-            g = np.swapaxes(J, 1, 2) @ columns
-            chain[rows] += g[:, :n]
-            chain[ends] += g[:, n:2 * n]
-            border += g[:, 2 * n:].sum(axis=0)
+            product = np.swapaxes(J, 1, 2) @ columns
+            g[rows] += product[:, :n]
+            g[ends] += product[:, n:2 * n]
+            g_constants += product[:, 2 * n:].sum(axis=0)
             square += (np.swapaxes(columns, 1, 2) @ columns).sum(axis=0)
             score -= np.einsum('kil,ki->l', columns, self.r[rows])
-        return chain, border, square, score
+        return g, g_constants, square, score
 
     def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """Return the estimates of the unit noises and their expected variances: (K, c) each."""
-        # once for one ``marginals``: levels and slips both use them
-        if self._found is None or self._found[0]() is not marginals:
+        """Return estimates of the unit noises, in sigmas, and their variances: (K, c) each."""
+        # stored for one ``marginals``: levels and variance factors both use them
+        if self._noise_estimates is None or self._noise_estimates[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
             for rows in blocks(len(self.r)):
                 A = self.units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
                 fitted = marginals.covariance_form(rows, self.J[rows])
                 variances[rows] = (A * (A - fitted @ A)).sum(axis=1)
-            self._found = ref(marginals), estimates, variances
-        return self._found[1:]
+            self._noise_estimates = ref(marginals), estimates, variances
+        return self._noise_estimates[1:]
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        units, given = [], []
+        units, known = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
             cross = self.parameter_covariances(block)
             by_rows = cross @ np.swapaxes(self.J[rows], 1, 2)
             units.append(by_rows @ self.units(rows))
-            given.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
+            known.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.noise_mask(name)]
         if self.noise.known_columns.shape[2]:
-            yield SpeedSteps.source, np.concatenate(given)
+            yield SpeedSteps.source, np.concatenate(known)
 
     def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """Return estimates, in sigmas, of noise forward, left, up, and variances: (K, 3) each."""
-        estimate, seen = self._noises(marginals)
-        columns = [self.noise_mask(*names) for names in ODOMETER_AXES]
-        return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
-                np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
+        """Return odometer noise forward, left, up, in sigmas, and its variances: (K, 3) each."""
+        estimate, observed = self._noises(marginals)
+        masks = [self.noise_mask(*names) for names in ODOMETER_AXES]
+        return (np.stack([estimate[:, mask].sum(axis=1) for mask in masks], -1),
+                np.stack([observed[:, mask].sum(axis=1) for mask in masks], -1))
 
     def imu_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """Return norms of the IMU's noises, and variances of the best observed: (K, 4) each."""
-        estimate, seen = self._noises(marginals)
-        columns = [self.noise_mask(name) for name in IMU]
-        return (np.stack([np.linalg.norm(estimate[:, c], axis=1) for c in columns], -1),
-                np.stack([seen[:, c].max(axis=1) for c in columns], -1))
+        """Return norms of the noises IMU, in sigmas, and their largest variances: (K, 4) each."""
+        estimate, observed = self._noises(marginals)
+        masks = [self.noise_mask(name) for name in IMU]
+        return (np.stack([np.linalg.norm(estimate[:, mask], axis=1) for mask in masks], -1),
+                np.stack([observed[:, mask].max(axis=1) for mask in masks], -1))
 
-    def along_size(self) -> Floats:
-        """Return the displacement by a unit of the noise along the path, m: (K,)."""
-        pick = self.noise_mask(*ALONG)
+    def along_sigma(self) -> Floats:
+        """Return the sigma of the noise along the path in each interval: (K,) m."""
+        mask = self.noise_mask(*ALONG)
         return np.concatenate([
-            np.linalg.norm(self.noise.columns(rows)[:, D, pick] * self.roots()[pick], axis=1)
-            .sum(axis=1) for rows in blocks(len(self.r))])
+            np.linalg.norm(self.noise.columns(rows)[:, D, mask] * self.level_sigmas()[mask],
+                           axis=1).sum(axis=1) for rows in blocks(len(self.r))])

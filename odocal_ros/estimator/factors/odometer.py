@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The odometer's readings: delay and filter, rounding error, and the steps of a coarse speed.
+The readings of the odometer: their delay and filter, rounding error, and steps of a coarse speed.
 
-``TravelError`` is the factor of the rounding error at each keyframe, docs/method.md (S10).
-``SpeedSteps`` is the factor of a coarse speed, (S14): its value is known at a change by a step.
-The integral of such a speed is not used along the path (interval_noise.py): while the value does
-not change, its error is up to a step.
+``as_rolled`` returns the travel of the wheel from delayed and filtered readings. ``TravelError``
+is the factor of the rounding error at each keyframe, docs/method.md (S10). ``SpeedSteps`` is that
+of a speed in coarse steps, (S14): it is known when it changes by a step. The integral of such a
+speed is not used along the path (interval_noise.py): between changes its error is up to a step.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,35 +22,30 @@ from odocal_ros.estimator.factors.factor import add_prior, Factor, Linearisation
 from odocal_ros.estimator.factors.point_rows import PointRows
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    E,
-    ODO_CLOCK,
-    ODO_DELAY,
-    ODO_LAG2,
-)
+from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.coarse_speed import SpeedInstants
 from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rotate
 
-# s each side, for the mean of a speed: some rows of an odometer. Judgement
+# s to each side of a time, judgement: for the mean speed at it, some readings of an odometer
 SPEED_WINDOW = 0.4
-
-# s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s, the
-# rounding error of a counter adds twice the error of a reading
+# s to each side of a time, judgement: for the derivatives of the travel at it. With a filter of
+# 0.4 s, the rounding error of a counter adds twice the error of a reading
 REACH = 0.5
-# definition: differences over it
+# definition: times of the readings, and their weights in the second and the third derivative
 STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
 BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
-# definition: Gauss and Laguerre's nodes, less the mean delay, and weights of a first-order filter
+# definition: nodes of Gauss-Laguerre quadrature, minus the mean delay, and weights: a first-order
+# filter with the time constant 1
 FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
     np.polynomial.laguerre.laggauss(5)[1]
-LEAST_FILTER = 0.2      # s, judgement: speeds closer in time differ by vibration
+MIN_FILTER_TIME = 0.2      # s, judgement: speeds closer in time differ by vibration
 
 
 def stamp_of(t: Floats, constants: Floats) -> Floats:
-    """Return the stamps, s, of readings of the wheel at some times; the delay is that at 0."""
+    """Return the stamps of readings that were measured at times t, s, by delay and clock rate."""
     out: Floats = t + constants[ODO_DELAY] + constants[ODO_CLOCK] * t
     return out
 
@@ -81,25 +76,24 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
 
 
 class TravelError(Factor):
-    """Rows of the travel error at each keyframe, with one level: scale units."""
+    """Rows of the travel error at each keyframe; its level is a variance, scale units squared."""
 
     name = 'travel'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.at_rest = point.state, problem.at_rest
-        self.least = problem.min_levels['travel']
+        self.min_variance = problem.min_levels['travel']
         self.weight = standstill_weights(problem.at_rest)
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        leg = problem.leg
-        least = MIN_NOISE.travel / leg.rough_scale
-        level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
+        least = MIN_NOISE.travel / problem.leg.rough_scale
+        level = {'travel': max(problem.leg.travel.quantum**2 / 12, least**2)}
         return level, level
 
     def weigh(self, levels: Levels) -> None:
         """Compute the variance, scale units squared."""
-        self.variance = max(self.least, levels['travel'])
+        self.variance = max(self.min_variance, levels['travel'])
         self.log_R = self.weight.sum() * np.log(self.variance)
 
     def add(self, out: Normal) -> None:
@@ -107,14 +101,13 @@ class TravelError(Factor):
                   self.state.travel_error[:, None], self.weight[:, None])
 
     def cost(self) -> float:
-        out: float = (self.weight * self.state.travel_error**2).sum() / self.variance
-        return out
+        return float((self.weight * self.state.travel_error**2).sum() / self.variance)
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        e, moving = self.variance, ~self.at_rest
-        spread = marginals.variances()[:, E]
-        x = self.state.travel_error[moving]
-        return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
+        moving = ~self.at_rest
+        square = (self.state.travel_error[moving]**2).sum() / self.variance
+        redundancy = 1 - marginals.variances()[:, E][moving] / self.variance
+        return {'travel': (float(square), float(redundancy.sum()))}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         i, = out.columns((self.name,))
@@ -130,7 +123,7 @@ class TravelError(Factor):
 
 
 def standstill_weights(at_rest: Bools) -> Floats:
-    """Return the weights of rounding errors, (N,): 1 for all keyframes of a standstill."""
+    """Return the weights of rounding errors, (N,), whose sum over each standstill is 1."""
     starts = np.flatnonzero(np.diff(at_rest, prepend=False) & at_rest)
     stops = np.flatnonzero(np.diff(at_rest, append=False) & at_rest) + 1
     weight = np.ones(len(at_rest))
@@ -140,7 +133,7 @@ def standstill_weights(at_rest: Bools) -> Floats:
 
 
 class SpeedSteps(PointRows):
-    """Residuals of speeds: K times the odometer speed minus the speed of its point."""
+    """Rows at speed steps: K times the odometer speed minus the forward speed at the odometer."""
 
     name, source = 'steps', 'speed_steps'
     levels_of = {'steps': slice(0, 1)}
@@ -154,21 +147,22 @@ class SpeedSteps(PointRows):
         v_n, ahead = state.v_n[k] + dv + g * tau, C_t @ state.forward
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
         arm_b = state.C_bv @ self.arm_v
+        # at the steps, and at the earlier times that the filter needs
         speeds = (np.einsum('ki,ki->k', ahead, v_n) + np.cross(
             points.rate, arm_b) @ state.forward).reshape(len(FILTER_X) + 1, -1)
         self.speed = speeds[0]
         self.by_lag = (FILTER_W @ speeds[1:] - self.speed) / filter_time(state.constants)**2
-        own = np.arange(len(self.speed))
-        self.points, self.C, self.C_t, self.dv, self.v_n, self.ahead, g = points.take(own), *(
-            x[own] for x in (C, C_t, dv, v_n, ahead, g))
-        points = self.points
+        at_steps = np.arange(len(self.speed))
+        points = self.points = points.take(at_steps)
+        self.C, self.C_t, self.dv, self.v_n, self.ahead, g = (
+            x[at_steps] for x in (C, C_t, dv, v_n, ahead, g))
         super().__init__(problem, points)
         self.sigma = self.instants.sigma * leg.rough_scale
         self.v_b = rotate(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the forward axis rotates, and an IMU beside the axle moves relative to the axle
         self.acceleration = np.einsum('ki,ki->k', self.ahead, rotate(self.C, points.force) + g)\
             + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
-            + np.cross(points.spin, arm_b) @ state.forward
+            + np.cross(points.rate_change, arm_b) @ state.forward
         c = state.constants
         axle = Axle(problem, state)
         self.tyre_signals = tyre_signals_at(
@@ -177,9 +171,9 @@ class SpeedSteps(PointRows):
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         speed_by_wheel = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
         speed_by_wheel *= state.scale * self.scale_ratio
-        # the error is one of the published value, so it grows with K: with derivatives by that
-        # value all scales of IMU and odometer would shrink together
-        self.wheel = self.speed if point.fitted else speed_by_wheel
+        # derivative by ln K. The error of the published value is multiplied by K: with derivatives
+        # by that value all scales of IMU and odometer would shrink together
+        self.speed_gradient = self.speed if point.fitted else speed_by_wheel
         self.raw = (speed_by_wheel - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
@@ -189,15 +183,15 @@ class SpeedSteps(PointRows):
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of the steps, s, then the times at which the filter needs a speed."""
-        t, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
-        at = t - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * t
-        before = filter_time(constants) * FILTER_X
-        return np.concatenate([at, np.clip(
-            at - before[:, None], keyframes[0], keyframes[-1]).ravel()])
+        stamp, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
+        t = stamp - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * stamp
+        delays = filter_time(constants) * FILTER_X
+        return np.concatenate([t, np.clip(
+            t - delays[:, None], keyframes[0], keyframes[-1]).ravel()])
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        # factors on the variances by the grid: real transitions are no more regular
+        # factors on the variances by the step size; real steps are not more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
@@ -216,22 +210,22 @@ class SpeedSteps(PointRows):
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.scale_ratio
-        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.wheel, K * self.instants.side
-        c[:, layout.TYRES] = (self.wheel / self.scale_ratio)[:, None] * self.tyre_signals
+        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_gradient, K * self.instants.side
+        c[:, layout.TYRES] = (self.speed_gradient / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
-        c[:, layout.ODO_DELAY], c[
-            :, layout.ODO_CLOCK] = self.acceleration, self.acceleration * self.instants.t
+        c[:, layout.ODO_DELAY] = self.acceleration
+        c[:, layout.ODO_CLOCK] = self.acceleration * self.instants.t
         c[:, layout.ODO_LAG2] = -self.by_lag
         c[:, layout.ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]
 
 
 def _within(problem: Problem) -> SpeedInstants:
-    """Return the steps of the speed within the keyframes."""
+    """Return the steps of the speed between the first and the last keyframe."""
     t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
     assert coarse is not None, 'uses_speed_steps'
     return coarse.instants.between(t[0], t[-1])
@@ -239,9 +233,9 @@ def _within(problem: Problem) -> SpeedInstants:
 
 def filter_time(constants: Floats) -> float:
     """Return the time constant of a first-order filter with the variance of its delays, s."""
-    return float(np.sqrt(max(constants[layout.ODO_LAG2], LEAST_FILTER**2)))
+    return float(np.sqrt(max(constants[layout.ODO_LAG2], MIN_FILTER_TIME**2)))
 
 
 def odometer_speed(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
-    """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
+    """Return the odometer speed at times t, means over 2 SPEED_WINDOW: (N,) scale units per s."""
     return (travel(t + SPEED_WINDOW) - travel(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)

@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Rows at times between keyframes, for sensors that measure at an instant.
+Factors of sensors that measure at single times, such as fixes.
 
-Each depends on the keyframe before it, on the constants and, if correlated fix errors are
-estimated, on those of the keyframe after it. Outliers are down-weighted: docs/method.md (S25).
+``PointRows`` is their base class. A row at a time between two keyframes depends on the keyframe
+before it, on the constants and, for fixes, on the time-correlated error of the keyframe after it.
+Outliers are down-weighted: docs/method.md (S25).
 
-``ExternalRows`` is the base of the sensors besides IMU, odometer and fixes: rows with a sigma for
-each component. To the estimator such a sensor is one subclass, listed in ``equations.FACTORS``.
+``ExternalRows`` is the base class of other sensors, with a sigma for each measured component. A
+new sensor is one subclass of it, listed in ``equations.FACTORS``.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,27 +32,28 @@ from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
-# row in 370 is down-weighted
+# sigmas above which a row, or the slip of an interval, is down-weighted. Statistical: one normal
+# row in 370 is
 TAIL_SIGMAS = 3.0
-LEAST_ROWS = 5    # rows, of which one may be an outlier: judgement
-Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
+LEAST_ROWS = 5    # judgement: with fewer, outliers and levels are not estimated
+# function that groups rows by interval: (m, d, c) to (intervals, d times their largest number, c)
+Gather = Callable[[Floats], Floats]
 
 
 class PointRows(Factor):
     """
-    Rows of d components each; k (m,) : the keyframes before.
+    m measurements of d components each.
 
-    A subclass sets raw (m, d), the residuals; share (m,), the weight of the correlated fix error
-    of the keyframe after, in rows of three components, or None. It implements ``jacobians`` and
-    ``whiten``. Weighted are r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that error, or None.
+    A subclass sets raw and, if its rows contain the correlated fix error, share. A weighted copy
+    has the whitened residuals r (m, d), their derivatives J (m, d, n + m), and J_end (m, 3, 3) by
+    the correlated fix error of the keyframe after, or None.
     """
 
-    levels_of: ClassVar[dict[str, slice]]     # columns of each level, a factor on variances
+    levels_of: ClassVar[dict[str, slice]]     # components of each level, a factor on variances
     source: ClassVar[str]                     # name in the budget
-    k: Ints
-    raw: Floats
-    share: Floats | None = None
+    k: Ints                         # (m,) the keyframes before
+    raw: Floats                     # (m, d) residuals
+    share: Floats | None = None     # (m,) weight of the correlated error of the keyframe after
 
     def __init__(self, problem: Problem, points: Points) -> None:
         self.k = points.interval
@@ -59,7 +61,7 @@ class PointRows(Factor):
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of validity, s: (m,); ``point`` holds the sums up to these times."""
+        """Return the times of the measurements, after their delays: (m,) s."""
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
@@ -67,7 +69,7 @@ class PointRows(Factor):
         raise NotImplementedError
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        """Return some of the rows, (k, d, c), divided by the sigmas that the sensor states."""
+        """Return rows (k, d, c) divided by the stated sigmas; some : which of the m they are."""
         raise NotImplementedError
 
     def existing_components(self) -> Bools | bool:
@@ -75,22 +77,22 @@ class PointRows(Factor):
         return True
 
     def weigh(self, levels: Levels) -> None:
-        """Compute r and J_end with the weights of heavy tails."""
+        """Compute r and J_end with the weights of outliers."""
         white = self.whiten(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
         for level, columns in self.levels_of.items():
             factor[columns] /= np.sqrt(levels[level])
         white = white * factor
         self.weight = self._weights(white)
-        each = np.sqrt(self.weight / self.rows_per_independent)
-        self.r = each * white
-        self._root = (each * factor)[:, :, None]
+        root_weight = np.sqrt(self.weight / self.rows_per_independent)
+        self.r = root_weight * white
+        self._root = (root_weight * factor)[:, :, None]
         self.J_end = None
         if self.n == WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
             self.J_end = -self.whiten(one) * self._root * self.share[:, None, None]
-        self.log_R = -2 * np.log(np.tile(factor,
-                                         (len(white), 1))).sum() / self.rows_per_independent
+        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() \
+            / self.rows_per_independent
 
     @cached_property
     def J(self) -> Floats:
@@ -104,16 +106,16 @@ class PointRows(Factor):
         return out
 
     def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
+        """Yield the components of each level, and the norms of their residuals, in sigmas."""
         for columns in self.levels_of.values():
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
 
     def _weights(self, white: Floats) -> Floats:
-        """Return weights of whitened residuals, (m, d), equal for the columns of one level."""
-        w = np.ones_like(white)
-        if len(white) >= LEAST_ROWS:
-            for columns, size in self._sizes(white):
-                w[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
-        return w
+        """Return weights of whitened residuals, (m, d), equal for the components of a level."""
+        weight = np.ones_like(white)
+        for columns, size in self._sizes(white) if len(white) >= LEAST_ROWS else ():
+            weight[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
+        return weight
 
     def cost(self) -> float:
         """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
@@ -124,10 +126,10 @@ class PointRows(Factor):
                             + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
         return total / self.rows_per_independent
 
-    def apply_step(self, step: Floats, constants: Floats, reached: State) -> None:
-        own = np.concatenate([step[self.k], np.broadcast_to(
+    def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
+        steps = np.concatenate([step[self.k], np.broadcast_to(
             constants[:self.m], (len(self.k), self.m))], axis=1)
-        self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
+        self.r = self.r + np.einsum('kij,kj->ki', self.J, steps)
         if self.J_end is not None:
             self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
 
@@ -135,36 +137,37 @@ class PointRows(Factor):
         n = self.n
         for present, gather in self._intervals():
             J, r = gather(self.J), gather(self.r[:, :, None])
-            by = np.swapaxes(J, 1, 2)
-            own, g = by[:, :n] @ J, -(by @ r)[:, :, 0]
-            border = np.ascontiguousarray(J[:, :, n:]).reshape(-1, self.m)
-            out.diagonal[present] += own[:, :, :n]
-            out.coupling[present] += own[:, :, n:]
-            out.corner += border.T @ border
+            J_T = np.swapaxes(J, 1, 2)
+            H, g = J_T[:, :n] @ J, -(J_T @ r)[:, :, 0]
+            by_constants = np.ascontiguousarray(J[:, :, n:]).reshape(-1, self.m)
+            out.diagonal[present] += H[:, :, :n]
+            out.coupling[present] += H[:, :, n:]
+            out.corner += by_constants.T @ by_constants
             out.g[present] += g[:, :n]
             out.g_constants += g[:, n:].sum(axis=0)
             if self.J_end is None:
                 continue
             B = gather(self.J_end)
-            X = by @ B
+            X = J_T @ B
             out.upper[present, :, SLOW] += X[:, :n]
             out.coupling[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
             out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
             out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
 
     def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
-        """Yield the intervals that have rows, some at a time, and a function that groups rows."""
+        """Yield intervals with rows, some at a time, and the function that groups their rows."""
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
         for some in blocks(len(present)):
-            counts, most = count[some], count.max()
+            counts, largest = count[some], count.max()
             rows = slice(first[some.start], first[some.start] + counts.sum())
-            own = np.repeat(np.arange(len(counts)), counts)
+            interval = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
-            def gather(x: Floats, rows: slice = rows, own: Ints = own, place: Ints = place,
-                       counts: Ints = counts, most: int = most) -> Floats:
-                out = np.zeros((len(counts), most, *x.shape[1:]))
-                out[own, place] = x[rows]
+            def gather(x: Floats, rows: slice = rows, interval: Ints = interval,
+                       place: Ints = place, counts: Ints = counts,
+                       largest: int = largest) -> Floats:
+                out = np.zeros((len(counts), largest, *x.shape[1:]))
+                out[interval, place] = x[rows]
                 return out.reshape(len(counts), -1, x.shape[2])
 
             yield present[some], gather
@@ -172,12 +175,12 @@ class PointRows(Factor):
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         if len(self.k) < LEAST_ROWS:
             return {}
-        taken = np.concatenate([self._taken(marginals, present, gather)
-                                for present, gather in self._intervals()])
+        fitted = np.concatenate([self._fitted_variances(marginals, present, gather)
+                                 for present, gather in self._intervals()])
         known = np.broadcast_to(self.existing_components(), self.r.shape)
         r2 = np.where(known, self.r, 0.0)**2 * self.rows_per_independent
         return {level: (float(r2[:, columns].sum()),
-                        float(known[:, columns].sum() - taken[:, :, columns].sum()))
+                        float(known[:, columns].sum() - fitted[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
@@ -185,68 +188,69 @@ class PointRows(Factor):
             return
         columns = out.columns(self.levels_of)
         q = np.zeros((*self.r.shape, len(columns)))
-        for i, own in enumerate(self.levels_of.values()):
-            q[:, own, i] = self.r[:, own]
+        for i, components in enumerate(self.levels_of.values()):
+            q[:, components, i] = self.r[:, components]
         for present, gather in self._intervals():
-            some = gather(q)
-            g = np.swapaxes(gather(self.J), 1, 2) @ some
+            q_i = gather(q)
+            g = np.swapaxes(gather(self.J), 1, 2) @ q_i
             out.g[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
             out.g_constants[:, columns] += g[:, self.n:].sum(axis=0)
             if self.J_end is not None:
-                end = np.swapaxes(gather(self.J_end), 1, 2) @ some
+                end = np.swapaxes(gather(self.J_end), 1, 2) @ q_i
                 out.g[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
         out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
-    def _taken(self, marginals: JointMarginals, present: Ints, gather: Gather) -> Floats:
-        """Return the part of the row variances that the unknowns fit: (k, most, d)."""
+    def _fitted_variances(self, marginals: JointMarginals, present: Ints,
+                          gather: Gather) -> Floats:
+        """Return the part of the row variances that the unknowns fit: (intervals, rows, d)."""
         J = np.swapaxes(gather(self.J), 1, 2)
         end = None if self.J_end is None else np.swapaxes(gather(self.J_end), 1, 2)
-        taken = marginals.variances_of(present, J[:, :self.n], J[:, self.n:], end, SLOW)
-        return taken.reshape(len(present), -1, self.r.shape[1])
+        variances = marginals.variances_of(present, J[:, :self.n], J[:, self.n:], end, SLOW)
+        return variances.reshape(len(present), -1, self.r.shape[1])
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        n, parts = self.n, []       # columns of J and of J_end in the joint marginals
-        own, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
+        n, effects = self.n, []     # columns of J and of J_end in the joint marginals
+        columns, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
             cross = np.ascontiguousarray(
                 self.parameter_covariances(marginals.covariances(present)))
-            X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
+            X = cross[:, :, columns] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
-            parts.append(X)
-        yield self.source, np.concatenate(parts)
+            effects.append(X)
+        yield self.source, np.concatenate(effects)
 
 
 def count_rows_per_independent(rows: PointRows) -> float:
-    """Return rows per independent row, by the scatter of means of adjacent rows."""
+    """Return the number of adjacent rows that share one error, by the scatter of their means."""
     r = rows.r / np.sqrt(rows.weight)
-    r = (r - np.median(r, axis=0))[:, :2]       # horizontal: determine scale and yaw
+    r = (r - np.median(r, axis=0))[:, :2]       # horizontal: these determine scale and yaw
     scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN
     r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
     r = r - r.mean(axis=0)
     power = (r**2).mean()
-    most, length = 1.0, 2
-    while len(r) >= 12 * length and power > 0:      # bins: their variance is then known to 20 %
+    count, length = 1.0, 2
+    while len(r) >= 12 * length and power > 0:      # 12 bins: their variance has a sigma of 20 %
         bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
-        most = max(most, float(length * (bins.mean(axis=1)**2).mean() / power))
+        count = max(count, float(length * (bins.mean(axis=1)**2).mean() / power))
         length *= 2
-    return most
+    return count
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of one kind at one state: (m, d), (m, d, WITHOUT_SLOW), (m, d, M), (m, d) 1 / sigma."""
+    """The rows of an external sensor at one state."""
 
-    raw: np.ndarray
-    J: np.ndarray
-    c: np.ndarray
-    root: np.ndarray
+    raw: np.ndarray             # (m, d) residuals
+    J: np.ndarray               # (m, d, WITHOUT_SLOW) derivatives by the keyframes before
+    J_constants: np.ndarray     # (m, d, M) derivatives by the constants
+    inverse_sigma: np.ndarray   # (m, d)
 
 
 class ExternalRows(PointRows):
-    """Rows of one of ``problem.external``, its own constants and their prior sigmas."""
+    """The factor of a sensor of ``problem.external``, with constants of its own."""
 
-    constants: ClassVar[slice]      # of state.CONSTANTS
+    constants: ClassVar[slice]      # its indices in state.CONSTANTS
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self._rows = self.rows(problem, point)
@@ -255,17 +259,17 @@ class ExternalRows(PointRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> ExternalSamples | None:
-        """Return the rows of screened inputs in frame n; None without any, or unused."""
+        """Return the samples of the sensor in frame n; None without any, or if not used."""
         raise NotImplementedError
 
     @staticmethod
-    def prior_sigmas(sent: Any, config: Config) -> Floats | float:
+    def prior_sigmas(samples: Any, config: Config) -> Floats | float:
         """Return the prior sigmas of its constants."""
         raise NotImplementedError
 
     @classmethod
-    def details(cls, sent: Any, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        """Return details of a result: its constants by name, and their sigmas."""
+    def details(cls, samples: Any, constants: Floats, sigma: Floats) -> dict[str, Any]:
+        """Return its details of a result: by default its constants, with sigmas."""
         return {CONSTANTS[i]: {'value': float(constants[i]), 'sigma': float(sigma[i])}
                 for i in range(cls.constants.start, cls.constants.stop)}
 
@@ -283,17 +287,17 @@ class ExternalRows(PointRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        return dict.fromkeys(cls.levels_of, 1.0), cls.least(problem.external[cls.name])
+        return dict.fromkeys(cls.levels_of, 1.0), cls.min_levels(problem.external[cls.name])
 
     @staticmethod
-    def least(sent: Any) -> dict[str, float]:
-        """Return the least levels."""
+    def min_levels(samples: Any) -> dict[str, float]:
+        """Return the lower limits of its noise levels, factors on the stated variances."""
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        J = self._rows.J
-        return np.pad(J, ((0, 0), (0, 0), (0, n - WITHOUT_SLOW))), self._rows.c
+        columns = 0, n - WITHOUT_SLOW
+        return np.pad(self._rows.J, ((0, 0), (0, 0), columns)), self._rows.J_constants
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        out: Floats = rows * self._rows.root[some, :, None]
+        out: Floats = rows * self._rows.inverse_sigma[some, :, None]
         return out

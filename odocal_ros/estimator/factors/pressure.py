@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Heights by air pressure as rows, docs/method.md (S19a).
+The factor of heights by air pressure, docs/method.md (S19a).
 
 A pressure sensor measures height differences to a decimetre. Its zero, the weather, the dynamic
 pressure and the air temperature are constants of the leg.
@@ -26,24 +26,24 @@ from odocal_ros.settings.config import Config
 
 # physical, of the standard atmosphere at the ground: R T / g, m
 SCALE_HEIGHT = 8435.0
-# physical: m of zero; m/s of weather, 1 hPa/h; m per (m/s)^2, a pressure coefficient of 0.3;
-# relative, 15 K
+# of its constants, physical: zero, m; weather, m/s, 1 hPa/h; dynamic pressure, m per (m/s)^2, a
+# pressure coefficient of 0.3; air temperature, relative, 15 K
 PRIOR_SIGMAS = 1e4, 8.4 / 3600, 0.015, 0.05
-EARTH_RADIUS = 6.371e6      # m, physical: of the curvature, mean
-HEIGHT_SIGMA = 0.15     # m, initial sigma if a sensor states none: physical
-RATE = 1.0              # Hz: judgement, heights of a vehicle change no faster
+EARTH_RADIUS = 6.371e6      # m, physical: mean radius
+HEIGHT_SIGMA = 0.15     # m, physical: of one sample, if a sensor states none
+RATE = 1.0              # Hz, judgement: of means; heights of a vehicle change more slowly
 
 
 @dataclass(frozen=True, eq=False)
 class Pressure(ExternalSamples):
-    """Heights above an unknown zero, m, and their stated sigmas: (m,)."""
+    """Heights above an unknown zero."""
 
-    height: Floats
-    sigma: Floats
+    height: Floats      # (m,) m
+    sigma: Floats       # (m,) m
 
 
 class PressureRows(ExternalRows):
-    """Residuals of heights (by pressure less predicted) and their derivatives at one state."""
+    """Rows of the heights: by pressure minus predicted, m."""
 
     name, source = 'pressure', 'air_pressure'
     levels_of = {'pressure': slice(0, 1)}
@@ -51,41 +51,40 @@ class PressureRows(ExternalRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
-        sent, t = inputs.external['pressure']
+        samples, t = inputs.external['pressure']
         if not (config.imu.use_pressure and len(t) and inputs.has_accelerometer):
             return None
         cell = np.floor(t * RATE)
         first = np.r_[0, np.flatnonzero(np.diff(cell)) + 1]
         count = np.diff(np.r_[first, len(t)])
         t_mean, p_mean, v_mean = (np.add.reduceat(x, first) / count
-                                  for x in (t, sent.value, sent.variance))
-        per_pa = SCALE_HEIGHT / p_mean
-        stated = np.sqrt(np.maximum(v_mean, 0.0) / count) * per_pa
+                                  for x in (t, samples.value, samples.variance))
+        stated = np.sqrt(np.maximum(v_mean, 0.0) / count) * (SCALE_HEIGHT / p_mean)
         sigma = np.where(stated > 0, stated, HEIGHT_SIGMA / np.sqrt(count))
         return Pressure(t_mean, -SCALE_HEIGHT * np.log(p_mean / p_mean[0]), sigma)
 
     @staticmethod
-    def prior_sigmas(sent: Pressure, config: Config) -> Floats:
+    def prior_sigmas(samples: Pressure, config: Config) -> Floats:
         return np.array(PRIOR_SIGMAS)
 
     @staticmethod
-    def least(sent: Pressure) -> dict[str, float]:
-        return {'pressure': (MIN_NOISE.height / float(np.median(sent.sigma)))**2}
+    def min_levels(samples: Pressure) -> dict[str, float]:
+        return {'pressure': (MIN_NOISE.height / float(np.median(samples.sigma)))**2}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         leg, state, points = problem.leg, point.state, point.points['pressure']
-        sent, k, tau = problem.external['pressure'], points.interval, points.tau
-        assert isinstance(sent, Pressure)
+        samples, k, tau = problem.external['pressure'], points.interval, points.tau
+        assert isinstance(samples, Pressure)
         C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
         dp = rotate(C, points.dp)
         dv = rotate(C, points.dv)
         velocity_n = state.v_n[k] + dv + g * tau[:, None]
         by_velocity = (2 * state.constants[PRESSURE][2] * velocity_n)[:, None]
-        by_constants = np.stack([np.ones(len(k)), sent.t, (velocity_n**2).sum(axis=1),
-                                 sent.height - sent.height.mean()], -1)
+        by_constants = np.stack([np.ones(len(k)), samples.t, (velocity_n**2).sum(axis=1),
+                                 samples.height - samples.height.mean()], -1)
         p_n = state.p_n[k] + state.v_n[k] * tau[:, None] + dp + g * (tau**2 / 2)[:, None]
         height = p_n[:, 2] + (p_n[:, :2]**2).sum(axis=1) / (2 * EARTH_RADIUS)
-        raw = sent.height - height - by_constants @ state.constants[PRESSURE]
+        raw = samples.height - height - by_constants @ state.constants[PRESSURE]
         J, c = np.zeros((len(k), 1, WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         up = np.concatenate([p_n[:, :2] / EARTH_RADIUS, np.ones((len(k), 1))], axis=1)[:, None]
         t = tau[:, None, None]
@@ -95,4 +94,4 @@ class PressureRows(ExternalRows):
         by_gyro = -up @ C @ points.dp_by_gyro - by_velocity @ C @ points.dv_by_gyro
         J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         c[:, 0, PRESSURE] = -by_constants
-        return Rows(raw[:, None], J, c, 1 / sent.sigma[:, None])
+        return Rows(raw[:, None], J, c, 1 / samples.sigma[:, None])

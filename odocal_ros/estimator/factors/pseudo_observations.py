@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Pseudo-observations: priors of biases, constants and the first keyframe, and standstills.
+Factors without a sensor: priors and standstills.
 
-``PriorRows`` are the priors, docs/method.md (S21). ``StandstillRows`` state that the vehicle has
-no velocity at a keyframe in a standstill, and does not turn between two of them, (S20).
+``PriorRows`` are the priors of the biases, the constants and the first keyframe, docs/method.md
+(S21), and estimate the sizes of imperfections, (S28). ``StandstillRows`` state that the vehicle
+has no velocity at a keyframe in a standstill, and does not turn between two of them, (S20).
 """
 
 from collections.abc import Iterator
@@ -29,24 +30,25 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import PHI, V
 from odocal_ros.nav.rotations import rotvec, transpose
 
-# sizes of imperfections, by the square of the usual one: names of the levels, and their median.
-# Judgement: usual sizes are those of data sheets, which most sensors keep
+# sizes of imperfections, factors on their usual variances: names of the levels, and their prior
+# median. Judgement: usual sizes are those of data sheets, which most sensors keep
 SIZES, SIZE = tuple(f'size_{kind}' for kind in layout.KIND_SIZES), 0.5
-# of the logarithms of sizes. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
-# (docs/decisions/0016). Most receivers have no odometer, others one that is up to 2 % off, 6 of
-# the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
-# one, at 3 1.7 times (docs/decisions/0019)
+# prior sigmas of the logarithms of sizes. Tuned: with 2, pitch is up to 5.2 sigma off in 113
+# drives, with 1, 2.8 (docs/decisions/0016). Most receivers have no odometer, others one with an
+# error of up to 2 %, which is 6 in the logarithm: with 1, the sigma of the scale is up to 2.8
+# times as large in drives without one, with 3, 1.7 times (docs/decisions/0019)
 SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
-# definition: grid of the logarithms of sizes, relative to the least
+# definition: values of the logarithm of a size over which its posterior is integrated
 LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
 # priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
 # data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
     'position': (layout.P, 1e4), 'velocity': (layout.V, 100.0),
     'attitude': (layout.PHI, np.array([1.0, 1.0, 10.0]))}
-# m: without heights; with 1e4 m the rounding error is too large. Definition
+# definition: column of the height, and its prior, m, if no fix has a height; with 1e4 m the
+# rounding error is too large
 UP, LEVEL_START = slice(layout.P.stop - 1, layout.P.stop), 1.0
-# priors of the vehicle, shared by all legs
+# constants that all legs of a vehicle share, by source in the budget
 SHARED: dict[str, slice | Ints] = {
     'odometer_lever_arm': layout.ODO_ARM, 'antenna_lever_arm': layout.GNSS_ARM,
     'odometer_delay': np.array([layout.ODO_DELAY, layout.ODO_CLOCK, layout.ODO_LAG2]),
@@ -62,31 +64,30 @@ SHARED: dict[str, slice | Ints] = {
     'body_lean': layout.constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
     'speed_truncation': layout.constants_from('speed_offset'),
     'heading': layout.constants_from('heading_offset'), 'velocity': layout.VELOCITY}
-# 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.
-# Physical, judgement: wind, an engine and people move it on its springs, and tilt it more than
-# they turn it
+# motion of a vehicle at rest, 1 sigma: m/s, and rad/sqrt(s) about east, north, up. Judgement:
+# wind, an engine and people move it on its springs, and tilt it more than they turn it
 STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
 class PriorRows(Factor):
-    """Rows of the unknowns with their priors."""
+    """Rows of the priors: unknown minus prior mean."""
 
     name = 'priors'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.usual_priors = point.state, point.priors
-        self.own = problem.unshared_constants | {'slow_fix_errors': layout.FIX_ERRORS,
-                                  'vertical_motion': layout.LIFT}
+        self.unshared = problem.unshared_constants | {
+            'slow_fix_errors': layout.FIX_ERRORS, 'vertical_motion': layout.LIFT}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
-        self.shared = {name: where for name, where in SHARED.items()
-                       if (problem.priors.sigma[where] > layout.NO_ERROR).any()}
+        self.shared = {name: indices for name, indices in SHARED.items()
+                       if (problem.priors.sigma[indices] > layout.NO_ERROR).any()}
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
 
     def weigh(self, levels: Levels) -> None:
-        """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
+        """Multiply the usual variances of the imperfections by their sizes, (S28)."""
         size = np.array([levels[name] for name in SIZES])[layout.KIND_OF]
         sigma = self.usual_priors.sigma.copy()
         sigma[layout.IMPERFECTIONS] *= np.sqrt(size)
@@ -95,11 +96,12 @@ class PriorRows(Factor):
 
     def sizes(self, marginals: JointMarginals) -> dict[str, float]:
         """
-        Return the expected size of each type at the other current values: docs/method.md (S29).
+        Return the size of each kind of imperfections, given all other unknowns, (S29).
 
-        An imperfection is weighted by the share of the drive in its information; otherwise model
-        errors would change the size of one that is hardly observable. For the wide prior of a rare
-        effect it is the most likely size: the mean is that of the few vehicles with the effect.
+        It is the mean of the posterior. An imperfection is weighted by the share of the drive in
+        its information; otherwise model errors would change the size of one that is hardly
+        observable. For a rare effect, with a wide prior, it is the most likely size: the mean
+        would be that of the few vehicles with this effect.
         """
         at = 2 * self.n + np.arange(layout.IMPERFECTIONS.start, layout.IMPERFECTIONS.stop)
         usual = self.usual_priors.sigma[layout.IMPERFECTIONS]**2
@@ -107,23 +109,25 @@ class PriorRows(Factor):
         total = 1 / marginals[0][at, at]
         data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
         known = data / (data + 1 / (SIZE * usual))
-        found = (self._constants_off()[layout.IMPERFECTIONS] * total / data)**2
+        z2 = (self._deviations()[layout.IMPERFECTIONS] * total / data)**2
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
-        off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[layout.KIND_OF]
+        kinds = np.eye(len(SIZES))[layout.KIND_OF]
         spread = np.array([SIZE_SPREADS[name] for name in SIZES])
-        cost = off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2
-        likely = np.exp(LOG_SIZES[np.argmin(cost, axis=0)])
+        # -2 ln of the posterior density, for each value of LOG_SIZES and each kind
+        cost = (known * (z2 / variance + np.log(variance))) @ kinds + (
+            (LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2
+        most_likely = np.exp(LOG_SIZES[np.argmin(cost, axis=0)])
         mean = np.average(np.broadcast_to(np.exp(LOG_SIZES)[:, None], cost.shape), axis=0,
                           weights=np.exp((cost.min(axis=0) - cost) / 2))
-        return dict(zip(SIZES, np.where(spread > 1, likely, mean).tolist(), strict=True))
+        return dict(zip(SIZES, np.where(spread > 1, most_likely, mean).tolist(), strict=True))
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         columns = out.columns(SIZES)
-        off = self._constants_off()[layout.IMPERFECTIONS]
+        deviation = self._deviations()[layout.IMPERFECTIONS]
         sigma = self.priors.sigma[layout.IMPERFECTIONS]
-        of = np.eye(len(SIZES))[layout.KIND_OF]
-        out.g_constants[layout.IMPERFECTIONS, columns] += of * (off / sigma**2)[:, None]
-        out.square[columns, columns] += of.T @ (off / sigma)**2
+        kinds = np.eye(len(SIZES))[layout.KIND_OF]
+        out.g_constants[layout.IMPERFECTIONS, columns] += kinds * (deviation / sigma**2)[:, None]
+        out.square[columns, columns] += kinds.T @ (deviation / sigma)**2
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""
@@ -131,11 +135,12 @@ class PriorRows(Factor):
         yield layout.BG, state.gyro_bias[0], priors.gyro_bias_sigma
         yield layout.BA, state.accel_bias[0], priors.accel_bias_sigma
 
-    def _constants_off(self) -> Floats:
+    def _deviations(self) -> Floats:
+        """Return the constants minus their prior means: (M,)."""
         return self.state.constants - self.priors.mean
 
     def add(self, out: Normal) -> None:
-        # the first keyframe has a wide prior at its value
+        # the first keyframe has a wide prior, with its value as mean
         for columns, sigma in START_SIGMAS.values():
             add_prior(out, 0, columns, sigma**2, 0.0)
         if self.no_heights:
@@ -144,51 +149,51 @@ class PriorRows(Factor):
             add_prior(out, 0, columns, sigma**2, value)
         w, m = 1 / self.priors.sigma**2, self.m
         out.corner[range(m), range(m)] += w[:m]
-        out.g_constants -= (w * self._constants_off())[:m]
+        out.g_constants -= (w * self._deviations())[:m]
         out.absent = w[m:]
 
     def cost(self) -> float:
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
-        out: float = total + (self._constants_off()**2 / self.priors.sigma**2).sum()
-        return out
+        return float(total + (self._deviations()**2 / self.priors.sigma**2).sum())
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         first = self.parameter_covariances(marginals[0][None])[0]
         yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias_sigma
         yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias_sigma
-        for name, where in self.own.items():
-            if where.stop <= self.m:
-                yield name, first[:, 2 * self.n:][:, where] / self.priors.sigma[where]
+        for name, indices in self.unshared.items():
+            if indices.stop <= self.m:
+                yield name, first[:, 2 * self.n:][:, indices] / self.priors.sigma[indices]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
-        """Yield names and effects, (3, k), of errors that all legs share."""
-        for name, where in self.shared.items():
-            yield name, covariance[:PARAMETER_COUNT, where] / self.priors.sigma[where]
+        """Yield sources that all legs share, as ``effects``; covariance : (M, M) of constants."""
+        for name, indices in self.shared.items():
+            yield name, covariance[:PARAMETER_COUNT, indices] / self.priors.sigma[indices]
 
 
 class StandstillRows(Factor):
-    """Rows of the velocity of keyframes at rest, of the turn of intervals at rest."""
+    """Rows of the velocity of keyframes at rest, and of the turn of intervals at rest."""
 
     name = 'standstills'
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.at_rest = point.state, problem.at_rest
-        self.pair = self.at_rest[:-1] & self.at_rest[1:]
+        self.intervals_at_rest = self.at_rest[:-1] & self.at_rest[1:]
         variance = STILL_TURN**2 * point.intervals.T[:, None]
-        z2 = (self.turned()**2 / variance).mean(axis=1, keepdims=True)
+        z2 = (self.turn()**2 / variance).mean(axis=1, keepdims=True)
         self.turn_variance = variance * np.maximum(z2 / TAIL_SIGMAS**2, 1.0)
 
-    def turned(self) -> Floats:
-        """Return the turn within each interval, rad: (K, 3)."""
+    def turn(self) -> Floats:
+        """Return the rotation vector of each interval, in n: (K, 3) rad."""
         C = self.state.C_nb
         return rotvec(C[1:] @ transpose(C[:-1]))
 
     def add(self, out: Normal) -> None:
         weight = self.at_rest[:, None] / STILL_SPEED**2
         add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
-        add_process(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
+        add_process(out, PHI, 1.0, self.intervals_at_rest[:, None] / self.turn_variance,
+                    self.turn())
 
     def cost(self) -> float:
-        total = (self.state.v_n[self.at_rest]**2).sum() / STILL_SPEED**2
-        out: float = total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()
-        return out
+        rest = self.intervals_at_rest
+        return float((self.state.v_n[self.at_rest]**2).sum() / STILL_SPEED**2
+                     + (self.turn()[rest]**2 / self.turn_variance[rest]).sum())

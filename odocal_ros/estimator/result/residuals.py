@@ -132,7 +132,7 @@ def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
     """Return odometer path minus ground path in each interval, m: (K,)."""
     rows = fit.weighted[MotionRows]
     estimate, _ = rows.road_noise(marginals)
-    return -estimate[:, 0] * rows.along_size()
+    return -estimate[:, 0] * rows.along_sigma()
 
 
 def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
