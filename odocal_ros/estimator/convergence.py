@@ -54,17 +54,12 @@ class Progress:
     """Convergence of a fit from pass to pass."""
 
     def __init__(self, fitted: bool, frozen: bool, fewest: int) -> None:
-        """
-        Start without a pass.
-
-        fitted : derivatives use the fitted signal.   frozen : the levels are constant.   fewest :
-        passes before which a fit with free levels has not converged.
-        """
+        """Start; fitted : use fitted signals; frozen : keep levels; fewest : passes at least."""
         self.fitted = self.was_fitted = fitted      # in the next pass, in the last
         self.frozen, self.fewest, self.converged = frozen, fewest, False
-        # sigmas of scale and mounting, and the change of their logarithms
-        self.sigma, self.change = np.ones(PARAMETER_COUNT), np.inf
-        self.largest_change = np.inf    # the larger of this change and their largest step, sigmas
+        # sigmas of scale and mounting, largest change of their logarithms, the larger of it and of
+        # their largest step in sigmas
+        self.sigma, self.change, self.largest_change = np.ones(PARAMETER_COUNT), np.inf, np.inf
         self.largest_step = np.inf      # weighted, of all constants, in sigmas
         self.previous_step = np.zeros(layout.M)     # of the constants, for ``damp_step``
 

@@ -6,11 +6,9 @@ The least-squares problem of a leg, linearised at one state.
 
 ``Equations`` has all factors (sensors and priors) at the state, ``Weighted`` the same at given
 noise levels: normal equations, cost, and variance components. An additional sensor or prior is one
-more class in ``FACTORS``, derived from ``factor.Factor``.
-
-``find_constant_steps`` tests whether scale, yaw or pitch change within the leg: docs/method.md
-(S27c). A step of a constant at a time is one more column of the equations: that of the constant,
-in all rows after this time. Its estimate with all other unknowns free needs no second fit.
+more class in ``FACTORS``. ``find_constant_steps`` tests whether scale, yaw or pitch change within
+the leg: docs/method.md (S27c). A step of a constant at a time is one more column of the equations,
+that of the constant in all rows after this time: no second fit is needed.
 """
 
 from dataclasses import dataclass
@@ -59,13 +57,7 @@ def preintegrate_at(problem: Problem, state: State) -> tuple[Intervals, dict[str
 
 
 class Equations:
-    """
-    The factors at one linearisation point, without weights.
-
-    priors : by default those of the problem.   variance_factors : (K, VARIANCE_FACTOR_COUNT), of
-    outlier intervals, by default 1.   fitted : residuals are noise; derivatives by IMU errors then
-    use the fitted signals (signals.py).
-    """
+    """The factors at one linearisation point, without weights; see ``LinearisationPoint``."""
 
     def __init__(self, problem: Problem, state: State,
                  priors: Priors | None = None, variance_factors: Floats | None = None,
@@ -83,12 +75,7 @@ class Equations:
 
 
 class Weighted:
-    """
-    The factors at given levels.
-
-    After ``apply_step``, cost and components refer to the new state. ``marginals`` are those of
-    ``Solved``.
-    """
+    """The factors at given levels; ``apply_step`` changes cost and components to the new state."""
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels

@@ -24,11 +24,7 @@ from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import SpeedSteps
-from odocal_ros.estimator.factors.point_rows import (
-    count_rows_per_independent,
-    PointRows,
-    TAIL_SIGMAS,
-)
+from odocal_ros.estimator.factors.point_rows import PointRows, rows_per_independent, TAIL_SIGMAS
 from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.level_steps import prior_information, update_levels
 from odocal_ros.estimator.levels import Levels
@@ -199,7 +195,7 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
 def find_rows_per_independent(problem: Problem, weighted: Weighted) -> dict[str, float]:
     """Return rows per independent row of other sensors and of speed steps, by sensor."""
     # at constant acceleration errors of speed steps repeat
-    return {name: count_rows_per_independent(rows) for name, rows in weighted.factors.items()
+    return {name: rows_per_independent(rows) for name, rows in weighted.factors.items()
             if name in (*problem.external, SpeedSteps.name) and isinstance(rows, PointRows)}
 
 
@@ -222,12 +218,7 @@ def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,
 
 
 def _widen(initial: Floats, current: Floats, deviation: Floats, variance: Floats) -> Floats:
-    """
-    Return sigmas with which a prior differs from its estimate by RELAXATION_SIGMAS at most.
-
-    initial, current : sigmas, inf: no prior.   deviation : of the estimate from the prior mean.
-    variance : of the estimate.
-    """
+    """Return sigmas; deviation : estimate minus prior mean.   variance : of the estimate."""
     # at most 30 times the initial one: a larger difference is a wrong setting, which is reported
     finite = np.isfinite(initial)
     start, sigma = np.where(finite, initial, 1.0), np.where(finite, current, 1.0)

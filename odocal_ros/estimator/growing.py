@@ -193,11 +193,7 @@ def _motion_summary(state: State) -> tuple[float, float, float]:
 
 
 def make_imu_steps(view: SmootherLeg, spacing: float) -> ImuSteps:
-    """
-    Return the IMU steps of a leg, with keyframes that keep their times as it grows.
-
-    Keyframes are at multiples of ``spacing``, s, and at the first and the last sample.
-    """
+    """Return IMU steps with keyframes at multiples of spacing, s, and at both ends of a leg."""
     first, t = imu_rows(view)
     k = nearest_samples(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)

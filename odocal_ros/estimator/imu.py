@@ -70,11 +70,7 @@ def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """
-    Sums over m steps from t[k] to t[k + 1], in the axes of b at the start of each.
-
-    They contain the biases and all other errors of the IMU.
-    """
+    """Sums over m steps of samples, with all their errors, in the axes of b at each start."""
 
     turn: Floats        # (m, 3) rad, rotation vector from start to end
     turn_mean: Floats   # (m, 3) rad, its mean over the step: half of it if the rate is constant

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The input of the estimator: one leg as arrays of screened samples.
-
-``prepare.make_smoother_leg`` makes a ``SmootherLeg``. Other sensors than IMU, odometer and fixes
-are ``ExternalSamples``.
-"""
+"""The input of the estimator: one leg as arrays of screened samples (``SmootherLeg``)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace

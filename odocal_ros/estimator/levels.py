@@ -85,11 +85,7 @@ class Levels:
 
 
 class LevelRightHandSides:
-    """
-    The vectors g_i of L levels, initially zero.
-
-    g : (N, n, L) of the keyframes.   g_constants : (m, L).   square : (L, L) q_i' R^-1 q_j.
-    """
+    """The vectors g_i: (N, n, L) of keyframes, (m, L) of constants; q_i' R^-1 q_j: (L, L)."""
 
     def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
         self.names = tuple(names)

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Preparation of the estimator: from screened samples to a leg, from a leg to its problem.
-
-``make_smoother_leg`` returns the input of a fit; ``make_problem`` the keyframes, the priors of the
-constants and the initial noise levels.
-"""
+"""Preparation of a fit: screened samples to a leg; a leg to keyframes, priors and levels."""
 
 from dataclasses import replace
 

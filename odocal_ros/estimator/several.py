@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The result of several legs of one vehicle, from the marginal information of each.
-
-calib/joint.py computes the joint estimate of their constants; this module makes estimates,
-reasons, error budget and details of it.
-"""
+"""The result of several legs of one vehicle, by the joint estimate of their marginals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,6 +18,7 @@ from odocal_ros.calib.value_limits import cause_of_change, format_change
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 from odocal_ros.estimator.factors.pseudo_observations import SHARED, SIZE
+from odocal_ros.estimator.result import wheel_result
 from odocal_ros.estimator.result.estimates import (
     estimate_constants,
     FittedConstants,
@@ -32,12 +28,6 @@ from odocal_ros.estimator.result.estimates import (
 from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
 from odocal_ros.estimator.result.outcome import SCALES, with_model_floor
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
-from odocal_ros.estimator.result.wheel_result import (
-    combine_wheels,
-    Wheel,
-    wheel_details,
-    wheel_estimates,
-)
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECTIONS, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -74,13 +64,13 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
     fitted = FittedConstants(found.value[at], sigma, sigma / found.factor / found.prior_sigma[at])
-    wheels = combine_wheels(legs)
+    wheels = wheel_result.combine_wheels(legs)
     estimates, refusals = _estimate(legs, fitted, wheels, config, local)
     sources = _error_sources(found.relaxed_sigma[at] * found.factor, C, common)
     # a pitch without a prior: some leg has an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.prior_sigma[at][PITCH]) else None
     details = _details(found, fitted.value, C, sources, len(legs)) | {
-        'beside': additional_figures(fitted.value, C, grade)} | wheel_details(wheels)
+        'beside': additional_figures(fitted.value, C, grade)} | wheel_result.wheel_details(wheels)
     reasons = (*(_scale_change_reason(change, times, leg_numbers) for change in changes),
                *_disagreement_reasons(found, leg_numbers), *refusals)
     return MethodResult('smoother', reasons, estimates, PARAMETERS, sources, details,
@@ -101,8 +91,9 @@ def _fit(legs: Sequence[MethodResult], times_ns: Ints,
                        (days == 0).tolist()), changes
 
 
-def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants, wheels: dict[str, Wheel],
-              config: Config, local: bool) -> tuple[dict[str, Estimate], list[Reason]]:
+def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
+              wheels: dict[str, wheel_result.Wheel], config: Config,
+              local: bool) -> tuple[dict[str, Estimate], list[Reason]]:
     """Return the estimates of the legs together, and the reasons for those not determined."""
     scales = ((leg.estimates[name].value for name in ('scale_factor', 'scale_ratio'))
               for leg in legs)
@@ -111,7 +102,8 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants, wheels: dic
                                              nominal, config)
     estimates |= combine_as_sent(legs, estimates['scale_factor'])
     if wheels:
-        of_wheels, reasons = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
+        of_wheels, reasons = wheel_result.wheel_estimates(
+            wheels, wheels, estimates['scale_factor'], config)
         estimates, refusals = estimates | of_wheels, refusals + reasons
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]

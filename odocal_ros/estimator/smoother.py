@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The smoother: scale factor and mounting angles from all samples of a leg at once (docs/method.md).
-
-``smooth`` prepares the problem, fits it from one or two starts, and makes the result.
-"""
+"""The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
 
 from dataclasses import replace
 
@@ -76,11 +72,7 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
 
 
 def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fit:
-    """
-    Return the fit with the offset of a coarse speed fixed: 0 (rounding) or that of truncation.
-
-    It is unchanged if the data do not clearly select one of them.
-    """
+    """Return the fit with the offset fixed at 0 or at truncation, if the data select one."""
     coarse = problem.leg.travel.coarse
     if coarse is None or not coarse.truncation:
         return current
@@ -170,8 +162,6 @@ def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Lev
     """
     Return the Cramer-Rao bound, the covariance of the constants at a known state: (M, M).
 
-    It is the inverse of the information of all observations, with the priors of the constants, in
-    the order of CONSTANTS.
     truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
     return Equations(make_problem(leg, config), truth, fitted=True).at(levels).solved().covariance

@@ -178,9 +178,18 @@ class State:
     @cached_property
     def C_bv_gradient(self) -> tuple[Floats, Floats]:
         """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
-        C, up = self.C_bv, self.up_b
-        by_yaw, by_pitch = forward_gradient(self.constants[YAW], self.constants[PITCH])
-        return _axes_gradient(C, up, by_yaw), _axes_gradient(C, up, by_pitch)
+        yaw, pitch = self.constants[[YAW, PITCH]]
+        cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+        forward, left, _ = self.C_bv.T
+        size = np.linalg.norm(np.cross(self.up_b, forward))
+
+        def gradient(by_forward: Floats) -> Floats:
+            by_left = np.cross(self.up_b, by_forward) / size
+            by_left = by_left - left * (left @ by_left)
+            return np.stack([by_forward, by_left, np.cross(by_forward, left)
+                             + np.cross(forward, by_left)], -1)
+        return (gradient(np.array([-sy * cp, -cy, -sy * sp])),
+                gradient(np.array([-cy * sp, 0.0, cy * cp])))
 
     def updated(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state after a step of every unknown: (N, n), (M,)."""
@@ -194,11 +203,8 @@ class State:
 
 
 def limit_pitch(constants: Floats) -> Floats:
-    """
-    Return constants with the same forward axis and a pitch within 90 deg.
-
-    Far from the solution, a step may move the pitch beyond 90 deg and invert the lever arms.
-    """
+    """Return constants with the same forward axis and a pitch within 90 deg."""
+    # far from the solution a step may move the pitch beyond it, which inverts the lever arms
     if abs(constants[PITCH]) <= np.pi / 2:
         return constants
     out = constants.copy()
@@ -207,30 +213,10 @@ def limit_pitch(constants: Floats) -> Floats:
 
 
 def C_bv(forward: Floats, up: Floats) -> Floats:
-    """
-    Return the rotation from vehicle to body axes, forward, left, up in columns: (3, 3).
-
-    forward, up : (3,) in b. The left axis is level: the motion of a point does not determine roll.
-    """
+    """Return the axes forward, left (level), up of the vehicle in columns: (3, 3); (3,) in b."""
     left = np.cross(up, forward)
     left = left / np.linalg.norm(left)
     return np.stack([forward, left, np.cross(forward, left)], -1)
-
-
-def _axes_gradient(C: Floats, up: Floats, by_forward: Floats) -> Floats:
-    """Return the derivative of C_bv from that of the forward axis, ``by_forward``: (3, 3)."""
-    forward, left = C[:, 0], C[:, 1]
-    size = np.linalg.norm(np.cross(up, forward))
-    by_left = np.cross(up, by_forward) / size
-    by_left = by_left - left * (left @ by_left)
-    return np.stack([by_forward, by_left,
-                     np.cross(by_forward, left) + np.cross(forward, by_left)], -1)
-
-
-def forward_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
-    """Return the derivatives of the forward axis by yaw and by pitch: two (3,)."""
-    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    return np.array([-sy * cp, -cy, -sy * sp]), np.array([-cy * sp, 0.0, cy * cp])
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
 
     border = np.arange(N * n, size)
     every, weighted_copy = slice(None), motion.weighted_copy(levels, M)
-    units = motion.noise.columns(every) * weighted_copy.roots()
+    units = motion.noise.columns(every) * weighted_copy.level_sigmas()
     a, b, c = weighted_copy.derivatives(every, units)
     Q = motion.noise.covariance(units, every)
     for k in range(N - 1):

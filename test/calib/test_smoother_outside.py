@@ -21,7 +21,7 @@ from smoother_legs import (
 
 from odocal_ros.estimator import cramer_rao_bound, smooth
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.point_rows import count_rows_per_independent
+from odocal_ros.estimator.factors.point_rows import rows_per_independent
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import PRESSURE, YAW
@@ -148,7 +148,7 @@ def test_white_errors_are_not_alike():
         r, weight = rng.standard_normal((1000, 3)), np.ones((1000, 3))
 
     # the largest of seven ratios of chi2 with 24 to 1000 degrees of freedom: 1 + 3 / sqrt(12)
-    assert count_rows_per_independent(White) < 1.9
+    assert rows_per_independent(White) < 1.9
 
 
 @pytest.mark.parametrize('how', ['topic', 'fixed', 'imu'])

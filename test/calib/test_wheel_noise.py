@@ -9,12 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.estimator.result.wheels import (
-    _left_out,
-    _solved,
-    fit_line,
-    Increments,
-)
+from odocal_ros.estimator.result.wheels import _leave_one_out, _solve, fit_line, Increments
 
 K = 300             # increments of a drive of five minutes
 PATH = 10.0          # m in each
@@ -53,18 +48,18 @@ def dense(seen, spread, log_levels):
 def test_it_is_least_squares_with_the_whole_covariance():
     seen, spread, levels = uneven()
     V = dense(seen, spread, levels)
-    x, covariance, cost, banded, root = _solved(levels, seen, spread)
+    x, covariance, cost, banded, root = _solve(levels, seen, spread)
     information = seen.X.T @ np.linalg.solve(V, seen.X) + np.diag(1 / seen.prior**2)
-    expected = seen.centre + np.linalg.solve(
-        information, seen.X.T @ np.linalg.solve(V, seen.y - seen.X @ seen.centre))
+    expected = seen.mean + np.linalg.solve(
+        information, seen.X.T @ np.linalg.solve(V, seen.y - seen.X @ seen.mean))
     assert_allclose(covariance, np.linalg.inv(information), rtol=1e-10)
     assert_allclose(x, expected, rtol=1e-10)
-    off, before = seen.y - seen.X @ x, x - seen.centre
+    off, before = seen.y - seen.X @ x, x - seen.mean
     quadratic = off @ np.linalg.solve(V, off) + before @ (before / seen.prior**2)
     assert cost == pytest.approx(np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1]
                                  + quadratic, rel=1e-10)
     inverse = np.linalg.inv(V)
-    assert_allclose(_left_out(banded, root, off), inverse @ off / np.sqrt(np.diag(inverse)),
+    assert_allclose(_leave_one_out(banded, root, off), inverse @ off / np.sqrt(np.diag(inverse)),
                     rtol=1e-9)
     assert_allclose(banded[1], np.diag(V))
 

@@ -80,12 +80,8 @@ class Axle:
         return np.concatenate([force, jerk], axis=1)
 
     def acceleration(self) -> Floats:
-        """
-        Return the acceleration by traction and braking, positive if faster: (K,) m/s^2.
-
-        That of the speed plus the component of gravity on slopes. It is by speeds, since in a turn
-        with sideslip the centripetal acceleration has a forward component.
-        """
+        """Return the acceleration by traction (positive) and braking, (S11): (K,) m/s^2."""
+        # by speeds: in a turn with sideslip the centripetal acceleration has a forward component
         speed = self._forward_speed(self.v_n)
         by_slope: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope

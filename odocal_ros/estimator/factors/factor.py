@@ -112,19 +112,11 @@ class Factor:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, marginals: JointMarginals) -> Iterable[tuple[str, Floats]]:
-        """
-        Yield sources of the error budget, (S32).
-
-        Each with the effects of k unit errors on ln K, yaw and pitch: (..., 3, k).
-        """
+        """Yield budget sources, (S32): effects of unit errors on ln K, yaw, pitch, (..., 3, k)."""
         return ()
 
     def parameter_covariances(self, covariances: Floats) -> Floats:
-        """
-        Return the cross-covariances of ln K, yaw, pitch with all unknowns: (k, 3, 2n + m).
-
-        covariances : (k, 2n + m, 2n + m) of some intervals, from ``JointMarginals``.
-        """
+        """Return covariances (k, 2n + m, 2n + m), only the rows of ln K, yaw and pitch."""
         return covariances[:, 2 * self.n:2 * self.n + PARAMETER_COUNT, :]
 
     def all_parameter_covariances(self, marginals: JointMarginals) -> Floats:
@@ -136,11 +128,7 @@ class Factor:
 
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
               residual: Floats | float, weight: Floats | float = 1.0) -> None:
-    """
-    Add priors of single unknowns: of columns at keyframes k.
-
-    residual : value minus prior mean.   weight : factor on the information, 0: no prior.
-    """
+    """Add priors of columns at keyframes k; residual : value minus mean.   weight 0 : no prior."""
     i = np.arange(out.g.shape[1])[columns]
     keys = np.atleast_1d(np.arange(len(out.g))[k])
     information, gradient = (np.broadcast_to(x, (len(keys), len(i)))
@@ -153,12 +141,7 @@ def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | fl
 
 def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
                 residual: Floats) -> None:
-    """
-    Add a first-order process of c columns over all intervals.
-
-    residual : (K, c) value at the end minus decay times value at the start.   weight : inverse
-    variance.
-    """
+    """Add a process; residual : (K, c), value at the end minus decay times that at the start."""
     i = np.arange(out.g.shape[1])[columns]
     shape = np.broadcast_shapes(np.shape(residual), (len(out.upper), len(i)))
     terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,

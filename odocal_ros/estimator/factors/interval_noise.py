@@ -10,9 +10,8 @@ each noise, at unit variance, on the rows. Those of IMU and road are multiplied 
 their levels, which the fit estimates.
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
-time is a two-point Gauss rule. With constant force and speed the integrand is a polynomial in
-time. The rule is exact up to the third order, and 3 % off for the small terms of fourth order
-(position by gyro noise).
+time is a two-point Gauss rule: exact up to the third order, and 3 % off for the small terms of
+fourth order (position by gyro noise).
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
@@ -30,7 +29,7 @@ from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import stamp_of
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import Levels, MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, P, PHI, V
 from odocal_ros.nav.odometer import Travel
@@ -52,6 +51,7 @@ PITCHING, PITCHING_LEAST = 0.03, 1e-4
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn angle: one corner does not determine sideslip, two do. Judgement
 CORNER_ANGLE = np.pi / 2
+ALONG = ('along', 'along_hard')     # levels along the path
 # levels whose lower limit is that of sideslip
 SIDEWAYS = ('side', 'side_turn', 'up')
 # levels of the motion that the odometer does not measure, m^2/s, and the index of their axis:
@@ -88,6 +88,15 @@ def min_sideslip(angle: float) -> float:
     """Return the lower limit of sideslip noise, m/sqrt(s); angle : rad, of all turns of a leg."""
     corners = np.clip((angle - CORNER_ANGLE) / CORNER_ANGLE, 0.0, 1.0)
     return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**corners)
+
+
+def road_levels(total_turn: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Return initial values and lower limits of ROAD; total_turn : rad."""
+    sideslip, road = min_sideslip(total_turn)**2, 0.01**2      # m^2/s; road: initial
+    return (dict.fromkeys(ALONG, road) | dict.fromkeys(SIDEWAYS, max(road, sideslip))
+            | {'pitching': PITCHING**2},
+            dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, sideslip)
+            | {'up': max(sideslip, HEAVE**2), 'pitching': PITCHING_LEAST**2})
 
 
 def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:

@@ -45,12 +45,9 @@ def moving_mean(x: Floats) -> Floats:
 
 
 def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
-    """
-    Return the squared inclination by a bounce of the body on its springs, (S11a): (K,).
-
-    inclination : of the path to the body.   slope : of the path to the horizontal. A bounce
-    changes both, sway the former only, a crest the latter only.
-    """
+    """Return the squared inclination by a bounce of the body on its springs, (S11a): (K,)."""
+    # of the path to the body and to the horizontal: a bounce changes both, sway the former only, a
+    # crest the latter only
     squared = (inclination - moving_mean(inclination)) * (slope - moving_mean(slope))
     return np.clip(squared, -0.5, 0.5)      # keeps the root real far from the solution
 
@@ -176,13 +173,9 @@ class Motion:
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
-        """
-        Return the root of (S11a), (K,), and set its derivative by the displacement, up_n times.
-
-        The odometer counts the path along the ground, whatever the pitch of the body by sway or
-        bumps. The projections of both paths on the body axis are shorter by the cosine of their
-        inclinations.
-        """
+        """Return the root of (S11a), (K,); set its derivative by a displacement along up_n."""
+        # the odometer counts the path along the ground, whatever the pitch of the body by sway or
+        # bumps; both projections on the body axis are shorter by the cosine of their inclination
         C_mean = (self.C + self.C_end) / 2
         self.up_n, forward_n = C_mean @ self.up, C_mean @ self.state.forward
 

@@ -16,23 +16,19 @@ from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import (
-    HEAVE,
+    ALONG,
     INTERVAL,
     interval_noise,
-    min_sideslip,
-    PITCHING,
-    PITCHING_LEAST,
-    SIDEWAYS,
+    road_levels,
 )
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
-from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
 
-ALONG = ('along', 'along_hard')     # levels of the noise along the path
 # sources in the budget, by level
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
          'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
@@ -62,11 +58,8 @@ class MotionRows(Factor):
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= white_noise_at_rest(problem.imu, problem.leg, problem.at_rest)
-        sideslip, road = min_sideslip(problem.total_turn)**2, 0.01**2      # m^2/s; road: initial
-        return (imu | dict.fromkeys(ALONG, road)
-                | dict.fromkeys(SIDEWAYS, max(road, sideslip)) | {'pitching': PITCHING**2},
-                imu | dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, sideslip)
-                | {'up': max(sideslip, HEAVE**2), 'pitching': PITCHING_LEAST**2})
+        initial, minimum = road_levels(problem.total_turn)
+        return imu | initial, imu | minimum
 
     def weigh(self, levels: Levels) -> None:
         """Whiten rows and derivatives by the inverse Cholesky factor of their covariance."""

@@ -32,11 +32,10 @@ from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# sigmas above which a row, or the slip of an interval, is down-weighted. Statistical: one normal
-# row in 370 is
+# sigmas above which a row or the slip of an interval has less weight. Statistical: 1 row in 370
 TAIL_SIGMAS = 3.0
 LEAST_ROWS = 5    # judgement: with fewer, outliers and levels are not estimated
-# function that groups rows by interval: (m, d, c) to (intervals, d times their largest number, c)
+# groups rows by interval: (m, d, c) to (intervals, d times their largest number, c)
 Gather = Callable[[Floats], Floats]
 
 
@@ -44,9 +43,8 @@ class PointRows(Factor):
     """
     m measurements of d components each.
 
-    A subclass sets raw and, if its rows contain the correlated fix error, share. A weighted copy
-    has the whitened residuals r (m, d), their derivatives J (m, d, n + m), and J_end (m, 3, 3) by
-    the correlated fix error of the keyframe after, or None.
+    A subclass sets raw, and share if its rows contain the correlated fix error. A weighted copy
+    has whitened r (m, d), J (m, d, n + m), and J_end (m, 3, 3) by that error after, or None.
     """
 
     levels_of: ClassVar[dict[str, slice]]     # components of each level, a factor on variances
@@ -91,8 +89,8 @@ class PointRows(Factor):
         if self.n == WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
             self.J_end = -self.whiten(one) * self._root * self.share[:, None, None]
-        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() \
-            / self.rows_per_independent
+        logs = np.log(np.tile(factor, (len(white), 1)))
+        self.log_R = -2 * logs.sum() / self.rows_per_independent
 
     @cached_property
     def J(self) -> Floats:
@@ -163,11 +161,10 @@ class PointRows(Factor):
             interval = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
-            def gather(x: Floats, rows: slice = rows, interval: Ints = interval,
-                       place: Ints = place, counts: Ints = counts,
-                       largest: int = largest) -> Floats:
+            def gather(x: Floats, rows: slice = rows, own: Ints = interval, place: Ints = place,
+                       counts: Ints = counts, largest: int = largest) -> Floats:
                 out = np.zeros((len(counts), largest, *x.shape[1:]))
-                out[interval, place] = x[rows]
+                out[own, place] = x[rows]
                 return out.reshape(len(counts), -1, x.shape[2])
 
             yield present[some], gather
@@ -221,7 +218,7 @@ class PointRows(Factor):
         yield self.source, np.concatenate(effects)
 
 
-def count_rows_per_independent(rows: PointRows) -> float:
+def rows_per_independent(rows: PointRows) -> float:
     """Return the number of adjacent rows that share one error, by the scatter of their means."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # horizontal: these determine scale and yaw
@@ -271,7 +268,7 @@ class ExternalRows(PointRows):
     def details(cls, samples: Any, constants: Floats, sigma: Floats) -> dict[str, Any]:
         """Return its details of a result: by default its constants, with sigmas."""
         return {CONSTANTS[i]: {'value': float(constants[i]), 'sigma': float(sigma[i])}
-                for i in range(cls.constants.start, cls.constants.stop)}
+                for i in range(*cls.constants.indices(len(CONSTANTS)))}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         """Return the rows at a state."""

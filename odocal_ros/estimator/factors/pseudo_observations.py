@@ -17,13 +17,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.factor import (
-    add_prior,
-    add_process,
-    Factor,
-    LinearisationPoint,
-    PARAMETER_COUNT,
-)
+from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
@@ -69,12 +63,12 @@ SHARED: dict[str, slice | Ints] = {
 STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
-class PriorRows(Factor):
+class PriorRows(factor.Factor):
     """Rows of the priors: unknown minus prior mean."""
 
     name = 'priors'
 
-    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+    def __init__(self, problem: Problem, point: factor.LinearisationPoint) -> None:
         self.state, self.usual_priors = point.state, point.priors
         self.unshared = problem.unshared_constants | {
             'slow_fix_errors': layout.FIX_ERRORS, 'vertical_motion': layout.LIFT}
@@ -142,11 +136,11 @@ class PriorRows(Factor):
     def add(self, out: Normal) -> None:
         # the first keyframe has a wide prior, with its value as mean
         for columns, sigma in START_SIGMAS.values():
-            add_prior(out, 0, columns, sigma**2, 0.0)
+            factor.add_prior(out, 0, columns, sigma**2, 0.0)
         if self.no_heights:
-            add_prior(out, 0, UP, LEVEL_START**2, 0.0)
+            factor.add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
-            add_prior(out, 0, columns, sigma**2, value)
+            factor.add_prior(out, 0, columns, sigma**2, value)
         w, m = 1 / self.priors.sigma**2, self.m
         out.corner[range(m), range(m)] += w[:m]
         out.g_constants -= (w * self._deviations())[:m]
@@ -167,15 +161,15 @@ class PriorRows(Factor):
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield sources that all legs share, as ``effects``; covariance : (M, M) of constants."""
         for name, indices in self.shared.items():
-            yield name, covariance[:PARAMETER_COUNT, indices] / self.priors.sigma[indices]
+            yield name, covariance[:factor.PARAMETER_COUNT, indices] / self.priors.sigma[indices]
 
 
-class StandstillRows(Factor):
+class StandstillRows(factor.Factor):
     """Rows of the velocity of keyframes at rest, and of the turn of intervals at rest."""
 
     name = 'standstills'
 
-    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+    def __init__(self, problem: Problem, point: factor.LinearisationPoint) -> None:
         self.state, self.at_rest = point.state, problem.at_rest
         self.intervals_at_rest = self.at_rest[:-1] & self.at_rest[1:]
         variance = STILL_TURN**2 * point.intervals.T[:, None]
@@ -189,8 +183,8 @@ class StandstillRows(Factor):
 
     def add(self, out: Normal) -> None:
         weight = self.at_rest[:, None] / STILL_SPEED**2
-        add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
-        add_process(out, PHI, 1.0, self.intervals_at_rest[:, None] / self.turn_variance,
+        factor.add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
+        factor.add_process(out, PHI, 1.0, self.intervals_at_rest[:, None] / self.turn_variance,
                     self.turn())
 
     def cost(self) -> float:

@@ -120,13 +120,10 @@ class SlowError(factor.Factor):
                          for x in (z, observed)])
 
     def _time(self, product: Floats, excess: Floats, begin: Floats) -> tuple[float, float]:
-        """
-        Return quadratic sum and redundancy of the logarithm of the correlation time.
-
-        Their difference is the score: the expected one of the complete data (Fisher's identity).
-        Expected values : product, driving noise times the error before; excess, begin, squares of
-        noise and of the first error, in sigmas, minus 1.
-        """
+        """Return Q and E of the logarithm of the correlation time; Q - E is its score."""
+        # the expected score of the complete data (Fisher's identity). Expected values: product,
+        # driving noise times the error before; excess, begin: squares of noise and of the first
+        # error, in sigmas, minus 1
         a, tau, da, dq = self.decay, self.levels.correlation_time, self.da, self.dq
         score = float((product * da / self.noise_variance + excess * dq / 2).sum()
                       + begin.sum() / 2 - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimates of the constants: values that the drive determines, refusals, and their reasons."""
+"""Estimates of constants that the drive determines, reasons for others, marginal information."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
 from odocal_ros.settings.nominal import nominal_yaw
 
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
-# rad from nominal, judgement: more than any mounting
+# rad from nominal, judgement: no IMU is mounted so
 REVERSED_YAW = np.deg2rad(135.0)
 UNITS = dict.fromkeys(layout.CONSTANTS, 'm') | {
     'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
     'gnss_delay': 's'}
-# estimated if the drive determines them: lever arms and delays
+# constants that are stated if the drive determines them: lever arms and delays
 OPTIONAL = range(layout.ODO_ARM.start, layout.HEADING)
 
 
@@ -45,7 +45,7 @@ def refused_result(reasons: Iterable[Reason], scale_unit: str,
 
 
 def implausible_imu_reasons(fit: Fit) -> list[Reason]:
-    """Return the reasons against implausible errors of the IMU, [] if there are none."""
+    """Return the reason for a scale error that no IMU has, [] if there is none."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
     if abs(c[worst]) <= 0.2:        # twenty times the error of a consumer IMU
@@ -65,22 +65,18 @@ def unknown_estimates(scale_unit: str) -> dict[str, Estimate]:
 
 @dataclass(frozen=True, eq=False)
 class FittedConstants:
-    """Constants by one or several legs: (M,) each."""
+    """Constants from one or several legs."""
 
-    value: Floats           # ln K first, whole lever arms
-    sigma: Floats
-    sigma_ratio: Floats     # sigma of the fit over that of the prior
-    factor: float = 1.0     # on the sigmas, by model errors; angles must be determined with it
+    value: Floats           # (M,) ln K first, whole lever arms
+    sigma: Floats           # (M,)
+    sigma_ratio: Floats     # (M,) sigma of the fit over that of the prior
+    factor: float = 1.0     # by model errors, on the sigmas of angles before the comparison
     changed_angles: Collection[str] = ()    # names of angles that change in the leg
 
 
 def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
                        config: Config) -> tuple[dict[str, Estimate], list[Reason]]:
-    """
-    Return the estimates of the constants, and the reasons for those that are not determined.
-
-    scale_unit, nominal : of the scale; K0, 0 unknown.   config : limits.
-    """
+    """Return estimates of the constants, and reasons; nominal : configured scale, 0: unknown."""
     value, sigma = fitted.value, fitted.sigma
     is_informed = fitted.sigma_ratio < INFORMED_SHARE
     K, relative = float(np.exp(value[layout.LN_K])), float(sigma[layout.LN_K])
@@ -93,7 +89,7 @@ def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
         reasons.append(Reason(
             Code.SCALE_NOT_DETERMINED, f'scale uncertainty is {100 * relative:.0f} %, too large '
             f'to state a value; the limit is {100 * SCALE_LIMIT:g} %'))
-    # an angle with a larger sigma than half a degree and the limit is not determined
+    # sigma above which an angle is not stated
     limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
     for name, i, angle in (('yaw_mounting_angle', layout.YAW, wrap(value[layout.YAW])),
                            ('pitch_mounting_angle', layout.PITCH, value[layout.PITCH])):
@@ -108,7 +104,7 @@ def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
 
 
 def configured_constants(leg: SmootherLeg) -> Floats:
-    """Return the values of the settings that constants are corrections to: (M,)."""
+    """Return the settings that constants are corrections of: (M,), zero without a setting."""
     value = np.zeros(layout.M)
     value[layout.ODO_ARM], value[layout.GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
     return value
@@ -116,16 +112,16 @@ def configured_constants(leg: SmootherLeg) -> Floats:
 
 def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformation:
     """
-    Return the marginal information of a fit at its last linearisation point.
+    Return the marginal information of a fit at its last linearisation point, (S33).
 
-    The Schur complement of the constants less their priors. Constants that are fixed in the leg
-    have no information for other legs.
+    The Schur complement of the constants minus their priors. It has no information on constants
+    that are fixed in the leg, or that other legs do not share.
 
-    setting_values : (M,) values of the settings that constants are corrections to.
+    setting_values : (M,) as ``configured_constants``.
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
-    # each leg has its own ground and errors of the fixes, with their own priors
+    # LEG_CONSTANTS are eliminated, with their priors
     leg_rows = reduced[layout.LEG_CONSTANTS]
     gain = np.linalg.solve(leg_rows[:, layout.LEG_CONSTANTS], leg_rows).T
     g_reduced = g_reduced - gain @ g_reduced[layout.LEG_CONSTANTS]
@@ -145,7 +141,7 @@ def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:
     """
     Return the reason that constants keep their configured values.
 
-    names : of estimates.   local : positions in a local frame.
+    drives : subject, as text.   names : of estimates.   local : positions in a local frame.
     """
     heights = all(name.endswith('_z') for name in names)
     return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
@@ -155,7 +151,7 @@ def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Return names of estimates as people say them, axes of one thing together."""
+    """Return names of estimates as text, with the axes of one lever arm together."""
     words: dict[str, list[str]] = {}
     for name in names:
         stem, _, axis = name.rpartition('_')

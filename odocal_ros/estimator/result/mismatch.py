@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Model validation: where residuals contradict the noise model, and the factor on all sigmas.
+Check of the noise model against the residuals of a fit.
 
-IMU noise above its grade has a cause: quantisation, vibration, or the sensor itself.
+``find_mismatch`` returns the factor on all sigmas, f of docs/method.md (S31), and the reasons.
+``find_noise_cause`` finds out whether IMU noise above its grade is quantisation, vibration or
+noise of the sensor itself.
 """
 
 from collections.abc import Collection
@@ -27,23 +29,23 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import REMARK_SIGMAS
 from odocal_ros.settings.nominal import grade_of, turn_on_bias
 
-WORSE_THAN_GRADE = 3.0      # judgement: times the noise of its grade
-# m/s in a second, share and number of the seconds, of outliers that are reported. Judgement:
+WORSE_THAN_GRADE = 3.0      # judgement: limit of noise or bias over that of its grade
+# limits of accelerometer outliers: size, m/s per second, share and number of seconds. Judgement:
 # aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
 # drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
 OUTLIER_SIZE, OUTLIER_TIME, FEWEST_OUTLIERS = 0.01, 0.01, 3
 FINEST = 1e-5           # rad/s and m/s^2, physical: finer steps have no effect
-SAMPLES = 20_000        # judgement: fewest rows for the detection of a step
-ROWS_A_VALUE = 20       # judgement: a signal that holds so few values is quantised
-EXPLAINED = 0.4         # judgement: share of the noise variance that quantisation must have
-# judgement: times that single samples vary more in motion than at rest. Real drives: vibrating
-# accelerometers 26 and 3.6, gyros 1.3 and 2.0
+SAMPLES = 20_000        # judgement: number of samples in which a quantisation step is sought
+SAMPLES_PER_VALUE = 20  # judgement: a signal with more samples for each value is quantised
+EXPLAINED = 0.4         # judgement: share of the noise variance that quantisation must explain
+# judgement: limit of the noise of single samples in motion over that at rest. Real drives:
+# vibrating accelerometers 26 and 3.6, gyros 1.3 and 2.0
 VIBRATION = 3.0
 MOST_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
-FEWEST_ROWS = 100       # judgement: samples at rest, whose median then has a sigma of 15 %
+FEWEST_SAMPLES = 100    # judgement: their median has a sigma of 15 %
 # judgement: share of outliers among the fixes, and of intervals with slip
 OUTLIER_SHARE_LIMIT = 0.15
-SIDESLIP_LIMIT = 0.2    # m/sqrt(s), judgement: of wheels
+SIDESLIP_LIMIT = 0.2    # m/sqrt(s), judgement
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
 UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
 REMEDIES = {
@@ -90,19 +92,19 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
 def _noise_over_grade(problem: Problem, level: dict[str, float],
                       config: Config) -> tuple[float, list[str], str]:
     """
-    Return the IMU noise relative to its grade.
+    Return the largest ratio of IMU noise to the grade that the fit uses.
 
-    Largest ratio to the grade that the fit uses; texts on the noises that exceed the configured
-    grade; cause and action, '' if no noise exceeds a grade.
+    Also texts on noises above the configured grade, and cause and action, '' without any.
     """
-    stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
+    configured, used = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
-    texts = [f'{NAMES[name]} noise is {level[name] / stated[name]:.1f} times'
-             for name in sensors if level[name] > WORSE_THAN_GRADE * stated[name]]
+    texts = [f'{NAMES[name]} noise is {level[name] / configured[name]:.1f} times'
+             for name in sensors if level[name] > WORSE_THAN_GRADE * configured[name]]
     remedy = find_noise_cause(problem, level, [
-        name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
-    return max(level[name] / own[name] for name in sensors), texts, remedy
+        name for name in sensors
+        if level[name] > WORSE_THAN_GRADE * min(used[name], configured[name])])
+    return max(level[name] / used[name] for name in sensors), texts, remedy
 
 
 def _sensors(problem: Problem) -> list[str]:
@@ -124,7 +126,7 @@ def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
 
 
 def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
-    """Return text -> remedy of a fit that has not converged, and its last step, sigmas."""
+    """Return text and remedy of a fit that has not converged, and its last step in sigmas."""
     if not fit.slowly_converging and fit.converged:
         return {}, 0.0
     step = last_step(fit)
@@ -135,7 +137,7 @@ def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
 
 
 def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> dict[str, str]:
-    """Return text -> remedy of outliers, slip, sideslip and height errors beyond limits."""
+    """Return texts and remedies of outliers, slip, sideslip and height errors beyond limits."""
     texts = {}
     for what, mask, remedy in (
             ('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5,
@@ -158,7 +160,7 @@ def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> dict[st
 
 
 def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
-    """Report an accelerometer whose errors are far beyond its noise level for many seconds."""
+    """Return the reason for an accelerometer with many outliers."""
     factor = fit.variance_factors[:, ACCEL_NOISE]
     size = np.sqrt(factor * fit.levels['accel'])
     outlier = (factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)
@@ -180,7 +182,7 @@ def last_step(fit: Fit) -> float:
 
 
 def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reason]:
-    """Report an external heading that differs from that of the drive by more than its sigma."""
+    """Return the reason for an external heading that contradicts the drive; error : rad."""
     if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source_name}) differs by '
@@ -192,17 +194,17 @@ def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reas
 
 def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
     """
-    Return the cause of a noise that exceeds its grade, with the evidence, and what to do.
+    Return the cause of a noise that exceeds its grade, with the evidence, and the action.
 
-    level : roots of the white noise levels of 'gyro' and 'accel', SI per sqrt(Hz).
-    worse : those of 'gyro' and 'accel' that exceed their grade; empty: no text.
+    level : white noise of 'gyro' and 'accel', SI per sqrt(Hz).   worse : which of them exceed
+    their grade; empty: no text.
     """
     if not worse:
         return ''
     coarse = {name: step for name, step in find_quantised(problem.leg, level).items()
               if name in worse}
     vibrating: dict[str, str] = {}
-    own_noise: list[str] = []
+    sensor_noise_names: list[str] = []
     unknown: list[str] = []
     in_motion, at_rest = sample_noise_by_motion(problem)
     for name in (name for name in worse if name not in coarse):
@@ -213,8 +215,8 @@ def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]
         elif not rest and motion > VIBRATION * level[name]:
             vibrating[name] = (f'{NAMES[name]} samples vary {motion / level[name]:.0f} times as '
                                'much as their means over seconds')
-        else:       # less at rest than its integral
-            (own_noise if VIBRATION * rest > level[name] else unknown).append(name)
+        else:
+            (sensor_noise_names if VIBRATION * rest > level[name] else unknown).append(name)
     texts = []
     if coarse:
         texts.append(f'{_cause_of(coarse, worse)} is quantisation: {_steps_in_words(coarse)}. Set '
@@ -225,7 +227,7 @@ def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]
                      f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
                      'engine and motors.')
     texts += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
-              f'this is its normal noise, {_setting(name, level)}' for name in own_noise]
+              f'this is its normal noise, {_setting(name, level)}' for name in sensor_noise_names]
     texts += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
         'single samples vary less than their means over seconds. ' if at_rest else
         'there is no standstill to compare with. ')
@@ -241,20 +243,20 @@ def _cause_of(names: Collection[str], worse: Collection[str]) -> str:
 
 
 def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the white noise of single samples in motion and at rest; {}: too few samples."""
+    """Return the white noise of samples in motion and at rest, by sensor; {}: too few samples."""
     leg, keys = problem.leg, problem.imu.t[problem.imu.key]
-    at_rest = problem.at_rest[:-1] & problem.at_rest[1:]
+    rest = problem.at_rest[:-1] & problem.at_rest[1:]
 
     def part(t: Floats) -> Array:
         """Return 0 in motion, 1 at rest, 2 outside the keyframes."""
         at = np.searchsorted(keys, t, side='right') - 1
         inside = (t >= keys[0]) & (t < keys[-1])
-        return np.where(inside, at_rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
+        return np.where(inside, rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
     parts = by_row(part, leg.t_imu)
-    in_motion, at_rest = (sample_noise(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
-        np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1)))
-    return in_motion, at_rest
+    in_motion, at_rest = (np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1))
+    return (sample_noise(leg, in_motion) if len(in_motion) >= FEWEST_SAMPLES else {},
+            sample_noise(leg, at_rest) if len(at_rest) >= FEWEST_SAMPLES else {})
 
 
 def _setting(name: str, level: dict[str, float]) -> str:
@@ -269,23 +271,19 @@ def _steps_in_words(steps: dict[str, float]) -> str:
 
 
 def find_quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
-    """
-    Return the quantisation steps of sensors whose noise they explain, rad/s and m/s^2.
-
-    level : roots of the white noise levels of 'gyro' and 'accel', SI per sqrt(Hz).
-    """
-    interval = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
+    """Return quantisation steps, rad/s, m/s^2, that explain white noise, SI per sqrt(Hz)."""
+    T = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
     steps = {'gyro': _step(leg.w_b), 'accel': _step(leg.f_b)}
     return {name: step for name, step in steps.items()
-            if step**2 / 12 * interval > EXPLAINED * level[name]**2}
+            if step**2 / 12 * T > EXPLAINED * level[name]**2}
 
 
 def _step(x: Floats) -> float:
-    """Return the largest step of the columns of a signal."""
+    """Return the largest quantisation step of the columns of a signal, 0 if there is none."""
     rows = thinned(x, SAMPLES)
     found = 0.0
     for column in rows.T:
         values = np.unique(np.round(column / FINEST))
-        if 2 < len(values) < len(rows) / ROWS_A_VALUE:
+        if 2 < len(values) < len(rows) / SAMPLES_PER_VALUE:
             found = max(found, float(np.median(np.diff(values))) * FINEST)
     return found

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Data of a fitted leg for other programs: odometer messages, motion, biases, twist covariance.
+Data of a fitted leg for other programs, beside the calibrated values.
 
-The mean factor of a quantised speed as published is for consumers that only multiply. The
-covariance of the twist of calibrated wheels is from noise levels and constants of the legs.
+``odometry_details`` describes odometer messages and motion, ``factor_as_sent`` is the scale factor
+of a quantised speed for programs that only multiply, ``TwistNoise`` the covariance of the twist
+(speed and turn rate) that calibrated wheels give.
 """
 
 from collections.abc import Sequence
@@ -28,17 +29,17 @@ from odocal_ros.settings.config import SIDES
 from odocal_ros.settings.nominal import G, Grade
 
 AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
-SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocity faster
+SWAY_TIME = 0.1      # s, judgement: a body does not change its sideways velocity faster
 
 
-def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
-                     widen: float) -> dict[str, Any]:
+def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: JointMarginals,
+                     factor: float) -> dict[str, Any]:
     """
     Return ``odometer`` and ``accelerometer_bias``, as details of a method.
 
     odometer: sigma of a reading in scale units, period s, step of a quantised speed in scale units
-    per s, share of the motion that is accelerated, speeds m/s and turn rates rad/s in motion.
-    Biases at the start of the leg in b, m/s^2, with the ratio of their sigmas to the prior's.
+    per s, share of the motion with acceleration, speeds m/s and turn rates rad/s in motion.
+    Biases at the start of the leg in b, m/s^2. factor : on the sigmas of the fit.
     """
     motion = fit.weighted[MotionRows].motion
     path = np.linalg.norm(motion.displacement, axis=1)
@@ -57,7 +58,7 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMa
         'speed': float(np.sqrt(np.mean(speed**2))), 'fastest': float(speed.max()),
         'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
         'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
-    sigma = np.sqrt(np.diagonal(near[0])[BA]) * widen
+    sigma = np.sqrt(np.diagonal(marginals[0])[BA]) * factor
     ratio = sigma / fit.initial_priors.accel_bias_sigma
     biases = zip('xyz', fit.state.accel_bias[0], sigma, ratio, strict=True)
     return {'odometer': odometer} | ({'accelerometer_bias': {
@@ -65,14 +66,14 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMa
         for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
 
 
-def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:
+def factor_as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:
     """
-    Return the path length of a leg over the integral of its speeds as sent, by its name.
+    Return the path length over the integral of the published speeds, by name; {} without steps.
 
-    A truncated speed lacks half a step while the vehicle moves: K (1 + offset t / s), with t the
-    time in motion and s the integral. Only of a speed that the smoother uses by its steps.
+    It differs from K, since a truncated speed lacks half a step while the vehicle moves:
+    K (1 + offset t / s), with t the time in motion and s the integral.
 
-    leg, state : SmootherLeg, State.   covariance : (M, M) of the constants.
+    covariance : (M, M) of the constants.
     """
     coarse = leg.travel.coarse
     if coarse is None or not leg.uses_speed_steps:
@@ -82,17 +83,17 @@ def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Est
     dt, speed = np.diff(coarse.t)[within], np.abs(coarse.value[1:])[within]
     if not speed.any():
         return {}
-    lacks = float(dt[speed > 0].sum() / (dt @ speed))       # of the scale, by the offset
-    whole = 1 + lacks * state.constants[SPEED_OFFSET]
-    by = np.array([1.0, lacks / whole])
+    by_offset = float(dt[speed > 0].sum() / (dt @ speed))       # t / s
+    ratio = 1 + by_offset * state.constants[SPEED_OFFSET]
+    gradient = np.array([1.0, by_offset / ratio])
     at = [LN_K, SPEED_OFFSET]
-    relative = float(np.sqrt(by @ covariance[np.ix_(at, at)] @ by))
-    value = state.scale * whole
+    relative = float(np.sqrt(gradient @ covariance[np.ix_(at, at)] @ gradient))
+    value = state.scale * ratio
     return {AS_SENT: Estimate(value, value * relative, leg.scale_unit)}
 
 
 def combine_as_sent(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, Estimate]:
-    """Return the factor of several legs: joint scale times mean ratio of factor and scale."""
+    """Return ``factor_as_sent`` of several legs: joint scale times mean ratio to the scale."""
     ratios = [(leg.estimates[AS_SENT].value or 0.0) / (leg.estimates['scale_factor'].value or 1.0)
               for leg in legs if AS_SENT in leg.estimates]
     if not ratios or scale.value is None or scale.sigma is None:
@@ -103,7 +104,7 @@ def combine_as_sent(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, 
 
 
 def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
-    """Return additional figures for calibration.json; grade : None without an accelerometer."""
+    """Return further figures for calibration.json; grade : of the IMU, None: no accelerometer."""
     sigma = np.sqrt(np.diag(covariance))
     # scale_by_speed: the slope at FAST_SPEED
     out: dict[str, Any] = {
@@ -113,7 +114,7 @@ def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
             out[f'{name}_mounting_angle_housing_sigma'] = _entry(
                 _housing_sigma(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
-    next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
+    next_drive = 1e-3       # physical: 1 sigma of the scale between drives, tyres warm or cold
     out['scale_ratio_next_drive_sigma'] = _entry(np.hypot(sigma[layout.LN_K], next_drive), '1')
     return out
 
@@ -122,36 +123,35 @@ def _entry(value: float, unit: str) -> dict[str, Any]:
     return {'value': float(value), 'sigma': None, 'unit': unit}
 
 
-def _housing_sigma(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
-    """Return the sigma of an angle relative to the housing, from that to the sensor axes."""
-    # the angle between them is one of two axis errors of equal size whose sum is ``found``
+def _housing_sigma(error: float, error_sigma: float, sigma: float, misalignment: float) -> float:
+    """Return the sigma of a mounting angle of the IMU housing, from that of its sensor axes."""
+    # they differ by one of two axis errors of equal size, whose sum is ``error``
     if not misalignment:
         return sigma
-    posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
-    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (found / 2)**2)
-    return out
+    posterior_share = min(1.0, error_sigma**2 / (2 * misalignment**2))
+    return float(np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (error / 2)**2))
 
 
-def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
-    """Return the pitch relative to the accelerometer's level: third pitch of method_real."""
-    k = len(near) // 2
+def level_pitch(fit: Fit, marginals: JointMarginals, factor: float) -> dict[str, Any]:
+    """Return the pitch mounting relative to the level of the accelerometer with its bias."""
+    k = len(marginals) // 2
     n = fit.solved.step.shape[1]
     at = np.array([2 * n + layout.PITCH, layout.BA.start])
-    C = near[k][np.ix_(at, at)]
+    C = marginals[k][np.ix_(at, at)]
     row = np.array([1.0, -1 / G])
     return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
-            'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
+            'sigma': float(np.sqrt(row @ C @ row) * factor), 'unit': 'rad'}
 
 
 @dataclass(frozen=True, eq=False)
 class TwistNoise:
-    """Errors of the twist that calibrated wheels give over a message interval."""
+    """Errors of the twist (speed and turn rate) that calibrated wheels give for each message."""
 
-    period: float                     # s
+    period: float                     # s, between messages
     speed: float                      # m/s, rms of the drive in motion
     turn_rate: float                  # rad/s, rms
-    fastest: tuple[float, float]      # highest speed and turn rate
-    legs: tuple[dict[str, Any], ...]  # ``odometer``, levels, constants of each leg's fit
+    fastest: tuple[float, float]      # highest speed, m/s, and turn rate, rad/s
+    legs: tuple[dict[str, Any], ...]  # details of the fit of each leg
     estimates: dict[str, Estimate]    # of the calibration
 
     @property
@@ -175,45 +175,47 @@ class TwistNoise:
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
         K = self._known('scale_factor')[0]
         factor = self._known(AS_SENT)[0] or K
-        # as in noise.py: the noise of a wheel grows with the time it turns
-        turned, hard = min(max(v, 0.02), 1.0) / T, odometer['hard']
+        # as in interval_noise.py: noise is proportional to the time, below 1 m/s to the path
+        rate, hard = min(max(v, 0.02), 1.0) / T, odometer['hard']
         reading = (K * odometer['reading'])**2 / T**2       # of one reading; an interval has two
         along = (1 - hard) * noise['along']**2 + hard * noise['along_hard']**2
-        swayed = turned * T / max(T, SWAY_TIME)
-        grid = noise.get('steps')
-        if grid is not None:      # the fit does not use the integral of such a speed
+        sway_rate = rate * T / max(T, SWAY_TIME)
+        steps = noise.get('steps')
+        if steps is not None:     # the fit does not use the integral of such a speed
             along, reading = 0.0, 0.0
         side = noise['side_turn' if w > TURNING_RATE else 'side']**2
         white = leg['widened']**2 * np.array(
-            [along * turned + 2 * reading, side * swayed, noise['up']**2 * swayed])
-        arm_x, arm_y = (_mean_square(self._known(f'odometer_lever_arm_{axis}')) for axis in 'xy')
-        by_sideslip = _mean_square(_value_and_sigma(leg['sideslip'])) * (v**2 * w)**2
+            [along * rate + 2 * reading, side * sway_rate, noise['up']**2 * sway_rate])
+        arm_x, arm_y = (np.square(self._known(f'odometer_lever_arm_{axis}')).sum()
+                        for axis in 'xy')
+        by_sideslip = _mean_square(leg['sideslip']) * (v**2 * w)**2
         constant = np.array([self._scale_variance(leg, v) + arm_y * w**2,
                              by_sideslip + arm_x * w**2, 0.0])
-        coarse = (K * odometer['speed_step'])**2 / 12 * max(grid or 1.0, 1.0)**2 + (
+        coarse = (K * odometer['speed_step'])**2 / 12 * max(steps or 1.0, 1.0)**2 + (
             (factor - K) / K * v - K * leg['speed_offset']['value'])**2 * (factor != K)
         return np.append(white + constant + [coarse, 0.0, 0.0],
-                         self._turn_rate(leg, v, w, turned, reading))
+                         self._turn_rate(leg, v, w, rate, reading))
 
     def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
         """Return the variance of the speed by the scale: its sigma and its change with speed."""
         scale, sigma = self._known('scale_factor')
-        by_speed = _value_and_sigma(leg['scale_by_speed'])
+        by_speed = _mean_square(leg['scale_by_speed'])
         change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
-        return float(v**2 * ((sigma / scale)**2 + _mean_square(by_speed) * change**2))
+        return float(v**2 * ((sigma / scale)**2 + by_speed * change**2))
 
-    def _turn_rate(self, leg: dict[str, Any], v: float, w: float, turned: float,
+    def _turn_rate(self, leg: dict[str, Any], v: float, w: float, rate: float,
                    reading: float) -> float:
         """Return the variance of the turn rate from the difference of two wheels."""
         if not self.has_turn_rate:
             return np.nan
         left, right = (leg['wheels'][side] for side in SIDES)
         (width, sigma), hard = self._known('track_width'), leg['odometer']['hard']
-        even, pulled, turning = (np.square(left['walk']) + np.square(right['walk'])) / 2
-        walk = turning if w > TURNING_RATE else (1 - hard) * even + hard * pulled
+        constant, accelerating, turning = (np.square(left['walk'])
+                                           + np.square(right['walk'])) / 2
+        walk = turning if w > TURNING_RATE else (1 - hard) * constant + hard * accelerating
         # the mean of two wheels has half the variance of one; their deviations from the mean have
         # opposite signs
-        white = leg['widened']**2 * (4 * walk * turned + 8 * reading)
+        white = leg['widened']**2 * (4 * walk * rate + 8 * reading)
         ratio = left['ratio_sigma'] + right['ratio_sigma']
         return float(white + (sigma * w)**2 + (ratio * v)**2) / width**2
 
@@ -244,10 +246,6 @@ def _fitted_details(legs: Sequence[LegResult]) -> tuple[dict[str, Any], ...]:
     return tuple({'wheels': {}, **details} for details in found if 'odometer' in details)
 
 
-def _value_and_sigma(entry: dict[str, float]) -> tuple[float, float]:
-    return entry['value'], entry['sigma']
-
-
-def _mean_square(effect: tuple[float, float]) -> float:
+def _mean_square(effect: dict[str, float]) -> float:
     """Return the mean square of an effect, value and sigma, that a driver does not correct."""
-    return effect[0]**2 + effect[1]**2
+    return effect['value']**2 + effect['sigma']**2

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The smoother's fit as a method's result: estimates, reasons, budget, statistics of the drive.
+The result of a fit: estimates, reasons, error budget, details (``make_result``).
 
-The error budget, docs/method.md (S32), has each error's share of scale, yaw and pitch. For other
-legs the marginal information is without priors, (S33).
+The error budget, docs/method.md (S32), states the effect of each error source on scale, yaw and
+pitch. The result also has the marginal information for other legs, (S33).
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZES
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result import odometry_output, remarks
+from odocal_ros.estimator.result import odometry_output, remarks, residuals
 from odocal_ros.estimator.result.estimates import (
     configured_constants,
     estimate_constants,
@@ -42,20 +42,8 @@ from odocal_ros.estimator.result.estimates import (
     OPTIONAL,
 )
 from odocal_ros.estimator.result.mismatch import find_mismatch
-from odocal_ros.estimator.result.residuals import (
-    bias_sigmas,
-    correlation,
-    describe_slip_level,
-    find_slips,
-    normalised_residuals,
-    odometer_minus_ground_path,
-    Slip,
-    slip_reasons,
-    SLIP_VARIANCE,
-    stored_residuals,
-)
 from odocal_ros.estimator.result.wheel_result import Wheel, wheel_details, wheel_estimates
-from odocal_ros.estimator.result.wheels import wheels_beside
+from odocal_ros.estimator.result.wheels import fit_wheels
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE
@@ -66,9 +54,9 @@ SCALES = range(layout.FIX_MOTION_TIME, layout.VELOCITY.start)
 
 @dataclass(frozen=True, eq=False)
 class _Posterior:
-    """Constants after the fit, with the errors of the model."""
+    """Uncertainty of the constants after the fit, with the errors of the model, (S31)."""
 
-    factor: float        # on the sigmas of the fit, by contradictions of the noise model
+    factor: float        # f of (S31), on the sigmas of the fit
     covariance: Floats   # (M, M)
     sigma: Floats        # (M,)
     sigma_ratio: Floats  # (M,) sigma of the fit over that of the prior
@@ -76,13 +64,13 @@ class _Posterior:
 
 
 def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
-    """Return the result of a fit: estimates, reasons, budget, details."""
+    """Return the result of a fit; it uses up ``fit.solved``."""
     marginals = fit.solved.marginals()
     factor, reasons = find_mismatch(problem, fit, config)
     posterior = _posterior(problem, fit, factor)
     sigma, grade = posterior.sigma, problem.grade if leg.has_accelerometer else None
-    slips, slip_reasons = _find_slips(leg, fit, marginals, sigma)
-    reasons += slip_reasons
+    slips, reasons_of_slips = _find_slips(leg, fit, marginals, sigma)
+    reasons += reasons_of_slips
     reasons += remarks.remarks(problem, fit, sigma, posterior.sigma_ratio, config)
     estimates, refusals = _estimate(leg, fit, posterior, config)
     wheels, of_wheels, wheel_reasons = _estimate_wheels(
@@ -97,9 +85,9 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     reasons += check_limits(estimates, leg.nominal_scale, config)
     sources, information = _budget(leg, fit, marginals, posterior)
     details = _details(leg, problem, fit, sources, ratio, factor, sigma)
-    details |= stored_residuals(leg, problem, fit) | wheel_details(wheels)
+    details |= residuals.stored_residuals(leg, problem, fit) | wheel_details(wheels)
     details |= odometry_output.odometry_details(leg, problem, fit, marginals, factor)
-    details |= {'key_bias_sigmas': bias_sigmas(marginals, factor),
+    details |= {'key_bias_sigmas': residuals.bias_sigmas(marginals, factor),
                 'slips': [vars(slip) for slip in slips],
                 'beside': odometry_output.additional_figures(
                     fit.state.constants, posterior.covariance, grade)}
@@ -128,17 +116,17 @@ def _estimate(leg: SmootherLeg, fit: Fit, posterior: _Posterior,
                              posterior.sigma_ratio, posterior.factor, changed_angles)
     estimates, reasons = estimate_constants(fitted, leg.scale_unit, leg.nominal_scale, config)
     if estimates['scale_factor'].value is not None:
-        estimates |= odometry_output.as_sent(leg, fit.state, posterior.covariance)
+        estimates |= odometry_output.factor_as_sent(leg, fit.state, posterior.covariance)
     return estimates, reasons
 
 
 def _estimate_wheels(problem: Problem, fit: Fit, marginals: JointMarginals, posterior: _Posterior,
                      scale: Estimate, config: Config,
                      ) -> tuple[dict[str, Wheel], dict[str, Estimate], list[Reason]]:
-    """Return the wheels relative to their mean, their estimates, and the reasons."""
+    """Return the wheels relative to their mean, their estimates, and reasons."""
     up_b = fit.state.C_bv[:, 2]
     drift = float(np.sqrt(up_b @ marginals[0][layout.BG, layout.BG] @ up_b) * posterior.factor)
-    wheels = wheels_beside(problem, fit, posterior.covariance, drift, config.odometer.track_width)
+    wheels = fit_wheels(problem, fit, posterior.covariance, drift, config.odometer.track_width)
     if not problem.leg.wheels:
         return wheels, {}, []
     names = [wheel.name for wheel in problem.leg.wheels]
@@ -149,17 +137,16 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
                         factor: float) -> tuple[dict[str, Estimate], dict[str, float]]:
     """Return the estimates of the first gyro bias, and ratios of sigma to prior, by name."""
     sigma = np.sqrt(np.diagonal(marginals[0])[layout.BG]) * factor
+    ratio = sigma / fit.initial_priors.gyro_bias_sigma
     names = [f'gyro_bias_{axis}' for axis in 'xyz']
-    ratio = dict(zip(names, (sigma / fit.initial_priors.gyro_bias_sigma).tolist(), strict=True))
-    values = dict(zip(names, zip(fit.state.gyro_bias[0].tolist(), sigma.tolist(), strict=True),
-                      strict=True))
-    return {name: Estimate(*values[name], 'rad/s') for name in names
-            if ratio[name] < INFORMED_SHARE}, ratio
+    return {name: Estimate(float(fit.state.gyro_bias[0, i]), float(sigma[i]), 'rad/s')
+            for i, name in enumerate(names) if ratio[i] < INFORMED_SHARE}, dict(
+                zip(names, ratio.tolist(), strict=True))
 
 
 def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[str, float],
                       estimates: Mapping[str, Estimate]) -> list[Reason]:
-    """Return the reason for constants without an estimate that LEVER_ARM_OFF does not name."""
+    """Return the reason for constants without an estimate, but those of LEVER_ARM_OFF."""
     named = {layout.CONSTANTS[i] for i in remarks.deviating_lever_arms(fit.state.constants, sigma)}
     names = [name for name in ratio if name in estimates and estimates[name].value is None
              and name not in named]
@@ -169,7 +156,7 @@ def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[
 
 def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
             posterior: _Posterior) -> tuple[list[Source], MarginalInformation]:
-    """Return the error sources, and the information for other legs, with all model errors."""
+    """Return the error sources, and the information for other legs, both with model errors."""
     sources = [*(replace(source, effects=source.effects * posterior.factor)
                  for source in error_sources(fit, marginals)),
                Source('model', np.diag(remarks.MODEL_FLOOR))]
@@ -185,35 +172,36 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
 
 
 def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
-                sigma: Floats) -> tuple[tuple[Slip, ...], list[Reason]]:
+                sigma: Floats) -> tuple[tuple[residuals.Slip, ...], list[Reason]]:
     """Return the slips, and the reasons that report them and a filter of the odometer."""
     filtered = remarks.filter_reasons(fit.state.constants[layout.ODO_LAG2], sigma[layout.ODO_LAG2])
     if leg.uses_speed_steps:    # only the steps of a coarse speed are used, which do not show slip
         return (), list(filtered)
     count_m = leg.travel.quantum * fit.state.scale
-    slip_path = odometer_minus_ground_path(fit, marginals)
-    slips = find_slips(fit, slip_path, count_m)
+    slip_path = residuals.odometer_minus_ground_path(fit, marginals)
+    slips = residuals.find_slips(fit, slip_path, count_m)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
+    # 0: slip; else no force explains it: the odometer lost (-1) or added (1) the travel
     sign = np.array([unforced_sign(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips],
                     int)
-    # the shape of a filter is unknown, and a late or held speed errs at changes of speed: no slip
-    level = '' if filtered or (sign > 0).any() else describe_slip_level(fit, marginals, count_m)
-    wheel_slips = tuple(s for s, unforced_sign in zip(slips, sign, strict=True)
-                        if not unforced_sign)
-    return slips, [*filtered, *slip_reasons(wheel_slips, level), *travel_reasons(
+    # a filter of unknown shape, or a late or held speed, also has errors at changes of speed
+    level = '' if filtered or (sign > 0).any() else residuals.describe_slip_level(
+        fit, marginals, count_m)
+    wheel_slips = tuple(s for s, one in zip(slips, sign, strict=True) if not one)
+    return slips, [*filtered, *residuals.slip_reasons(wheel_slips, level), *travel_reasons(
         np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
 
 def with_model_floor(covariance: Floats) -> Floats:
-    """Return the covariance with the floor of the model: docs/method.md (S31)."""
+    """Return the covariance plus the lower limit F^2 of model errors: docs/method.md (S31)."""
     covariance, at = covariance.copy(), range(len(remarks.MODEL_FLOOR))
     covariance[at, at] += remarks.MODEL_FLOOR**2
     return covariance
 
 
 def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source],
-             ratio: dict[str, float], widen: float,
-             sigma: Floats) -> dict[str, Any]:
+             ratio: dict[str, float], factor: float, sigma: Floats) -> dict[str, Any]:
+    """Return the details of the result by the keys of calibration.json; sigma : (M,)."""
     state, motion, fixes = fit.state, fit.weighted[MotionRows].motion, fit.weighted[Fixes]
     K = state.scale
     arm = state.C_bv @ motion.arm_v
@@ -225,17 +213,18 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
         'f': K * state.forward,
         'noise': fit.levels.sigmas(),
-        'iterations': fit.iterations, 'widened': float(widen),
+        'iterations': fit.iterations, 'widened': float(factor),
         'outside': _outside(problem, fit, sigma),
         'posterior_to_prior': ratio,
         **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
-                      'fix_correlation_2s': correlation(t_fix, fixes.r[:, :2]),
+                      'fix_correlation_2s': residuals.correlation(t_fix, fixes.r[:, :2]),
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
-                      'fixes': len(t_fix), 'normalised': normalised_residuals(fit.weighted),
-                      'intervals_slipping': int((fit.variance_factors[:,
-                                                                      0] > SLIP_VARIANCE).sum())},
+                      'fixes': len(t_fix),
+                      'normalised': residuals.normalised_residuals(fit.weighted),
+                      'intervals_slipping': int(
+                          (fit.variance_factors[:, 0] > residuals.SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float((motion.turning * motion.T[:, 0]).sum()),
@@ -243,29 +232,24 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
                        'standing': float(problem.at_rest.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
         'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
-        'key_biases': np.stack([state.gyro_bias, state.accel_bias]),
-    }
+        'key_biases': np.stack([state.gyro_bias, state.accel_bias])}
 
 
 def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return details of the sensors besides IMU, odometer and fixes."""
-    return {part.name: {'messages': len(sent.t),
-                        'alike': problem.rows_per_independent.get(part.name, 1.0),
-                        **part.details(sent, fit.state.constants, sigma)}
-            for part in EXTERNAL_FACTORS if (sent := problem.external.get(part.name)) is not None}
+    return {kind.name: {'messages': len(samples.t),
+                        'alike': problem.rows_per_independent.get(kind.name, 1.0),
+                        **kind.details(samples, fit.state.constants, sigma)}
+            for kind in EXTERNAL_FACTORS
+            if (samples := problem.external.get(kind.name)) is not None}
 
 
 def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
-    """
-    Return the error sources of (ln K, yaw, pitch); their covariances add up to the total.
-
-    A unit error in a row moves the estimate by the covariance of the estimate and the unknowns of
-    that row, times the row's whitened derivative. The remainder belongs to the standstills.
-    """
-    parts, solved = fit.weighted.factors, fit.solved.covariance
+    """Return the error sources of ln K, yaw and pitch, (S32); the remainder is by standstills."""
+    solved = fit.solved.covariance
     covariance: dict[str, np.ndarray] = {}
-    for part in parts.values():
-        for name, effects in part.effects(marginals):
+    for factor in fit.weighted.factors.values():
+        for name, effects in factor.effects(marginals):
             flat = np.moveaxis(effects, -2, 0).reshape(PARAMETER_COUNT, -1)
             covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
     shared = [Source(name, effects, True)
@@ -276,5 +260,5 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     for name, effects in (('noise_levels', by_levels[:, :-len(SIZES)]),
                           ('imperfection_sizes', by_levels[:, -len(SIZES):])):
         covariance[name] = effects @ effects.T
-    own = [Source(name, root_of(value)) for name, value in covariance.items()]
-    return (*own, *shared, Source('standstill', root_of(rest)))
+    sources = [Source(name, root_of(value)) for name, value in covariance.items()]
+    return (*sources, *shared, Source('standstill', root_of(rest)))

@@ -4,7 +4,7 @@
 """
 Diagnostics of a fit: noise, outliers, clocks and filters, a scale that varies, lever arms.
 
-Also the errors of the result that the fit does not contain, and the model's floor.
+``remarks`` returns the reasons, ``find_errors_beyond_fit`` errors that the fit does not contain.
 """
 
 from collections import defaultdict
@@ -32,19 +32,19 @@ CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
 AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
-IMU_ERROR_LIMIT = 4.0       # statistical: of the sigma of the grade, for scales and axes
-# 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
+IMU_ERROR_LIMIT = 4.0       # statistical: sigmas of the grade, for scales and axes
+# sigmas of unmodelled errors of scale, yaw and pitch, F of (S31): relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                       'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                       'Use wheel pulses, or a wheel that is not driven.')
-# factor on the variance of a second of a bias's walk, judgement: reported steps have 480 and more,
-# 60 drives without steps at most 7.3 (docs/decisions/0016)
+# variance factor of the random walk of a bias above which it has a step, judgement: reported steps
+# have 480 and more, 60 drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
-# relative, rad, judgement: smaller changes of the scale or of an angle are not reported
+# relative or rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
-# share and number of outliers among the fixes that are reported. Judgement
+# judgement: share and number of outliers among the fixes above which they are reported
 OUTLIER_SHARE, LEAST_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 POSE_COVARIANCE_REMEDY = (
@@ -54,22 +54,25 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
-# by whether the axis is z
+# other cause of a lever arm that deviates, by whether the axis is z
 OTHER_CAUSE = {
     False: 'Slip in turns, with skid steering or tracks, has this effect: then keep the setting.',
     True: 'On z, a body that rolls on its springs has this effect: then keep the setting.'}
-# by whether imu.lever_arm is set
+# advice by whether imu.lever_arm is set
 IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it first.',
            True: 'A wrong imu.lever_arm has the same effect: check it too.'}
 
 
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
-    """Return the sigma of ln K by positions in a local frame that contain the wheels."""
-    if not problem.leg.origin.local or not contains_odometer(c[layout.FIX_BY_MOTION],
-                                                             sigma[layout.FIX_BY_MOTION]):
+    """Return the sigma of ln K if the positions, in a local frame, contain the wheels, else 0."""
+    share = c[layout.FIX_BY_MOTION]
+    if not problem.leg.origin.local or not contains_odometer(share, sigma[layout.FIX_BY_MOTION]):
         return 0.0
-    return map_drift_sigma(c[layout.FIX_BY_MOTION], c[layout.FIX_MOTION_TIME],
-                           problem.leg.t_stop - problem.leg.t_begin)
+    # the drift of the map is filtered together with the wheels, and not modelled. Within a time
+    # constant of the filter it cannot be distinguished from the wheel error, which is averaged
+    # over only duration / time constant samples
+    duration = problem.leg.t_stop - problem.leg.t_begin
+    return float(abs(share) * np.sqrt(np.exp(c[layout.FIX_MOTION_TIME]) / duration))
 
 
 class ErrorBeyondFit(NamedTuple):
@@ -97,7 +100,7 @@ def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[Er
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             config: Config) -> list[Reason]:
-    """Return reasons; sigma : (M,) of the constants; ratio : (M,) posterior to prior sigma."""
+    """Return reasons; sigma : (M,) of the constants.   ratio : (M,) of it to the prior sigma."""
     c = fit.state.constants
     reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(problem, fit),
                *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
@@ -108,27 +111,33 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
                for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
                *_scale_variation_reasons(fit, sigma), *_change_reasons(fit),
                *_bias_step_reasons(fit)]
+    return reasons + _imu_reasons(c, sigma, config) + _lever_arm_reasons(c, sigma, ratio, config)
+
+
+def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
+    """Return the reasons for scale and axis errors of the IMU far beyond its grade."""
+    reasons = []
     usual = imperfection_sigmas(grade_of(config.imu))
-    off = np.zeros(len(c))
-    off[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / np.maximum(usual, 1e-300)
-    off *= np.abs(c) > REMARK_SIGMAS * sigma
-    skew = float(np.linalg.norm(off[AXES]))
+    error = np.zeros(len(c))        # in sigmas of the grade
+    error[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / np.maximum(usual, 1e-300)
+    error *= np.abs(c) > REMARK_SIGMAS * sigma
+    skew = float(np.linalg.norm(error[AXES]))
     if skew > IMU_ERROR_LIMIT:
-        seen = np.rad2deg(np.linalg.norm(c[AXES][off[AXES] > 0]))
-        reasons.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
-                              f'{seen:.2f} deg off perpendicular, '
-                              f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
-                              f'(limit {IMU_ERROR_LIMIT:g}); accounted for'))
-    worst = max(IMU_SCALES, key=lambda i: off[i])
-    if off[worst] > IMU_ERROR_LIMIT:
+        angle = np.rad2deg(np.linalg.norm(c[AXES][error[AXES] > 0]))
+        reasons.append(Reason(
+            Code.IMU_AXES_SKEW, f'accelerometer axes are {angle:.2f} deg off perpendicular, '
+            f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
+            f'(limit {IMU_ERROR_LIMIT:g}); accounted for'))
+    worst = max(IMU_SCALES, key=lambda i: error[i])
+    if error[worst] > IMU_ERROR_LIMIT:
         name = layout.CONSTANTS[worst].replace('_', ' ')
         setting = 'gyro_scale' if name.startswith('gyro') else 'accel_scale'
-        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} is '
-                              f'{100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
-                              f'the {config.imu.grade} grade (limit {IMU_ERROR_LIMIT:g}); '
-                              'accounted for', f'Set imu.{setting}_sigma, or imu.grade, to the '
-                              f'data sheet of this IMU. If its unit is wrong, set imu.{setting}.'))
-    return reasons + _lever_arm_reasons(c, sigma, ratio, config)
+        reasons.append(Reason(
+            Code.IMU_WORSE_THAN_GRADE, f'the {name} is {100 * c[worst]:+z.1f} % off, '
+            f'{error[worst]:.0f} times the sigma of the {config.imu.grade} grade '
+            f'(limit {IMU_ERROR_LIMIT:g}); accounted for', f'Set imu.{setting}_sigma, or '
+            f'imu.grade, to the data sheet of this IMU. If its unit is wrong, set imu.{setting}.'))
+    return reasons
 
 
 def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
@@ -202,7 +211,7 @@ def _change_reasons(fit: Fit) -> list[Reason]:
 
 
 def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
-    """Return the axes of lever arms that the drive puts far from their setting, by index."""
+    """Return the indices of lever arm axes whose estimates deviate from their settings."""
     axes = (*range(layout.ODO_ARM.start, layout.ODO_ARM.stop - 1),      # not z of the odometer
             *range(layout.GNSS_ARM.start, layout.GNSS_ARM.stop))
     least_size = 0.3     # m
@@ -210,20 +219,20 @@ def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
 
 
 def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
-    """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
+    """Return LEVER_ARM_OFF for the lever arms whose estimates deviate from their settings."""
     texts, axes_of = [], defaultdict[tuple[str, str], list[str]](list)
-    off = deviating_lever_arms(c, sigma)
-    for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
-                             ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
-        for i, axis, value, most in zip(range(where.start, where.stop), 'xyz', arm, VEHICLE,
-                                        strict=True):
-            if i not in off:
+    deviating = deviating_lever_arms(c, sigma)
+    for name, arm, indices in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
+                               ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
+        for i, axis, value, reach in zip(range(indices.start, indices.stop), 'xyz', arm, VEHICLE,
+                                         strict=True):
+            if i not in deviating:
                 continue
             found = value + c[i]
             text = f'{found:+z.2f} ± {sigma[i]:.2f} m'
             # not among the estimates
             rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
-            if abs(found) > most:
+            if abs(found) > reach:
                 texts.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 action = 'Ignore the estimate of {}: another error causes it.'
             elif any(arm):
@@ -256,7 +265,7 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 
 def contains_odometer(share: float, sigma: float) -> bool:
-    """Return True if the receiver has an odometer of its own, of this error."""
+    """Return True if the positions contain an odometer, with this scale error and its sigma."""
     least_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
     return bool(abs(share) > max(FAULT_SIGMAS * sigma, least_size))
 
@@ -271,16 +280,6 @@ def odometer_reasons(share: float, sigma: float, log_time: float,
                    f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
                    'accounted for' + (f', with an uncertainty of the scale of {100 * by_map:.2g} %'
                                       if by_map else '')),)
-
-
-def map_drift_sigma(share: float, log_time: float, duration: float) -> float:
-    """
-    Return the sigma of ln K by the drift of a map that is filtered together with the wheels.
-
-    This drift is not modelled. Within a time constant of the filter it cannot be distinguished
-    from the wheel error, which is therefore averaged over only duration / time constant samples.
-    """
-    return float(abs(share) * np.sqrt(np.exp(log_time) / duration))
 
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:

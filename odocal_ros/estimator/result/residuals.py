@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Residuals of each sensor after the fit, and wheel slip: outliers of the odometer's residuals.
+Residuals of each sensor after the fit, as details of the result, and wheel slip.
 
-Residuals and the sigmas of the biases are stored along the leg.
+A slip is a run of intervals in which the path of the wheel is an outlier.
 """
 
 from dataclasses import dataclass
@@ -29,19 +29,19 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
-# factor on the variance of an interval that is a slip. Statistical: 3.7 sigmas, by chance once in
-# 4200
+# variance factor of an interval above which it is a slip. Statistical: 3.7 sigmas, by chance once
+# in 4200
 SLIP_VARIANCE = 1.5
-LEAST_SLIP = 0.05    # m: a shorter slip is not reported. Judgement
-# effective rows of a level that is reported. Statistical: its root, with a sigma of root / sqrt(2
-# rows), is then REMARK_SIGMAS above zero
+LEAST_SLIP = 0.05    # m, judgement: a shorter slip is not reported
+# redundancy above which a level is reported. Statistical: its root, with a sigma of root / sqrt(2
+# redundancy), is then REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
 
 
-def bias_sigmas(near: JointMarginals, widen: float) -> Floats:
-    """Return the sigmas of the biases at the keyframes: (2, N, 3), gyro first, rad/s, m/s^2."""
-    variance = near.variances()
-    return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * widen
+def bias_sigmas(marginals: JointMarginals, factor: float) -> Floats:
+    """Return the bias sigmas times ``factor``: (2, N, 3), gyro first, rad/s, m/s^2."""
+    variance = marginals.variances()
+    return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * factor
 
 
 def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray[Any]]:
@@ -49,9 +49,9 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
     Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
 
     By name, (n, 6), three residuals and their sigmas; NaN: no data. For each interval, at its end:
-    ``left_odometer`` along, left, up, m; ``left_gyro`` and ``left_accelerometer``, means about x,
-    y, z of b, rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s: east, north,
-    up, m, without the time-correlated error. Single precision, to save memory.
+    ``left_odometer`` forward, left, up, m; ``left_gyro`` and ``left_accelerometer``, means in b,
+    rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s: east, north, up, m,
+    without the time-correlated error. Single precision, to save memory.
     """
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
     return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
@@ -59,22 +59,21 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
 
 
 def correlation(t: Floats, residual: Floats) -> float:
-    """Return the correlation of adjacent bins of 2 s of residuals; t : (m,) s, residual (m, c)."""
+    """Return the correlation of means over adjacent 2 s; t : (m,) s.   residual : (m, c)."""
     if len(t) < 4:
         return 0.0
-    cell = np.floor((t - t[0]) / 2.0).astype(int)
-    at, first = np.unique(cell, return_index=True)
+    bins, first = np.unique(np.floor((t - t[0]) / 2.0).astype(int), return_index=True)
     count = np.diff(np.append(first, len(t)))
     mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
-    beside = np.flatnonzero(np.diff(at) == 1)
+    adjacent = np.flatnonzero(np.diff(bins) == 1)
     power = (mean**2).mean()
-    if len(beside) < 5 or power == 0:
+    if len(adjacent) < 5 or power == 0:
         return 0.0
-    return float((mean[beside] * mean[beside + 1]).mean() / power)
+    return float((mean[adjacent] * mean[adjacent + 1]).mean() / power)
 
 
 def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
-    """Return rms and outlier share of whitened residuals by sensor, without outlier weights."""
+    """Return rms, number and outlier share of whitened residuals, without weights, by sensor."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
     white = fixes.r / np.sqrt(fixes.weight / fixes.rows_per_independent)
     return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
@@ -92,11 +91,11 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
         root = np.linalg.inv(motion.whiten[some])
         raw, Q = root @ motion.r[some, :, None], root @ np.swapaxes(root, 1, 2)
         per_T = 1 / T[some, :, None]
-        for name, own, axes in (('odometer', D, motion.noise.axes[some]),
-                                ('gyro', PHI, transpose(C_end[some]) * per_T),
-                                ('accelerometer', V, transpose(C[some]) * per_T)):
-            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, own, own], axes)
-            found[name].append(((axes @ raw[:, own])[:, :, 0], np.sqrt(variance)))
+        for name, rows, axes in (('odometer', D, motion.noise.axes[some]),
+                                 ('gyro', PHI, transpose(C_end[some]) * per_T),
+                                 ('accelerometer', V, transpose(C[some]) * per_T)):
+            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, rows, rows], axes)
+            found[name].append(((axes @ raw[:, rows])[:, :, 0], np.sqrt(variance)))
     whole = {name: (np.concatenate([value for value, _ in parts]),
                     np.concatenate([sigma for _, sigma in parts]))
              for name, parts in found.items()}
@@ -112,20 +111,20 @@ def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     factor = np.ones(3)
     for level, columns in fixes.levels_of.items():
         factor[columns] = np.sqrt(fixes.levels[level])
-    each = np.sqrt(fixes.weight / fixes.rows_per_independent) / factor
-    value = -(covariance_root @ (fixes.r / each)[:, :, None])[:, :, 0]
+    scale = np.sqrt(fixes.weight / fixes.rows_per_independent) / factor
+    value = -(covariance_root @ (fixes.r / scale)[:, :, None])[:, :, 0]
     sigma = np.sqrt(covariance_root**2 @ factor**2)
-    known = fixes.existing_components()
-    return np.where(known, value, np.nan), np.where(known, sigma, np.nan)
+    exists = fixes.existing_components()
+    return np.where(exists, value, np.nan), np.where(exists, sigma, np.nan)
 
 
 @dataclass(frozen=True)
 class Slip:
-    """A run of slip: s since the start mark, duration s, wheel travel minus vehicle travel m."""
+    """A run of intervals with slip."""
 
-    t: float
-    duration: float
-    metres: float
+    t: float            # s since the start mark
+    duration: float     # s
+    metres: float       # travel of the wheel minus travel of the vehicle
 
 
 def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
@@ -135,31 +134,27 @@ def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
     return -estimate[:, 0] * rows.along_sigma()
 
 
-def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
-    """
-    Return the slips: runs of intervals in which the wheel path is an outlier, largest first.
-
-    slip_path : (K,) as ``odometer_minus_ground_path``.   count_m : size of a count, m.
-    """
+def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
+    """Return the slips, largest first; slip_path : (K,) m.   count_m : size of a count, m."""
     t = fit.state.t
-    least = max(4 * float(np.sqrt(fit.levels['along'])), LEAST_SLIP, count)    # sigmas of a second
-    far = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
-    if not len(far):
+    least = max(LEAST_SLIP, count_m)
+    slipping = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE)
+                              | (np.abs(slip_path) > max(4 * np.sqrt(fit.levels['along']), least)))
+    if not len(slipping):
         return ()
     slips = []
-    for run in np.split(far, np.flatnonzero(np.diff(far) > 2) + 1):    # a second between
-        begin, end, metres = run[0], run[-1] + 1, float(turned[run].sum())
-        if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), LEAST_SLIP,
-                              count):
+    for run in np.split(slipping, np.flatnonzero(np.diff(slipping) > 2) + 1):   # at most 1 s apart
+        begin, end, metres = run[0], run[-1] + 1, float(slip_path[run].sum())
+        if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), least):
             slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
 
-def describe_slip_level(fit: Fit, marginals: JointMarginals, count: float) -> str:
-    """Return the slip level at changes of speed as text, '' if it is not observable."""
+def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> str:
+    """Return the slip level while accelerating or braking as text, '' if small or unknown."""
     level = fit.levels.sigmas()
     # the noise of the difference of two readings, over a phase of 10 s
-    rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
+    rounding = count_m * np.sqrt(2 / 12) / np.sqrt(10.0)
     # a level without information keeps its initial value
     known = {name for name, (_, rows) in fit.weighted[MotionRows].components(marginals).items()
              if rows > LEVEL_ROWS}
@@ -174,14 +169,14 @@ def describe_slip_level(fit: Fit, marginals: JointMarginals, count: float) -> st
 
 
 def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
-    """Return WHEEL_SLIP with places and sizes; level : of slip as the speed changes, as text."""
-    texts, most = [], 3      # runs listed singly
+    """Return WHEEL_SLIP with times and sizes; level : of ``describe_slip_level``."""
+    texts, listed = [], 3
     if slips:
-        one = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
-               for s in slips[:most]]
-        more = f' and {len(slips) - most} more' if len(slips) > most else ''
+        singles = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
+                   for s in slips[:listed]]
+        more = f' and {len(slips) - listed} more' if len(slips) > listed else ''
         texts.append('wheel slip, travel of the wheel minus travel of the vehicle: '
-                     + ', '.join(one) + more)
+                     + ', '.join(singles) + more)
     if level:
         texts.append(level)
     return [Reason(Code.WHEEL_SLIP, '; '.join(texts))] if texts else []

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimates of single wheels of one or several legs: factors, track width, reasons."""
+"""Estimates of single wheels of one or several legs: scale factors, track width, reasons."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,25 +17,26 @@ from odocal_ros.settings.config import Config, SIDES
 from odocal_ros.settings.levels import TRACK_WIDTH
 
 Found = tuple[dict[str, Estimate], list[Reason]]
-FEWEST_ALIKE = 3        # definition: with fewer, the wheel that differs is unknown
-# judgement: difference of new tyres of one size; a third less pressure changes half of that
+FEWEST_COMPARED = 3     # wheels, definition: with fewer, it is unknown which one differs
+# relative, judgement: difference of new tyres of one size; a third less pressure makes half of it
 DEPARTS = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Wheel:
-    """A wheel relative to the mean."""
+    """A wheel relative to the mean of all wheels."""
 
-    ratio: float             # K_i / K
+    ratio: float             # scale factor over that of the mean reading
     ratio_sigma: float       # relative
-    y: float                 # m to the left of the middle of all wheels
+    y: float                 # m, to the left
     y_sigma: float           # m
-    walk: tuple[float, ...]  # m/sqrt(s), relative to the mean: even, hard, in turns
-    x: float | None = None   # m, of a steered wheel ahead of the mean; None: it does not steer
+    # m/sqrt(s), random walk at constant speed, at acceleration and braking, in turns
+    walk: tuple[float, ...]
+    x: float | None = None   # m, ahead, of a steered wheel; None: it does not steer
     x_sigma: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry of calibration.json."""
+        """Return its entry of calibration.json."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
@@ -63,7 +64,7 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     if scale.value is None or scale.sigma is None:
         return found, []
     limit = levels.INFORMED_SHARE * (config.wheels.radius_range or levels.TYRE_SPREAD)
-    # left and right have the same line: the error of right over left is twice that of either
+    # errors of left and right are opposite: that of right over left is twice that of either
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
         known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
@@ -77,8 +78,9 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
         found[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
     reasons = _departing(wheels)
     for width, (left, right) in _widths(names).items():
-        found[width], why = _track_width(wheels[left], wheels[right], config.odometer.track_width)
-        reasons += why
+        found[width], width_reasons = _track_width(wheels[left], wheels[right],
+                                                   config.odometer.track_width)
+        reasons += width_reasons
         if (left, right) != SIDES and found[width].value is not None:
             found |= _places({name: wheels[name] for name in (left, right)})
     return found, reasons
@@ -100,24 +102,27 @@ def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
 
 def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
     """Return the reason that reports a wheel whose factor differs from all others."""
-    if len(wheels) < FEWEST_ALIKE:
+    if len(wheels) < FEWEST_COMPARED:
         return []
-    off = {}
+    differing = {}
     for name, wheel in wheels.items():
-        usual = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
+        others = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
         limit = max(DEPARTS, levels.FAULT_SIGMAS * wheel.ratio_sigma)
-        if abs(wheel.ratio / usual - 1) > limit:
-            off[name] = wheel.ratio / usual - 1, limit
+        if abs(wheel.ratio / others - 1) > limit:
+            differing[name] = wheel.ratio / others - 1, limit
     return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
                    f'{"larger" if x > 0 else "smaller"} than that of the others (limit '
                    f'{100 * limit:.2g} %). Likely cause: tyre pressure, another tyre, or '
-                   'continuous slip') for name, (x, limit) in off.items()] if len(off) == 1 else []
+                   'continuous slip') for name, (x, limit) in differing.items()
+            ] if len(differing) == 1 else []
 
 
-def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
-    width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # both have the same line
+def _track_width(left: Wheel, right: Wheel,
+                 configured: float) -> tuple[Estimate, list[Reason]]:
+    """Return the track width and its reasons, (W8); configured : m, 0: unknown."""
+    width, sigma = left.y - right.y, left.y_sigma + right.y_sigma
     none = Estimate(None, None, 'm')
-    if given and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
+    if configured and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.taped_share * configured:
         return none, []         # the configured width is more accurate
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
@@ -128,29 +133,26 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
                              f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
                              'turns')]
-    far = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * given, sigma))
-    if given and abs(width - given) > far:
+    far = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * configured, sigma))
+    if configured and abs(width - configured) > far:
         return Estimate(width, sigma, 'm'), [Reason(
             Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} ± '
-            f'{sigma:.4f} m; odometer.track_width is {given:.4g} m; the limit of the difference '
-            f'is {far:.2g} m')]
+            f'{sigma:.4f} m; odometer.track_width is {configured:.4g} m; the limit of the '
+            f'difference is {far:.2g} m')]
     return Estimate(width, sigma, 'm'), []
 
 
 def combine_wheels(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
-    """
-    Return the wheels of several legs, weighted by their variances; {} if no leg has any.
-
-    If legs differ beyond their sigmas, the sigma is increased accordingly.
-    """
-    each: dict[str, list[Mapping[str, Any]]] = {}
+    """Return the wheels of several legs: means, with sigmas by their scatter; {} without any."""
+    by_name: dict[str, list[Mapping[str, Any]]] = {}
     for leg in legs:
         for name, wheel in leg.details.get('wheels', {}).items():
-            each.setdefault(name, []).append(wheel)
-    return {name: _mean(wheels) for name, wheels in each.items()}
+            by_name.setdefault(name, []).append(wheel)
+    return {name: _mean(wheels) for name, wheels in by_name.items()}
 
 
 def _mean(wheels: Sequence[Mapping[str, Any]]) -> Wheel:
+    """Return the mean of entries of calibration.json of one wheel, with the last walk."""
     mean = {}
     for name in ('ratio', 'y', 'x'):
         if any(name not in wheel for wheel in wheels):
