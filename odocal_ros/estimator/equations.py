@@ -67,7 +67,7 @@ class Equations:
                                    priors or problem.priors, variance_factors, fitted)
         self.constants_in_use = point.priors.used_count
         self.factors = {kind.name: kind(problem, point) for kind in FACTORS
-                      if kind.is_present(problem)}
+                        if kind.is_present(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
         """Return the equations weighted by levels."""

@@ -151,13 +151,13 @@ def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -
     legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
                 {CONSTANTS[SCALE_BY_TIME]: np.inf}))
             for one in (past, now)]
-    whole = combine_legs(legs, [0] * len(legs), config)
-    sigmas = _parameter_sigmas(whole)
+    joint = combine_legs(legs, [0] * len(legs), config)
+    sigmas = _parameter_sigmas(joint)
     # the largest sources are those of the window in progress
     smaller = np.where(np.isfinite(now.sigmas), sigmas / now.sigmas, 1.0)[:, None]
-    reasons = {(r.code, r.text): r for r in (*now.method.reasons, *whole.reasons)}
+    reasons = {(r.code, r.text): r for r in (*now.method.reasons, *joint.reasons)}
     method = replace(
-        now.method, estimates=now.method.estimates | whole.estimates, marginal=whole.marginal,
+        now.method, estimates=now.method.estimates | joint.estimates, marginal=joint.marginal,
         reasons=tuple(reasons.values()),
         sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
     return RunningEstimate(method, sigmas, past.distance + now.distance,

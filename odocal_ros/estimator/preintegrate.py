@@ -179,9 +179,9 @@ class _Chunk:
         self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
         # an error that rotates the step uniformly turns a force by its time since the start
         self.grows = np.eye(3) + skew(self.turn) / 3
-        dv, dp, turned = imu.dv[rows], imu.dp[rows], rotate(self.grows, gyro)
-        dv, dp = (dv - np.cross(turned, dv - dp / dt) - rotate(self.G, accel),
-                  dp - np.cross(turned, dv * dt / 6) - rotate(self.GG, accel) * dt)
+        dv, dp, rotation = imu.dv[rows], imu.dp[rows], rotate(self.grows, gyro)
+        dv, dp = (dv - np.cross(rotation, dv - dp / dt) - rotate(self.G, accel),
+                  dp - np.cross(rotation, dv * dt / 6) - rotate(self.GG, accel) * dt)
         self.step_v, self.step_p = rotate(self.R, dv), rotate(self.R, dp)
         self.v, self.dv = self._running(self.step_v)
         self.p, self.dp = self._running(self.v * dt + self.step_p)

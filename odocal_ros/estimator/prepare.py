@@ -111,7 +111,7 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
     # it, and decreases the levels
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     problem.vibrating_levels = {name: max(sigma**2, problem.initial_levels[name])
-                         for name, sigma in sample_noise(leg, rows).items()}
+                                for name, sigma in sample_noise(leg, rows).items()}
     return problem
 
 

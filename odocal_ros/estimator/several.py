@@ -162,10 +162,10 @@ def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Rea
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
     if found.factor > 1:
-        of = ' in all parameters but scale, yaw and pitch' * bool(found.scatter)
+        in_others = ' in all parameters but scale, yaw and pitch' * bool(found.scatter)
         reasons.append(Reason(
-            Code.LEGS_DISAGREE, f'the scatter of {J} legs{of} is {found.factor:.1f} times their '
-            f'uncertainties; {_largest_deviation(found, numbers)}'))
+            Code.LEGS_DISAGREE, f'the scatter of {J} legs{in_others} is {found.factor:.1f} times '
+            f'their uncertainties; {_largest_deviation(found, numbers)}'))
     return tuple(reasons)
 
 

@@ -120,8 +120,8 @@ class Fixes(PointRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        least = (problem.min_fix_sigma / problem.fix_sigma)**2
-        return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
+        minimum = (problem.min_fix_sigma / problem.fix_sigma)**2
+        return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, minimum)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:

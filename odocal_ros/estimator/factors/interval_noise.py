@@ -101,16 +101,16 @@ def road_levels(total_turn: float) -> tuple[dict[str, float], dict[str, float]]:
 
 def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     """Return the reason that reports an assumed road noise, if it affects the result."""
-    least = problem.min_levels['side']
-    if least < 2e-3**2 or all(      # m^2/s, smallest that is reported
-            levels[name] > 1.01 * least for name in SIDEWAYS):
+    limit = problem.min_levels['side']
+    if limit < 2e-3**2 or all(      # m^2/s, smallest that is reported
+            levels[name] > 1.01 * limit for name in SIDEWAYS):
         return []
     return [Reason(
         Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
         f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to '
         f'{np.rad2deg(problem.total_turn):.0f} deg, less than the limit of '
         f'{np.rad2deg(2 * CORNER_ANGLE):.0f} deg. '
-        f'{1e3 * np.sqrt(least):.0f} mm/√s of sideslip are assumed; the uncertainties of the '
+        f'{1e3 * np.sqrt(limit):.0f} mm/√s of sideslip are assumed; the uncertainties of the '
         'mounting angles depend on this value', 'Drive with left and right turns.')]
 
 
@@ -270,8 +270,8 @@ def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     for at, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
-            near = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
-            variances[near, D] += (motion.state.scale * sigma)**2
+            intervals = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
+            variances[intervals, D] += (motion.state.scale * sigma)**2
     return variances
 
 
@@ -283,6 +283,6 @@ def _gap_variances(stamp: Floats, travel: Travel, scale: float) -> Floats:
     for begin, end in gaps_in_rhythm(travel.t):
         inside = (stamp[1:] > begin) & (stamp[:-1] < end)
         T = np.minimum(np.diff(stamp)[inside], (end - begin) / 4)
-        moved = scale * abs(float(np.diff(travel.at(np.array([begin, end])))[0]))
-        variance[inside] += np.minimum(HIDDEN_FORCE * (end - begin) * T / 2, moved)**2
+        path = scale * abs(float(np.diff(travel.at(np.array([begin, end])))[0]))
+        variance[inside] += np.minimum(HIDDEN_FORCE * (end - begin) * T / 2, path)**2
     return variance

@@ -21,7 +21,7 @@ from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at, WALK_SPEED
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, E, P, PHI, State, V
-from odocal_ros.nav.dead_reckoning import gravity_n
+from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.rotations import exp_so3, level_left, rotate, rotvec, skew, transpose
 
 # definition: rows of the odometer. The other rows are in the order of the columns of a keyframe:
@@ -58,6 +58,9 @@ class Motion:
 
     fitted : the state is so close to the solution that residuals are noise. The derivative by the
         scale then uses the fitted path, those by IMU errors the fitted signals (signals.py).
+
+    Attributes are residual (K, 18), and of the odometer's point, in n, (K, 3) m: displacement, by
+    the counts, its part wheel_displacement without pitching, and displacement_by_state.
     """
 
     def __init__(self, problem: Problem, state: State, intervals: Intervals,
@@ -71,18 +74,14 @@ class Motion:
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
         self.f = state.scale * state.forward
         _, self.left, self.up = state.C_bv.T
-        w = leg.origin.earth_rate_n
-        W = skew(w)
-        dv, dp = rotate(self.C, intervals.dv), rotate(self.C, intervals.dp)
-        half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
-        p, v = state.p_n, state.v_n
-        dp_n = p[1:] - p[:-1]
-        # of the point of the odometer, by the state and (below) by the counts
-        self.displacement_by_state = dp_n + (self.C_end - self.C) @ (state.C_bv @ self.arm_v)
+        self.dv, self.dp = rotate(self.C, intervals.dv), rotate(self.C, intervals.dp)
+        self.displacement_by_state = np.diff(state.p_n, axis=0) + (
+            self.C_end - self.C) @ (state.C_bv @ self.arm_v)
         along = self.f + self._vary_axis()
         # of length K: the odometer counts the path, whatever its direction in the body
         along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
-        straight = rotate(half @ self.C, rotate(intervals.S, along))
+        to_middle = np.eye(3) - skew(leg.origin.earth_rate_n) * T[:, :, None] / 2    # of T, for n
+        straight = rotate(to_middle @ self.C, rotate(intervals.S, along))
         self.wheel_displacement = straight * self.scale_ratio * self._inclination_ratio(straight)[
             :, None]
         self.by_delay = self._derivative_by_filter()
@@ -94,18 +93,22 @@ class Motion:
             self.by_speed_offset = (self.f_n + self.f_n_end) / 2 * T_in_motion[:, None]
             self.displacement = self.displacement + self.by_speed_offset * state.constants[
                 layout.SPEED_OFFSET]
-        self.dv, self.dp = dv, dp
-        g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
+        self.residual = self._residuals(leg.origin)
+
+    def _residuals(self, origin: Origin) -> Floats:
+        """Return the states at the ends minus their predictions, (S5) to (S9): (K, 18)."""
+        state, T, dv, dp = self.state, self.T, self.dv, self.dp
+        p, v, w = state.p_n, state.v_n, origin.earth_rate_n
+        dp_n, W = np.diff(p, axis=0), skew(w)
+        g = gravity_n((p[:-1] + p[1:]) / 2, origin)
         r_p = dp_n - (v[:-1] * T + dp - dp @ W.T * T / 3 + g * T**2 / 2
-                       - 2 * (v[:-1] * T**2 / 2 + dp * T / 3 + g * T**3 / 6) @ W.T)
+                      - 2 * (v[:-1] * T**2 / 2 + dp * T / 3 + g * T**3 / 6) @ W.T)
         r_v = v[1:] - (v[:-1] + dv - (dv * T - dp) @ W.T + g * T - 2 * dp_n @ W.T)
-        predicted = exp_so3(-w * T) @ self.C @ intervals.R
-        r_phi = rotvec(self.C_end @ transpose(predicted))
-        e = state.travel_error
-        f_n, f_n_end = self.f_n, self.f_n_end
-        r_d = self.displacement_by_state - (self.displacement - f_n_end * e[1:, None] + f_n
-                                            * e[:-1, None])
-        self.residual = np.concatenate(
+        r_phi = rotvec(self.C_end @ transpose(exp_so3(-w * T) @ self.C @ self.sums.R))
+        e = state.travel_error[:, None]
+        r_d = self.displacement_by_state - (self.displacement - self.f_n_end * e[1:]
+                                            + self.f_n * e[:-1])
+        return np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
 

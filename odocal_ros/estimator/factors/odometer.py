@@ -87,8 +87,8 @@ class TravelError(Factor):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        least = MIN_NOISE.travel / problem.leg.rough_scale
-        level = {'travel': max(problem.leg.travel.quantum**2 / 12, least**2)}
+        minimum = MIN_NOISE.travel / problem.leg.rough_scale
+        level = {'travel': max(problem.leg.travel.quantum**2 / 12, minimum**2)}
         return level, level
 
     def weigh(self, levels: Levels) -> None:

@@ -41,10 +41,11 @@ Gather = Callable[[Floats], Floats]
 
 class PointRows(Factor):
     """
-    m measurements of d components each.
+    m measurements of d components each, such as fixes.
 
-    A subclass sets raw, and share if its rows contain the correlated fix error. A weighted copy
-    has whitened r (m, d), J (m, d, n + m), and J_end (m, 3, 3) by that error after, or None.
+    A subclass sets raw, and share if its rows contain the correlated fix error. ``weigh`` sets r
+    (m, d), the whitened residuals, and J_end (m, 3, 3), their derivatives by that error of the
+    keyframe after, or None.
     """
 
     levels_of: ClassVar[dict[str, slice]]     # components of each level, a factor on variances

@@ -185,7 +185,7 @@ class StandstillRows(factor.Factor):
         weight = self.at_rest[:, None] / STILL_SPEED**2
         factor.add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
         factor.add_process(out, PHI, 1.0, self.intervals_at_rest[:, None] / self.turn_variance,
-                    self.turn())
+                           self.turn())
 
     def cost(self) -> float:
         rest = self.intervals_at_rest

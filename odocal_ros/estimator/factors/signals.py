@@ -60,9 +60,9 @@ class Signals:
         noise -= rate * bound / (rate**2 + bound)
         by_bias = by_bias.copy()
         by_bias[:, layout.BG] = 0.0     # the rows of the bias walk do not depend on scale errors
-        for i, (into, by) in enumerate(zip(layout.GYRO_AXIS, layout.GYRO_SIGNAL, strict=True)):
-            if by < FORCES:
-                columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
+        for i, (axis, signal) in enumerate(layout.GYRO_ERRORS.values()):
+            if signal < FORCES:
+                columns[:, :, i] += by_bias[:, :, axis] * noise[:, signal, None]
 
     def fit_forces(self, rows: slice, constants: Floats, gyro: Floats, estimates: Floats) -> None:
         """Subtract the noise from the others; estimates : (k, 3 p) of the unit gyro noises."""
@@ -82,11 +82,11 @@ class Signals:
         to_b = transpose(part.C)
         by_gyro = to_b @ by_gyro      # (k, 3, 3) along an axis of b, by noise about an axis of b
         by_accel = rotate(to_b, residual) - by_gyro.sum(axis=2)
-        for i, (into, by) in enumerate(zip(layout.ACCEL_AXIS, layout.ACCEL_SIGNAL, strict=True)):
+        for i, (axis, signal) in enumerate(layout.ACCEL_ERRORS.values()):
             noise = np.zeros_like(by_accel)
-            noise[:, into] = by_accel[:, by] - sway[:, by]
-            if into == by:      # a force along one axis, turned about another, towards the third
-                for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
+            noise[:, axis] = by_accel[:, signal] - sway[:, signal]
+            if axis == signal:  # a force along one axis, turned about another, towards the third
+                for about, toward in ((axis - 1, axis - 2), (axis - 2, axis - 1)):
                     noise[:, toward] += by_gyro[:, toward, about]
             columns[:, :, i] += rotate(part.C, noise)
 

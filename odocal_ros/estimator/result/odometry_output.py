@@ -49,9 +49,10 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
     rate = motion.turning[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)
-    least = 0.0 if leg.travel.quantum else problem.min_levels['travel']      # no reading error
+    # the lower limit, which a reading without quantisation has, is no error of a reading
+    no_error = 0.0 if leg.travel.quantum else problem.min_levels['travel']
     odometer = {
-        'reading': float(np.sqrt(max(fit.levels['travel'] - least, 0.0))),
+        'reading': float(np.sqrt(max(fit.levels['travel'] - no_error, 0.0))),
         'period': float(np.median(np.diff(t[within]))),
         'speed_step': coarse.step if coarse else 0.0,
         'hard': float(accelerating_and_turning(motion)[0][moving].mean()),

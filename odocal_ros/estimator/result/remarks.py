@@ -93,8 +93,8 @@ def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[Er
     of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
                  for step in fit.constant_steps
                  if step.constant != layout.LN_K and step.is_certain]
-    of_scale = [ErrorBeyondFit(layout.LN_K, name, own) for name, own in (
-        ('wheels_in_positions', by_map), ('height', by_height)) if own]
+    of_scale = [ErrorBeyondFit(layout.LN_K, name, size) for name, size in (
+        ('wheels_in_positions', by_map), ('height', by_height)) if size]
     return of_scale + of_angles
 
 
@@ -156,12 +156,12 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
     """Return the reason for fixes that are outliers."""
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
-    count, of = int(outlier.sum()), len(outlier)
-    if count < max(LEAST_OUTLIERS, OUTLIER_SHARE * of):
+    count, total = int(outlier.sum()), len(outlier)
+    if count < max(LEAST_OUTLIERS, OUTLIER_SHARE * total):
         return []
     far = np.hypot(*fixes.raw[outlier, :2].T).max()
-    return [Reason(Code.FIX_OUTLIERS, f'{count} of {of} fixes ({100 * count / of:.0f} %) are '
-                   f'outliers, up to {far:.1f} m from the track; they were down-weighted',
+    return [Reason(Code.FIX_OUTLIERS, f'{count} of {total} fixes ({100 * count / total:.0f} %) '
+                   f'are outliers, up to {far:.1f} m from the track; they were down-weighted',
                    POSE_OUTLIER_REMEDY if problem.leg.origin.local else '')]
 
 

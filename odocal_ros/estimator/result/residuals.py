@@ -96,12 +96,11 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
                                  ('accelerometer', V, transpose(C[some]) * per_T)):
             variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, rows, rows], axes)
             found[name].append(((axes @ raw[:, rows])[:, :, 0], np.sqrt(variance)))
-    whole = {name: (np.concatenate([value for value, _ in parts]),
-                    np.concatenate([sigma for _, sigma in parts]))
-             for name, parts in found.items()}
-    value, sigma = whole['odometer']
+    out = {name: (np.concatenate([value for value, _ in parts]),
+                  np.concatenate([sigma for _, sigma in parts])) for name, parts in found.items()}
+    value, sigma = out['odometer']
     absent = sigma**2 > ABSENT_VARIANCE / 2
-    return whole | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}
+    return out | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}
 
 
 def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
@@ -137,15 +136,15 @@ def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
 def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
     """Return the slips, largest first; slip_path : (K,) m.   count_m : size of a count, m."""
     t = fit.state.t
-    least = max(LEAST_SLIP, count_m)
+    limit = max(LEAST_SLIP, count_m)
     slipping = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE)
-                              | (np.abs(slip_path) > max(4 * np.sqrt(fit.levels['along']), least)))
+                              | (np.abs(slip_path) > max(4 * np.sqrt(fit.levels['along']), limit)))
     if not len(slipping):
         return ()
     slips = []
     for run in np.split(slipping, np.flatnonzero(np.diff(slipping) > 2) + 1):   # at most 1 s apart
         begin, end, metres = run[0], run[-1] + 1, float(slip_path[run].sum())
-        if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), least):
+        if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), limit):
             slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
@@ -162,10 +161,10 @@ def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> 
     if 'along_hard' not in known or level['along_hard'] <= max(
             0.006, 3 * level['along'], rounding):
         return ''
-    beside = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
+    constant_speed = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
               'speed') if 'along' in known else ''
     return ('slip while accelerating or braking is about '
-            f'{1e3 * level["along_hard"]:.0f} mm/√s{beside}')
+            f'{1e3 * level["along_hard"]:.0f} mm/√s{constant_speed}')
 
 
 def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:

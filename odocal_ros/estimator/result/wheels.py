@@ -80,7 +80,7 @@ class Line:
 
 
 def fit_wheels(problem: Problem, fit: Fit, covariance: Floats, drift: float,
-                  width: float) -> dict[str, Wheel]:
+               width: float) -> dict[str, Wheel]:
     """
     Return the wheels of a leg by name; empty with fewer than two, or with too little motion.
 
