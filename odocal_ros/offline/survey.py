@@ -230,7 +230,7 @@ def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floa
 
 
 def straight_sections(inputs: Inputs, located: LocatedFixes,
-                       shortest: float) -> list[tuple[float, float]]:
+                      shortest: float) -> list[tuple[float, float]]:
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
     if not located.rough or len(inputs.t_fix) < 3:
         return []
