@@ -58,13 +58,13 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     bias = np.einsum('nij,n->ij', effect, dt) * alignment.gyro_bias_sigma
     # a misaligned axis j measures a share of the turn about each axis k
     axes = np.einsum('nij,nk->ijk', effect, by_step(_step_rotations, q_nb)).reshape(3, 9)
-    scale, off = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
+    scale, off_diagonal = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
     # R(u): integral of r from u to the end; a bias step at u acts on all of it
     integrals = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(integrals[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
             'gyro_scale': axes[:, scale] * alignment.gyro_scale_sigma,
-            'gyro_axes': axes[:, off] * alignment.gyro_axes_sigma,
+            'gyro_axes': axes[:, off_diagonal] * alignment.gyro_axes_sigma,
             'gyro_noise': alignment.gyro_noise * root_of(_noise_integral(r, dt)),
             'gyro_bias_walk': alignment.gyro_bias_walk * root_of(_noise_integral(R, dt))}
 

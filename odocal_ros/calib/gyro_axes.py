@@ -117,16 +117,16 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
 def _inverted_turns(orientation: ImuOrientation, found: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
-    seen = ('accelerations in turns are opposite to turn rate and speed (ratio '
+    text = ('accelerations in turns are opposite to turn rate and speed (ratio '
             f'{orientation.inward:.2f} ± {orientation.inward_sigma:.2f} instead of 1)')
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
-        return (Reason(Code.IMU_AXES, f'{seen}, and gravity rotates about {found[0].published} '
+        return (Reason(Code.IMU_AXES, f'{text}, and gravity rotates about {found[0].published} '
                        f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
                        + NO_ROTATION),)
-    return (Reason(Code.GYRO_SIGN, f'{seen}: the sign of angular_velocity.{names[2][-1]}, or of '
+    return (Reason(Code.GYRO_SIGN, f'{text}: the sign of angular_velocity.{names[2][-1]}, or of '
                    f'linear_acceleration.{level[0]} or {level[1]}, is wrong',
                    'Correct the sign in the IMU driver. imu.mounting_rpy cannot: it rotates gyro '
                    'and accelerometer together.'),)
@@ -212,12 +212,12 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
     # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
     # IMU is unknown: a free step is fitted there
-    about = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(until[1:][keep]) > 0))
-    drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
+    restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(until[1:][keep]) > 0))
+    drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > restarts])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
     # rad^2: turns of 1 rad in total, root sum of squares, plus the error of chords at U-turns
-    if course @ course < 1.0 + U_TURN * len(about) or power == 0:
+    if course @ course < 1.0 + U_TURN * len(restarts) or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
     explained = slope**2 * power / (course @ course)      # share of the course's variance

@@ -172,10 +172,10 @@ class LinkedLegs:
                              - T @ (np.swapaxes(DA, 1, 2) @ offset[:, :, None]))[:, :, 0]
         cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())
         of_drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', T, DA[:, k])
-        whole = legs.D.sum(axis=0) - np.tensordot(T, DA, ((0, 2), (0, 2)))
+        total = legs.D.sum(axis=0) - np.tensordot(T, DA, ((0, 2), (0, 2)))
         across = np.cumsum(of_drifting[:, common], axis=0)
         steps = np.cumsum(of_drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
-        return (np.block([[whole[np.ix_(common, common)], across.T], [across, steps]]),
+        return (np.block([[total[np.ix_(common, common)], across.T], [across, steps]]),
                 np.concatenate([g_legs.sum(axis=0)[common], np.cumsum(g_legs[:, k])]), cost, rank)
 
     def solve(self, scatter: dict[str, float] | None = None) -> tuple[Floats, Floats]:
@@ -243,9 +243,9 @@ class LinkedLegs:
         sigmas = np.array(list((scatter or {}).values())) / self.unit[at]
         T, DA, A = eliminate_leg_errors(legs.D, at, sigmas)
         T[[bool(b.scatter_likelihood) for b in self.marginals]] = 0.0
-        free = (np.isinf(sigmas) & T.any(axis=1)).sum()
+        unbounded = (np.isinf(sigmas) & T.any(axis=1)).sum()
         errors = np.swapaxes(A, 1, 2) @ legs.gradient[:, :, None]
-        return T, DA, legs.gradient - (T @ errors)[:, :, 0], int(legs.rank.sum() - free)
+        return T, DA, legs.gradient - (T @ errors)[:, :, 0], int(legs.rank.sum() - unbounded)
 
 
 @dataclass(frozen=True, eq=False)

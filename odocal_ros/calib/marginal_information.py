@@ -82,13 +82,13 @@ class MarginalInformation:
     def select(self, names: Sequence[str]) -> 'MarginalInformation':
         """Return the information on some constants, the others eliminated with their priors."""
         at = np.isin(self.names, names)
-        whole = self.with_leg_errors({n: s for n, s in zip(
+        reduced = self.with_leg_errors({n: s for n, s in zip(
             self.names, self.relaxed_sigma, strict=True) if n not in names})
-        D = whole.information
+        D = reduced.information
         prior_step = np.where(np.isfinite(self.relaxed_sigma), self.prior_mean - self.point, 0.0)
         return MarginalInformation(
             tuple(n for n in self.names if n in names), self.point[at], D[np.ix_(at, at)],
-            whole.gradient[at] - D[np.ix_(at, ~at)] @ prior_step[~at], self.prior_mean[at],
+            reduced.gradient[at] - D[np.ix_(at, ~at)] @ prior_step[~at], self.prior_mean[at],
             self.prior_sigma[at], self.relaxed_sigma[at],
             {n: x for n, x in self.scatter_likelihood.items() if n in names})
 

@@ -70,12 +70,12 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
     median is the lower limit of the error.
     """
-    whole = path[-1] - path[0] if len(path) else 0.0
+    total = path[-1] - path[0] if len(path) else 0.0
     fewest = 8      # fixes of a section, twice the parameters of its fit
-    count = int(min(10, len(path) // fewest, whole // 10.0))      # tenths, of 10 m at least
+    count = int(min(10, len(path) // fewest, total // 10.0))      # tenths, of 10 m at least
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
-    edges = path[0] + whole * np.linspace(0.0, 1.0, count + 1)
+    edges = path[0] + total * np.linspace(0.0, 1.0, count + 1)
     part = np.clip(np.searchsorted(edges, path, side='right') - 1, 0, count - 1)
     reckoned, fixed = (p[:, 0] + 1j * p[:, 1] for p in (reckoned_n, fix_n))
     ratio, ratio_sigma = np.full(count, np.nan), np.full(count, np.nan)

@@ -191,10 +191,10 @@ def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, spe
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
     """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : ``unforced_sign``."""
     found = []
-    for code, of, relation, where in (
+    for code, tested_sign, relation, where in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
             (Code.TRAVEL_EXCESS, 1, 'more', 'while it brakes to a stop')):
-        size, at = np.abs(metres[sign == of]), t[sign == of]
+        size, at = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
         if len(at):
             found.append(Reason(code, (
                 f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '

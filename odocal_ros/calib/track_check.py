@@ -275,16 +275,16 @@ def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
     the track with the run reversed; after a fix error, which disappears, to that of the track.
     """
     t, error = pieces.t, pieces.heading_error
-    about = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)
-                           & (t <= t[run[-1]] + FIX_ERROR_DURATION))
+    nearby = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)
+                            & (t <= t[run[-1]] + FIX_ERROR_DURATION))
     # the heading by most forward pieces: that of single ones contains the error
-    of_forward = error[forward[np.isin(forward, about)]]
+    of_forward = error[forward[np.isin(forward, nearby)]]
     nearest = float(error[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
     usual = nearest + (float(np.median(wrap(of_forward - nearest))) if len(of_forward) else 0.0)
-    track = pieces.length_ratio[about] * pieces.length[about] * np.exp(
-        1j * (pieces.course[about] + error[about] - usual))
-    behind = np.sum(pieces.length[about] * np.exp(1j * pieces.course[about])) - track.sum()
-    return bool(abs(behind + 2 * track[np.isin(about, run)].sum()) < abs(behind))
+    track = pieces.length_ratio[nearby] * pieces.length[nearby] * np.exp(
+        1j * (pieces.course[nearby] + error[nearby] - usual))
+    behind = np.sum(pieces.length[nearby] * np.exp(1j * pieces.course[nearby])) - track.sum()
+    return bool(abs(behind + 2 * track[np.isin(nearby, run)].sum()) < abs(behind))
 
 
 def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:

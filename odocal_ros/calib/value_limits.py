@@ -32,9 +32,9 @@ OTHER_CAUSE = 'another vehicle, gear, counter or unit: tyres do not change this 
 
 def _likely_cause(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return the likely cause and the action, '' if unknown; ratio: scale to ``nominal``."""
-    for typical, what in UNIT_RATIOS.get(unit, {}).items():
+    for typical, cause in UNIT_RATIOS.get(unit, {}).items():
         if abs(ratio / typical - 1) < 0.04:    # tolerance for tyres: the ratios are farther apart
-            return f', typical for {what}', (
+            return f', typical for {cause}', (
                 f'If so, set odometer.nominal_scale to {typical * nominal:.6g}, or correct the '
                 'odometer driver. Otherwise check the odometer. The limit is '
                 'odometer.max_scale_deviation.')

@@ -100,9 +100,9 @@ def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Float
 
 def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
     """Return the wheels, with the cells of slips marked as unknown."""
-    known, around = pair.known.copy(), 2.0       # s each side, possibly part of the slip
+    known, margin = pair.known.copy(), 2.0       # s each side, possibly part of the slip
     for begin, end, _ in events:
-        known &= (pair.t[1:] < begin - around) | (pair.t[:-1] > end + around)
+        known &= (pair.t[1:] < begin - margin) | (pair.t[:-1] > end + margin)
     return replace(pair, known=known)
 
 
@@ -120,11 +120,11 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
         if len(jump) < span:
             continue
         limit = _jump_limits(pair, jump, span, quantum_m * (pair.quantum > 0), width)
-        far = np.abs(jump) > limit
-        far &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
-        for k in np.flatnonzero(far):
+        is_large = np.abs(jump) > limit
+        is_large &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
+        for k in np.flatnonzero(is_large):
             significant[k + MEAN_STEPS:k + span] = True
-        windows.append((span, jump, limit, far))
+        windows.append((span, jump, limit, is_large))
     finished: list[Event] = []
     slow: list[Event] = []
     for a, b in runs(significant):
@@ -185,9 +185,9 @@ def _measure_jump(pair: WheelPair, residual: Floats,
                   windows: list[tuple[int, Floats, Floats, Bools]], a: int, b: int) -> Event:
     """Return the event in steps a to b, by its best window: (span, jump, limit, significant)."""
     found = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
-    for span, jump, limit, far in windows:
+    for span, jump, limit, is_large in windows:
         low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
-        at = low + np.flatnonzero(far[low:high])
+        at = low + np.flatnonzero(is_large[low:high])
         if len(at):
             k = int(at[np.argmax(np.abs(jump[at]))])
             # a longer window is better only if its jump is larger by more than its noise
@@ -198,9 +198,9 @@ def _measure_jump(pair: WheelPair, residual: Floats,
     inner = residual[k:k + span + MEAN_STEPS]
     share = (inner - inner[:MEAN_STEPS].mean()) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
-    late = np.flatnonzero(share >= 0.9)
-    late = late[late >= MEAN_STEPS // 2]
-    end = int(late[0]) if len(late) else len(inner) - 1
+    reached = np.flatnonzero(share >= 0.9)
+    reached = reached[reached >= MEAN_STEPS // 2]
+    end = int(reached[0]) if len(reached) else len(inner) - 1
     return float(pair.t[k + min(begin, end)]), float(pair.t[k + max(begin, end)]), size
 
 
@@ -211,8 +211,8 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats
     # by -x moves it by -x / 2; the noise is the difference of mean and IMU elsewhere
     begin, end, size = event
     grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.SPIN_GRID)
-    beside = 1.0        # s each side of a slip, in which speeds are set equal
-    span = max(round((end - begin + 2 * beside) / slip.SPIN_GRID), 4 * slip.END_STEPS)
+    margin = 1.0        # s each side of a slip, in which speeds are set equal
+    span = max(round((end - begin + 2 * margin) / slip.SPIN_GRID), 4 * slip.END_STEPS)
     if len(grid) < 3 * span:
         return 0
     a = slip.acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)

@@ -76,9 +76,10 @@ def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
     if keep.sum() < 20:
         return None, None
     width = TRACK_WIDTH.first_sigma / metres_per_unit
-    late = 0.05     # s, sigma of the delay between the wheels, and of wheels to IMU
+    delay_sigma = 0.05     # s, sigma of the delay between the wheels, and of wheels to IMU
     load = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
-    prior = np.array([np.inf, width, np.inf, late, late * 1.5 / metres_per_unit, load])
+    prior = np.array([np.inf, width, np.inf, delay_sigma,
+                      delay_sigma * 1.5 / metres_per_unit, load])
     prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
     floor = 0.4 * pair.quantum + 1e-3 / metres_per_unit
     x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)

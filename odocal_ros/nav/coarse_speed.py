@@ -163,10 +163,10 @@ def find_coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     changes = np.diff(value, prepend=value[:1]) != 0
     knot_share = 0.5    # of the rows that change: an interpolation has fewer knots
     if (knots & changes).sum() < knot_share * changes.sum():
-        own = find_grid_step(value[knots])
+        knot_grid = find_grid_step(value[knots])
         knot_step = 1.5    # least ratio of the knots' grid to that of all rows
-        if own and own > knot_step * (step or 0.0):
-            return CoarseSpeed(own, t[knots], value[knots], True)
+        if knot_grid and knot_grid > knot_step * (step or 0.0):
+            return CoarseSpeed(knot_grid, t[knots], value[knots], True)
     return CoarseSpeed(step, t, value) if step else None
 
 

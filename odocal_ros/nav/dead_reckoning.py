@@ -159,9 +159,9 @@ def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | N
     return None
 
 
-def level_track(travel: Floats, turned: Floats) -> Floats:
+def level_track(travel: Floats, turn: Floats) -> Floats:
     """Return the level path of travel, (n, 2) in its units; turned : (n,) rad about up."""
-    middle = (turned[1:] + turned[:-1]) / 2
+    middle = (turn[1:] + turn[:-1]) / 2
     step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
     return running_sum(step)
 

@@ -72,7 +72,7 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
     the values.   reversed_counts : positive values mean backwards.   name : of the counter in
     reasons. Rollovers are corrected, resets interpolated by the adjacent speed.
     """
-    whole = np.issubdtype(value.dtype, np.integer)
+    is_integer = np.issubdtype(value.dtype, np.integer)
     reasons: tuple[Reason, ...] = ()
     coarse = None
     if form.quantity == 'rate':
@@ -90,7 +90,7 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
     else:
         step, reasons = _counter_steps(t, value, form.modulus, name)
     s = running_sum(step) if len(value) else np.empty(0)
-    quantum = _quantum(step) if whole and form.quantity != 'rate' else 0.0
+    quantum = _quantum(step) if is_integer and form.quantity != 'rate' else 0.0
     return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
 
 
@@ -130,17 +130,17 @@ def without_rollover(step: Values, modulus: int) -> Values:
 def _counter_steps(t: Floats, value: Values, modulus: int,
                    name: str) -> tuple[Floats, tuple[Reason, ...]]:
     """Return steps of a counter as floats, rollovers and resets corrected; and the reasons."""
-    whole = np.issubdtype(value.dtype, np.integer)
+    is_integer = np.issubdtype(value.dtype, np.integer)
     raw = np.diff(value)
     counted = without_rollover(raw, modulus)
     rolled, step = counted != raw, counted.astype(float)
-    resets = _find_resets(t, step, whole)
+    resets = _find_resets(t, step, is_integer)
     reasons: tuple[Reason, ...] = ()
     if resets.any():
         first = int(np.argmax(resets))
         step, count = _bridge_resets(t, step, resets), int(resets.sum())
         jump = value[first + 1].item() - value[first].item()
-        by = f'{jump:+}' if whole else f'{jump:+.6g}'
+        by = f'{jump:+}' if is_integer else f'{jump:+.6g}'
         reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {by} at t = '
                            f'{t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
                            'reset, not motion; interpolated from the adjacent speed'),)
@@ -153,7 +153,7 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
     return step, reasons
 
 
-def _find_resets(t: Floats, step: Floats, whole: bool) -> Bools:
+def _find_resets(t: Floats, step: Floats, is_integer: bool) -> Bools:
     """Return a mask of impossible steps: far above the speed of the drive, single or in pairs."""
     dt = np.diff(t)
     if len(step) < FEWEST_STEPS or not step.any():
@@ -163,7 +163,7 @@ def _find_resets(t: Floats, step: Floats, whole: bool) -> Bools:
     if not (rate > 0).any():       # steps so small that their rates are zero
         return np.zeros(len(step), bool)
     limit = RESET_FACTOR * np.percentile(rate[rate > 0], 95)
-    resets = rate > (max(limit, 3 / usual) if whole else limit)
+    resets = rate > (max(limit, 3 / usual) if is_integer else limit)
     # motion has long runs, even if the vehicle is mostly at rest; a reset or a false row has not
     for begin, end in runs(resets):
         if end - begin > 2:

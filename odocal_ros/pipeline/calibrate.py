@@ -105,8 +105,8 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     imu_reasons, z_down = unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
                                                 config.imu)
     # takes precedence: the mean gravity of the other test is then meaningless
-    if moved := gravity_turn_reasons(inputs):
-        imu_reasons, z_down = moved, False
+    if gravity_turns := gravity_turn_reasons(inputs):
+        imu_reasons, z_down = gravity_turns, False
     imu_reasons = imu_reasons or unit_change_reasons(inputs)
     reasons += tuple(with_axes(imu_reasons, inputs))
     release_mapped_memory()
@@ -131,12 +131,12 @@ def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
     if leg.stop_ns <= leg.start_ns:
         missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark',
                               'Set the start mark first, then the stop mark.'))
-    for n, least, code, what in (
+    for n, least, code, topic in (
             (len(inputs.t_imu), 4, Code.NO_IMU, 'IMU'),
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
         if n < least:
-            missing.append(Reason(code, f'{n} usable {what} message{"s" * (n != 1)}; '
-                                        f'required: {least} or more'))
+            missing.append(Reason(code, f'{n} usable {topic} message{"s" * (n != 1)}; '
+                                  f'required: {least} or more'))
     if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none received: reported already
         missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
     return missing
@@ -198,12 +198,12 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     good, carried_reason = usable_results(
         parts_between(leg, imu_gaps(leg, config.leg.max_gap))), None
     if not good:
-        whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
-        carried_reason = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
+        of_leg = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
+        carried_reason = next((r for r in of_leg.reasons if r.code is Code.ODOMETER_STILL), None)
         if carried_reason:
             good = usable_results(parts_between(leg, _carried_sections(leg, config)))
         if not good:
-            return [whole]
+            return [of_leg]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
         return good      # the gap is before the mark
     cause, do = (carried_reason.text,

@@ -215,18 +215,18 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
         return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
                        f'cannot be combined: {legs_by_unit}'),)
     extremes = _significant_extremes(scales)
-    if extremes and (more := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
+    if extremes and (excess := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
         low, high = extremes
-        found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
+        found.append(f'the scale of leg {high.leg} is {100 * excess:.1f} % above '
                      f'that of leg {low.leg}')
     yaws = _values_by_leg('yaw_mounting_angle', estimates)
     # of a reversed IMU they are near +-180 deg
     extremes = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
                                       for yaw in yaws])
     # rad, 5 deg: mountings bend less
-    if extremes and (more := extremes[1].value - extremes[0].value) > 0.087:
+    if extremes and (excess := extremes[1].value - extremes[0].value) > 0.087:
         low, high = extremes
-        found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
+        found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(excess):.1f} deg above '
                      f'that of leg {low.leg}')
     return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: larger than changes of one vehicle '
                    'with one mounting'),) if found else ()

@@ -118,12 +118,12 @@ def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
-               methods: dict[str, MethodResult] | None = None, **more: Any) -> LegResult:
+               methods: dict[str, MethodResult] | None = None, **fields: Any) -> LegResult:
     """Return the result of a leg: counts, reasons, methods, and further fields of LegResult."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
-    if 'distance' not in more:      # of a leg that is refused: by the fixes
+    if 'distance' not in fields:      # of a leg that is refused: by the fixes
         t_fix, geodetic = inputs.t_fix[between], inputs.geodetic[between]
-        more['distance'] = path_and_chord(
+        fields['distance'] = path_and_chord(
             t_fix, median_origin(t_fix, geodetic).to_n(np.nan_to_num(geodetic)),
             inputs.least_motion)[0] if len(t_fix) else 0.0
     return LegResult(
@@ -131,7 +131,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
         imu_samples=len(inputs.t_imu),
         pulses=len(inputs.travel.t), fixes=int(between.sum()),
         rejected_fixes=inputs.fixes_rejected, reasons=tuple(reasons), methods=methods or {},
-        C_bi=inputs.C_bi, **more)
+        C_bi=inputs.C_bi, **fields)
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:

@@ -112,9 +112,9 @@ class PreparedLeg(LocatedFixes):
     def level_path(self, t: Floats) -> Floats:
         """Return travel along the gyro's heading on level ground, up to a rotation: (n, 2)."""
         inputs, epochs = self.inputs, self.track.t
-        turned = integral_at(epochs, inputs.t_imu, by_row(
+        turn = integral_at(epochs, inputs.t_imu, by_row(
             lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
-        path = dead_reckoning.level_track(self.track.s, turned)
+        path = dead_reckoning.level_track(self.track.s, turn)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
     @property
@@ -139,11 +139,11 @@ class PreparedLeg(LocatedFixes):
             position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
             return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
                            standing_at(t, self.spans) is not None, 0, surveyed=True)
-        inputs, here = self.inputs, path(np.array(t))
+        inputs, at_mark_n = self.inputs, path(np.array(t))
         rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
         return fix_at(t, standing_at(t, self.spans),
                       (inputs.t_fix, self.fixes_n, inputs.covariance_n),
-                      lambda times: path(times) - here,
+                      lambda times: path(times) - at_mark_n,
                       self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
 
     def _surveyed(self, name: str, t: float) -> tuple[float, ...]:

@@ -113,8 +113,8 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
 def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
     """Return odometer point to antenna, as estimated, otherwise as configured: (3,) m, in b."""
     antenna, odometer = (
-        np.array([given if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
-                  for axis, given in zip('xyz', section.lever_arm, strict=True)])
+        np.array([value if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
+                  for axis, value in zip('xyz', section.lever_arm, strict=True)])
         for name, section in (('antenna', config.gnss), ('odometer', config.odometer)))
     arm: Floats = antenna - odometer
     return arm

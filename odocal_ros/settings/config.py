@@ -280,10 +280,10 @@ class Config:
 
     def in_local_frame(self) -> 'Config':
         """Return the settings of a leg whose positions are in a local frame."""
-        ours = self.reference
-        leg = replace(self.leg, min_distance=min(self.leg.min_distance, ours.min_distance),
-                      min_speed=min(self.leg.min_speed, ours.min_speed))
-        return replace(self, leg=leg, gnss=replace(self.gnss, default_sigma=ours.default_sigma))
+        local = self.reference
+        leg = replace(self.leg, min_distance=min(self.leg.min_distance, local.min_distance),
+                      min_speed=min(self.leg.min_speed, local.min_speed))
+        return replace(self, leg=leg, gnss=replace(self.gnss, default_sigma=local.default_sigma))
 
 
 SETTINGS = settings_of(Config)

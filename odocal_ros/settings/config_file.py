@@ -166,8 +166,8 @@ def scalar(text: str) -> bool | int | float | str:
         return text in TRUE
     if len(text) > MAX_NUMBER_LENGTH:
         return text
-    if whole := WHOLE_NUMBER.fullmatch(text):
-        number = int(text, 16 if whole[1] else 8 if whole[2] else 10)
+    if match := WHOLE_NUMBER.fullmatch(text):
+        number = int(text, 16 if match[1] else 8 if match[2] else 10)
         if -2**63 <= number < 2**63:
             return number
     dotted = DOTTED.fullmatch(text)

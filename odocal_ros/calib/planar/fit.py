@@ -170,23 +170,23 @@ def _wheel_rows(run: Run, state: Floats, c: Floats, path: Floats, first_gains: F
     k, by_state = np.arange(n), np.zeros((n, 3, 5))
     model, J = run.wheels.increments(c[:m])
     turn_per_metre = first_gains[2] / first_gains[0]
-    turned = np.diff(state[:, 2])
-    middle = state[:-1, 2] + turned / 2
+    turn = np.diff(state[:, 2])
+    middle = state[:-1, 2] + turn / 2
     cos, sin = np.cos(middle), np.sin(middle)
     dx, dy = np.diff(state[:, :2], axis=0).T
-    moved = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
-    chord = np.sinc(turned / (2 * np.pi))       # chord over arc
+    motion = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
+    chord = np.sinc(turn / (2 * np.pi))       # chord over arc
     by_state[:, 0, 0], by_state[:, 0, 1] = -cos, -sin
     by_state[:, 1, 0], by_state[:, 1, 1] = sin, -cos
     by_state[:, 2, 2] = -1.0
     by_next = -by_state
     for by_end in (by_state, by_next):
-        by_end[:, 0, 2], by_end[:, 1, 2] = moved[:, 1] / 2, -moved[:, 0] / 2
+        by_end[:, 0, 2], by_end[:, 1, 2] = motion[:, 1] / 2, -motion[:, 0] / 2
     arc = np.stack([chord, chord, np.ones(n)], -1)
     # residuals are metres of the wheels: divided by their gains, times the first gains
     gain, gain_by_c = run.wheels.gains(c[:m])
     unit = first_gains / gain
-    value = (np.column_stack([moved, turned]) - model * arc) * unit
+    value = (np.column_stack([motion, turn]) - model * arc) * unit
     by_constants = np.zeros((n, 3, len(c)))
     by_constants[:, :, :m] = -(J * arc[:, :, None] * unit[:, :, None]
                                + gain_by_c * (value / gain)[:, :, None])

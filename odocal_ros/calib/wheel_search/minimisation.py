@@ -152,7 +152,7 @@ class _BoxSearch:
         u = minimum_in_box(to_y.T @ surface.gradient, to_y.T @ surface.hessian @ to_y, low, high)
         self.on_edge = (u <= low) | (u >= high)
         move = np.linalg.solve(S, u * bound)
-        there = float(self.value((self.space.T @ (self.q + move))[None])[0])
+        value_there = float(self.value((self.space.T @ (self.q + move))[None])[0])
         step_limit = 1e-6    # share of the first half range, largest last step
         small = np.abs(S @ move) <= step_limit * self.space.bounds(self.first_half)
         # share of the criterion: the box is not shrunk if its curvature contributes less
@@ -162,13 +162,13 @@ class _BoxSearch:
         converged = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
         beyond = np.abs(move) > self.w
         rounding = 1e-12    # share of the criterion by which equal values may differ
-        if there <= self.least * (1 + rounding):
-            self.q, self.least = self.q + move, there
+        if value_there <= self.least * (1 + rounding):
+            self.q, self.least = self.q + move, value_there
         else:
             beyond = self._to_best_of_grid(bound)
         grow, shrink = 2.0, 0.25
-        grown = np.minimum(grow * self.w, self.first_width)
-        self.w = np.where(beyond, grown, np.where(shrinks, shrink * self.w, self.w))
+        larger = np.minimum(grow * self.w, self.first_width)
+        self.w = np.where(beyond, larger, np.where(shrinks, shrink * self.w, self.w))
         return converged
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:

@@ -169,9 +169,9 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
         np.sqrt(d2, out=d2)
         found['max'][rows], found['mean'][rows] = d2.max(axis=1), d2.mean(axis=1)
     if course and len(leg.pieces):
-        off = course_differences(leg, sets)
-        found['course_mean'] = np.angle(np.exp(1j * off).mean(axis=1))
-        found['course_rms'] = np.sqrt((off**2).mean(axis=1))
+        difference = course_differences(leg, sets)
+        found['course_mean'] = np.angle(np.exp(1j * difference).mean(axis=1))
+        found['course_rms'] = np.sqrt((difference**2).mean(axis=1))
     return Scores(**found)
 
 

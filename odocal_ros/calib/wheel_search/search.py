@@ -153,11 +153,11 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
                             f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
                             'together'))
     if refined.widened:
-        grown = [f'{name} ± {_amount(k, before)} to ± {_amount(k, after)}'
-                 for k, (name, before, after) in enumerate(zip(
+        changes = [f'{name} ± {_amount(k, before)} to ± {_amount(k, after)}'
+                   for k, (name, before, after) in enumerate(zip(
                      NAMES, ranges.half, refined.half, strict=True)) if after > before]
         found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
-                            f'range, which was widened: {", ".join(grown)}'))
+                            f'range, which was widened: {", ".join(changes)}'))
     if not refined.converged or refined.on_edge:
         where = 'ends on the edge of the widest range' if refined.on_edge else \
             f'has not converged after {refined.iterations} response surfaces'
