@@ -183,9 +183,10 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
     leg = make_smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)),
                             there.rough)
     grade = grade_of(config.imu)
-    np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias, math.hypot(1e-6, OMEGA))
+    np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias_sigma,
+                               math.hypot(1e-6, OMEGA))
     north = replace(leg, origin=replace(there.origin, local=None))
-    np.testing.assert_allclose(_priors(config, grade, north).gyro_bias, 1e-6)
+    np.testing.assert_allclose(_priors(config, grade, north).gyro_bias_sigma, 1e-6)
 
 
 def test_the_bias_at_rest_has_the_sigma_of_the_earth_rate():
