@@ -143,7 +143,8 @@ def imperfection_sigmas(grade: Grade) -> Floats:
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         # m: a car's 1.4, a truck's 2.5; in turns 0 of a body that rolls on level ground
-        'pitch_centre': 1.5, 'pitch_centre_in_turns': 1.0}
+        'pitch_centre': 1.5, 'pitch_centre_in_turns': 1.0,
+        'body_centre_height': 0.4, 'sway_by_force': 0.005}
     return np.repeat([usual[kind] for kind in layout.KIND_SIZES], list(layout.KIND_SIZES.values()))
 
 

@@ -56,7 +56,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
-             'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns', 'lift_by_turning',
+             'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
+             'body_centre_height', 'sway_by_force', 'lift_by_turning',
              'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
              'speed_offset', 'velocity_delay', 'velocity_lag_square', 'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
@@ -105,22 +106,25 @@ SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # pitch and yaw of the forward axis by forward and left acceleration, rad per m/s^2, and by their
 # rates of change, rad per m/s^3, (S12): the body reacts with a delay, tyres immediately
 BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
-# points about which the body pitches, m ahead of the odometer: on hills; in addition on bumps; in
-# turns about its own left axis, on banked ground. Last the lift of the axle by turns, m/rad: the
-# third point times the mean roll of the ground, which tilts that axis
-PITCH_CENTRES = constants_from('pitch_centre', 'lift_by_turning')
+# displacements of the axle by the tilt of the body, (S12): points about which it pitches, m ahead
+# of the odometer: on hills; in addition on bumps; in turns about its own left axis, on banked
+# ground. Height above the odometer, m, of the centre about which it tilts on its springs; its sway
+# there by lateral force, m per m/s^2. Lift of the axle by turns, m/rad: the third point times the
+# mean roll of the ground, which tilts the axis of turns
+BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
 # constants that other legs do not share: those of its ground and its fixes
 LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
 # deviations from ideal sensors and an ideal vehicle, (S28)
-IMPERFECTIONS = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
+IMPERFECTIONS = constants_from('gyro_scale_z', 'sway_by_force')
 # their kinds, with one common size each: numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
               'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1, 'squat_by_jerk': 1,
-              'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1}
+              'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1,
+              'body_centre_height': 1, 'sway_by_force': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

@@ -3,13 +3,26 @@
 
 """Simulated legs as the smoother sees them, their results, their truth at its keyframes."""
 
+from dataclasses import replace
+
 from drives import cached, settings
 import numpy as np
 
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.estimator import make_smoother_leg, smooth
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
+from odocal_ros.estimator.state import (
+    GNSS_DELAY,
+    LN_K,
+    M,
+    ODO_DELAY,
+    PITCH,
+    State,
+    WITHOUT_SLOW,
+    YAW,
+)
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -102,3 +115,18 @@ def _biases(drive, since):
             for first, name, walk in (
                 (drive.truth.gyro_bias, 'gyro walk', grade.gyro_bias_walk),
                 (drive.truth.accel_bias, 'accelerometer walk', grade.accel_bias_walk)))
+
+
+def at_truth(t_stop=None, **options):
+    """Return a drive without noise, and problem and state of its leg."""
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
+    leg = replace(leg, t_stop=t_stop or leg.t_stop)
+    return drive, make_problem(leg, config), truth(drive, config, leg)
+
+
+def along_axis(problem, state, axis, constants):
+    """Return the odometer's residuals along an axis of the vehicle and how constants move them."""
+    part = Equations(problem, state).factors['motion']
+    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
+    return ((C_vn @ part.raw[:, D, None])[:, axis, 0],
+            (C_vn @ part.jacobians(WITHOUT_SLOW)[2][:, D, constants])[:, axis])

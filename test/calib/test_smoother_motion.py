@@ -8,12 +8,12 @@ from dataclasses import replace
 from drives import ANGLES, configured, off
 import numpy as np
 import pytest
-from smoother_legs import made, truth
+from smoother_legs import along_axis, at_truth, made, truth
 
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, preintegrate_at as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
-from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, moving_mean
+from odocal_ros.estimator.factors.motion import Motion
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
 from odocal_ros.estimator.prepare import make_problem
@@ -29,13 +29,6 @@ from odocal_ros.sim.wheels import G
 
 BUS = SimOptions(scenario='town', duration=250.0, imu_grade='industrial', imu_rate=50.0,
                  fix_noise='rtk')
-
-
-def at_truth(t_stop=None, **options):
-    """Return a drive without noise, and problem and state of its leg."""
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
-    leg = replace(leg, t_stop=t_stop or leg.t_stop)
-    return drive, make_problem(leg, config), truth(drive, config, leg)
 
 
 @pytest.fixture(scope='module')
@@ -76,7 +69,7 @@ def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
     rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level, and the mounting is 1 deg
     leaning = replace(state, C_nb=rolled)
     measured = rotate(transpose(rolled[:-1]), rate_n)
-    upright, other = (Motion(problem, one, own).pitch_increments[:, 0] for one, own in (
+    upright, other = (Motion(problem, one, own).tilt.pitch_increments[:, 0] for one, own in (
         (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
     # of a turn by 0.2 rad a tenth was pitch; the heading that the mounting changes with the roll,
     # by 0.1 times some degrees, turns what the body really pitches by
@@ -134,14 +127,6 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
 
 
-def along_axis(problem, state, axis, constants):
-    """Return the odometer's residuals along an axis of the vehicle and how constants move them."""
-    part = Equations(problem, state).factors['motion']
-    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
-    return ((C_vn @ part.raw[:, 15:18, None])[:, axis, 0],
-            (C_vn @ part.jacobians(layout.WITHOUT_SLOW)[2][:, 15:18, constants])[:, axis])
-
-
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
 def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
@@ -154,50 +139,6 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
 
     assert left([0, 1]) < 0.3 * left([])
     assert left([0, 1, 2, 3]) < 0.7 * left([0, 1])
-
-
-def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
-    """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
-    _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
-                                 real=Real(wheelbase=3.0))
-    off, by = along_axis(problem, state, 2, layout.PITCH_CENTRES)
-    by = by[:, 0]
-    centre = -(by @ off) / (by @ by)
-    assert np.abs(off).max() > 1e-3       # m in a second
-    assert centre == pytest.approx(1.5, rel=0.02)
-    assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
-    # no count lifts the odometer: what does is no part of what the scale multiplies
-    c = state.constants.copy()
-    c[layout.PITCH_CENTRES.start] = centre
-    there, here = (
-        Equations(problem, one).factors['motion'].jacobians(layout.WITHOUT_SLOW)[2]
-        for one in (replace(state, constants=c), state))
-    np.testing.assert_allclose(there[:, D, layout.LN_K], here[:, D, layout.LN_K], atol=1e-9)
-
-
-@pytest.mark.parametrize('banking', [0.0, 1.0])
-def test_on_banked_ground_a_turn_pitches_the_vehicle_about_its_own_left_axis(banking):
-    """The road takes all of the lateral force: it leans by its angle to gravity, inwards."""
-    _, problem, state = at_truth(real=Real(banking=banking))
-    motion = Equations(problem, state).factors['motion'].motion
-    rate, speed = motion.rate_n[:, 2], np.linalg.norm(state.v_n, axis=1)[:-1]
-    want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
-    steady = np.abs(np.gradient(rate)) < 0.01        # the lean is that at the begin
-    assert np.abs(want[steady]).max() >= 0.06 * banking
-    np.testing.assert_allclose(motion.pitch_increments[steady, 2], want[steady], atol=5e-3)
-
-
-def test_bumps_may_have_another_centre_than_hills():
-    _, problem, state = at_truth(slope=0.05)
-    motion = Equations(problem, state).factors['motion'].motion
-    hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
-    around = slice(HILL_INTERVALS, -HILL_INTERVALS)
-    # the mean of five over a period of 2.5 is 0; over one of 40 it is a sinc: 0.974
-    assert moving_mean(bump)[around] == pytest.approx(0.0, abs=1e-9)
-    assert moving_mean(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
-                                                      * hill[around])
-    both, fast = motion.pitch_increments.T[:2]
-    assert fast == pytest.approx(both - moving_mean(both))
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():

@@ -58,13 +58,14 @@ def moved():
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, layout.PHI.start:layout.BG.stop] *= 0.1
-    c = 1e-3 * np.insert(rng.standard_normal(layout.M - 4), [
-        layout.FIX_MOTION_TIME, *3 * [layout.FIX_ERROR_BY_SIGMA.start - 1]], 1.0)
-    # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
+    c = 1e-3 * np.insert(rng.standard_normal(layout.M - 6), [
+        layout.FIX_MOTION_TIME, *2 * [layout.BODY_TILT.start + 2],
+        *3 * [layout.FIX_ERROR_BY_SIGMA.start - 3]], 1.0)
+    # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps or body
     # of the size that there is: derivatives leave out how these change what the others do
     c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
     c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
-                                0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3]
+                                0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3, 0.0, 0.0]
     c[layout.FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     c[layout.VELOCITY_LAG2] = 2.1e-4
     return problem, state.updated(step, c)

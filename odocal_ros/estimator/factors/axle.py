@@ -13,6 +13,7 @@ change the path length.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, iterate_releasing
+from odocal_ros.estimator.factors.body_tilt import moving_mean
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
@@ -64,18 +65,35 @@ class Axle:
         return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2,
                                                               (2 * WALK_SPEED)**2)
 
+    def _bank(self, left_up: Floats, acceleration: Floats) -> Floats:
+        """
+        Return the bank of the road in each interval, left side up: (K,) rad.
+
+        left_up : (N,) upward component of the left axis.   acceleration : (K,) m/s^2 to the left.
+        """
+        # without bumps, which tilt the body only. A body rolls in turns: its roll at no lateral
+        # acceleration is that of the IMU, on a road that is level in the mean
+        roll = moving_mean((left_up[1:] + left_up[:-1]) / 2)
+        path = np.linalg.norm(self.v_n[1:] + self.v_n[:-1], axis=1) * np.diff(self.state.t)
+        share = path / max(path.sum(), 1e-9)
+        off = acceleration - share @ acceleration
+        by_acceleration = share @ (off * roll) / max(share @ off**2, 1e-9)
+        bank: Floats = roll - share @ (roll - by_acceleration * acceleration)
+        return bank
+
     def accelerations(self) -> Floats:
         """
         Return the signals of BODY_LEAN in each interval: (K, 4).
 
-        Acceleration forward (including the component of gravity on a slope) and left, m/s^2, and
-        their rates of change, m/s^3.
+        Acceleration forward and left, including the components of gravity along a slope and a
+        bank, m/s^2, and their rates of change, m/s^3.
         """
         T = np.diff(self.state.t)[:, None]
         # mean axes: with those at its start, centripetal acceleration looks like braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
         force = rotate((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
         force[:, 0] += G * self._slope()
+        force[:, 1] += G * self._bank(C_vn[:, 1, 2], force[:, 1])
         jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)
 

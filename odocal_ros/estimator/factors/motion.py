@@ -18,6 +18,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at, WALK_SPEED
+from odocal_ros.estimator.factors.body_tilt import BodyTilt, moving_mean
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, E, P, PHI, State, V
@@ -28,20 +29,12 @@ from odocal_ros.nav.rotations import exp_so3, level_left, rotate, rotvec, skew, 
 # P, V, PHI, BG and BA
 D = slice(E, E + 3)
 ROWS = D.stop
-# judgement: intervals of a hill; faster pitching is by bumps of the road, or squat
-HILL_INTERVALS = 5
 # attributes of Motion with a row for each interval
 INTERVAL_ATTRIBUTES = (
     'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
-    'by_speed_offset', 'lean_accelerations', 'pitch_increments', 'rate_n', 'level_left',
+    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'rate_n', 'level_left',
     'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
     'displacement_by_state', 'residual')
-
-
-def moving_mean(x: Floats) -> Floats:
-    """Return moving means over HILL_INTERVALS: (K,)."""
-    around = np.ones(HILL_INTERVALS)
-    return np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
 
 
 def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
@@ -85,7 +78,7 @@ class Motion:
         self.wheel_displacement = straight * self.scale_ratio * self._inclination_ratio(straight)[
             :, None]
         self.by_delay = self._derivative_by_filter()
-        self.displacement = self.wheel_displacement + self.vertical_shift
+        self.displacement = self.wheel_displacement + self.tilt_displacement
         # derivative by the offset of a quantised speed
         self.by_speed_offset: Floats | None = None
         if leg.travel.coarse is not None:
@@ -138,15 +131,9 @@ class Motion:
         return self.C_end @ self.f
 
     @property
-    def by_pitch_centre(self) -> Floats:
-        """Return the derivatives of the displacement by PITCH_CENTRES: (K, 3, 4)."""
-        out: Floats = (self.C @ self.up)[:, :, None] * self.pitch_increments[:, None]
-        return out
-
-    @property
-    def vertical_shift(self) -> Floats:
-        """Return the displacement of the odometer by pitching, delta D of (S12): (K, 3) m."""
-        return self.by_pitch_centre @ self.state.constants[layout.PITCH_CENTRES]
+    def tilt_displacement(self) -> Floats:
+        """Return the displacement of the odometer by tilt, delta D of (S12): (K, 3) m."""
+        return self.by_tilt @ self.state.constants[layout.BODY_TILT]
 
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
@@ -163,16 +150,9 @@ class Motion:
             + self.half_pitch_variance[:, None] * c[layout.SCALE_BY_PITCHING]
         lean = self.lean_accelerations * c[layout.BODY_LEAN]
         pitch, yaw = lean.reshape(-1, 2, 2).sum(axis=1).T
-        # pitch about the horizontal axis to the left: turns of a body with roll are no pitch
-        self.rate_n = rotate(self.C, self.sums.mean_rate)
-        self.level_left = level_left(self.C @ state.forward)
-        pitch_increments = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
-        # about the left axis of the vehicle, which differs on banked ground
-        left = np.einsum('ki,ki->k', self.rate_n, self.C @ self.left) * T[:, 0]
-        turn = self.sums.mean_rate @ self.up * T[:, 0]
-        self.pitch_increments = np.stack(
-            [pitch_increments, pitch_increments - moving_mean(pitch_increments), left
-             - pitch_increments, turn], -1)
+        self.tilt = BodyTilt(state, self.sums.mean_rate, self.lean_accelerations[:, 1])
+        self.rate_n, self.level_left = self.tilt.rate_n, self.tilt.level_left
+        self.by_tilt = self.tilt.displacements
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
@@ -221,10 +201,10 @@ class Motion:
         gyro[:, PHI], gyro[:, V] = C @ s.R_by_gyro, -C @ s.dv_by_gyro
         gyro[:, P], gyro[:, D] = -C @ s.dp_by_gyro, -C @ s.S_by_gyro
         a[:, :, BG] = gyro[:, :, :3]
-        # by the pitch about PITCH_CENTRES. A bias changes little over HILL_INTERVALS: it does not
+        # by the pitch of BODY_TILT. A bias changes little over HILL_INTERVALS: it does not
         # affect the part of bumps
         lift = T * (C @ self.up)[:, :, None]
-        hills, _, turns, tilted = state.constants[layout.PITCH_CENTRES]
+        hills, _, turns, _, _, tilted = state.constants[layout.BODY_TILT]
         a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
                                + turns * self.left + tilted * self.up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
@@ -258,7 +238,7 @@ class Motion:
             displacement = along * np.einsum(
                 'ki,ki->k', along, self.displacement_by_state)[:, None]
         # the odometer does not count its displacement by pitching
-        c[:, D, layout.LN_K] = self.vertical_shift - displacement
+        c[:, D, layout.LN_K] = self.tilt_displacement - displacement
         by_scale = c[:, D, layout.LN_K] / self.scale_ratio
         c[:, D, layout.TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
         c[:, D, layout.SCALE_BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
@@ -272,7 +252,7 @@ class Motion:
             by_angle = C @ s.S @ (state.scale * axis)
             columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)
             c[:, D, columns] = -by_angle[:, :, None] * self.lean_accelerations[:, None, i::2]
-        c[:, D, layout.PITCH_CENTRES] = -self.by_pitch_centre
+        c[:, D, layout.BODY_TILT] = -self.by_tilt
         c[:, D, layout.ODO_ARM] = swing @ state.C_bv
         if self.by_speed_offset is not None:
             c[:, D, layout.SPEED_OFFSET] = -self.by_speed_offset

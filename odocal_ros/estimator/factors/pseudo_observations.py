@@ -55,7 +55,7 @@ SHARED: dict[str, slice | Ints] = {
     'receiver_smoothing': np.array([layout.FIX_LAG2, layout.FIX_BY_MOTION,
                                     layout.FIX_MOTION_TIME]),
     'tyre_changes': layout.TYRES,
-    'body_lean': layout.constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
+    'body_lean': layout.constants_from('scale_by_pitching', 'sway_by_force'),
     'speed_truncation': layout.constants_from('speed_offset'),
     'heading': layout.constants_from('heading_offset'), 'velocity': layout.VELOCITY}
 # motion of a vehicle at rest, 1 sigma: m/s, and rad/sqrt(s) about east, north, up. Judgement:
