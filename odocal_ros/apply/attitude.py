@@ -82,7 +82,8 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
     the cubic through four rates, or of the line through two at uneven times, and its coning term.
     """
     h, first, second = t[k + 1] - t[k], w[k], w[k + 1]
-    rise = [b - a for a, b in zip(first, second, strict=True)]      # of the rate, over h
+    # change of the rate within the interval; with four rates h times its slope in the middle
+    rise = [b - a for a, b in zip(first, second, strict=True)]
     middle = [(a + b) * 0.5 for a, b in zip(first, second, strict=True)]      # rate at h / 2
     angle = [m * h for m in middle]
     if 0 < k < len(t) - 2:
@@ -95,6 +96,8 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
             right_weight = weight * (between / 2 + before)
             for i, (a, b, c, d) in enumerate(zip(w[k - 1], first, second, w[k + 2], strict=True)):
                 slope = rise[i] / between
+                # curvatures as second divided differences; sag: line minus cubic in the middle,
+                # of which the mean is 2/3
                 left = (slope - (b - a) / before) / (before + between)
                 right = ((d - c) / after - slope) / (between + after)
                 sag = left * left_weight + right * right_weight

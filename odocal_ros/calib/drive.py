@@ -15,9 +15,10 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST
 
-# motion without counts is a fault of the odometer if it is farther than wheels slide, m, or, after
-# the longest slide, s, than GNSS_MOVES: physical. Judgement: and at least this share of the path
-FURTHEST_SLIDE, LONGEST_SLIDE, LEAST_SHARE = 100.0, 20.0, 0.01
+# motion without counts is a fault of the odometer if it is longer than wheels slide
+FURTHEST_SLIDE = 100.0      # m: physical
+LONGEST_SLIDE = 20.0        # s: physical, after it GNSS_MOVES is enough
+LEAST_SHARE = 0.01          # judgement, of the path
 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -131,8 +132,9 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
     found = []
+    # shorter intervals cannot contain that distance
     for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
-        # at the end, where no cut helps, a parked vehicle has such errors of the fixes
+        # not at the end of the data: errors of the fixes of a parked vehicle move as far
         is_no_slide = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
         least = max(GNSS_MOVES if is_no_slide else FURTHEST_SLIDE, 10 * fix_sigma)
         distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], least)
@@ -175,8 +177,8 @@ def path_and_chord(t_fix: Floats, fixes_n: Floats,
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
-    The path connects fixes at least ten times their white noise, and ``least`` m, apart, so that
-    noise does not accumulate. Fixes out of reach of a vehicle are left out.
+    The path connects fixes at least ten times their white noise, and ``least`` or 2 m, apart, so
+    that noise does not accumulate. Fixes out of reach of a vehicle are left out.
     """
     p = fixes_n[find_reachable(t_fix, fixes_n), :2]
     if len(p) < 2:

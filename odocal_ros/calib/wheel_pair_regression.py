@@ -26,7 +26,8 @@ BIAS_REST = 5.0
 # rad/s: a faster turn at rest is that of a ferry or a turntable. Physical: consumer IMUs drift by
 # 0.5 to 1.3 deg/s
 MOST_DRIFT = np.deg2rad(2.0)
-MEAN_STEPS = 10     # steps over which speed, turn rate and the ends of a window are averaged: 1 s
+# judgement: steps of 0.1 s over which speed and turn rate are averaged; also a cell of the fit
+MEAN_STEPS = 10
 
 
 def without_gyro_drift(pair: WheelPair) -> WheelPair:
@@ -75,11 +76,12 @@ def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
     keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < 20:
         return None, None
-    width = TRACK_WIDTH.first_sigma / metres_per_unit
+    width_sigma = TRACK_WIDTH.first_sigma / metres_per_unit
     delay_sigma = 0.05     # s, sigma of the delay between the wheels, and of wheels to IMU
-    load = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
-    prior = np.array([np.inf, width, np.inf, delay_sigma,
-                      delay_sigma * 1.5 / metres_per_unit, load])
+    usual_width = 1.5       # m: the delay to the IMU acts as this width times the delay
+    load_sigma = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
+    prior = np.array([np.inf, width_sigma, np.inf, delay_sigma,
+                      delay_sigma * usual_width / metres_per_unit, load_sigma])
     prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
     floor = 0.4 * pair.quantum + 1e-3 / metres_per_unit
     x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
@@ -120,14 +122,15 @@ def find_ratio_change(pair: WheelPair, signals: Floats, metres_per_unit: float,
         if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
-        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up equally within it
+        # 2e-3: tyres that warm up differently change the ratio by less
+        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)
         if abs(change) > least and abs(change) / sigma > best[0]:
             best = (abs(change) / sigma, float(change), share, at)
     sigmas, change, share, at = best
     if not change:
         return (), 0.0
     # the ratio before or after may be correct: that of the fit is between, (1 - share) of the
-    # change from that before
+    # change from that before. rms of both errors, so that it is the change for a share of half
     at_half = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
     left, right = pair.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {pair.t[at]:.0f} s on, after about '

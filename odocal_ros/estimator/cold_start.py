@@ -10,9 +10,9 @@ x + i y or east + i north: a factor exp(i a) rotates by a.
 
 The gyro gives the attitude relative to the first keyframe. The mean specific force of the drive is
 up; its apparent rotation is the gyro bias about the horizontal axes. The fit of the odometer's
-track in the level frame to the fixes gives the scale and the sum of heading and mounting angle; a
-change of this angle is the gyro bias about up. The heading alone is the rotation from the specific
-force to the accelerations of the track. A gyro warms up: a long leg is divided into sections.
+track in the level frame to the fixes gives the scale and the angle chi, heading psi minus yaw
+mounting; a change of chi is the gyro bias about up. psi is the rotation from the specific force to
+the accelerations of the track. A gyro warms up: a long leg is divided into sections.
 """
 
 from dataclasses import dataclass, replace
@@ -32,6 +32,7 @@ from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.rotations import exp_so3, skew, wrap
 from odocal_ros.nav.time_series import fit_robust_line
 
+MEDIAN_RADIUS = 1.18        # statistical: median of a two-dimensional normal error, in sigmas
 SECTION_LENGTH = 600.0      # s, judgement: a gyro that warms up has one bias for this time
 
 
@@ -79,7 +80,7 @@ class FittedTrack:
         self.place = self._place(t, t_fix, z)
         self.height = _window_medians(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
         scatter = np.median(np.abs(np.interp(t_fix, t, self.place) - z))
-        self.scatter = max(float(scatter) / 1.18, 1e-3)
+        self.scatter = max(float(scatter) / MEDIAN_RADIUS, 1e-3)
 
     def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
         """Return the track plus the smoothed difference from the fixes: (N,) m, complex, in n."""
@@ -153,12 +154,12 @@ def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
     """Return the sections of a leg, each of about SECTION_LENGTH or longer."""
-    # without enough fixes for a heading, it is joined with the next, the last with the one before
+    # one without enough fixes for a heading is joined with the next, the last with the one before
     count = max(1, round(float(np.ptp(imu.t[imu.key])) / SECTION_LENGTH))
     ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
     sections, firsts = list[_Section](), [0]
 
-    def between(first: int, last: int) -> _Section:
+    def section_of(first: int, last: int) -> _Section:
         before = sections[-1].bias if sections else np.zeros(3)
         return _estimate_section(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
 
@@ -166,13 +167,13 @@ def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[
         begin, end = imu.t[imu.key[[firsts[-1], last]]]
         if np.count_nonzero((leg.t_fix >= begin) & (leg.t_fix <= end)) < 2:
             continue
-        section = between(firsts[-1], last)
+        section = section_of(firsts[-1], last)
         if section.track.slope is not None:
             sections.append(section)
             firsts.append(last)
     if firsts[-1] < ends[-1]:
         first = firsts[-2] if sections else 0
-        sections[-1:] = [between(first, ends[-1])]
+        sections[-1:] = [section_of(first, ends[-1])]
     return sections
 
 
@@ -180,10 +181,11 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
     """Return a section; before : (3,) gyro bias of the section before it."""
     rest = gyro_bias_at_rest(leg, imu)
     bias = before if rest is None else rest
+    # rad/s, judgement: of a bias at rest, the drift of a consumer gyro in a leg
     sigma = np.maximum(priors.gyro_bias_sigma, 1e-3) if rest is None else np.full(3, 2e-4)
-    K, change = len(imu.key) - 1, np.zeros(3)
-    at_bias, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
-                              np.array([1.0, 0.0, 0.0]), np.empty(0))
+    count, change = len(imu.key) - 1, np.zeros(3)
+    at_bias, _ = preintegrate(imu, np.tile(bias, (count, 1)), np.zeros((count, 3)), leg.travel.at,
+                              forward_b(0.0, 0.0), np.empty(0))        # no times within
     sums, C_0k = change_gyro_bias(at_bias, change)
     for _ in range(2):
         up, correction = _find_level(leg, sums, C_0k, sigma)
@@ -204,6 +206,7 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
 
 def change_gyro_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
     """Return sums with a gyro bias increased by ``change``, and the attitudes C_0k: (N, 3, 3)."""
+    # R_by_gyro is the rotation by a smaller bias, the other derivatives are by a larger one
     bias = slice(0, 3)
     S = sums.S.copy()
     S[:, :, 0] += sums.S_by_gyro[:, :, bias] @ change
@@ -253,22 +256,21 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
     F = F[:, 0] + 1j * F[:, 1]
     drift = np.exp(1j * (track.chi_at[:-1] - track.chi))
     T = sums.T
-    lag = min(3, len(T))
-    kernel = np.ones(lag)
-    columns = [np.convolve(c, kernel, 'valid')
+    lag = min(3, len(T))        # intervals, to average noise: judgement
+    columns = [np.convolve(c, np.ones(lag), 'valid')
                for c in (F * drift, T.astype(complex), T * direction[:-1] * drift)]
     y = v[lag:] - v[:-lag]
     A = np.stack(columns, -1)
     w = np.ones(len(y))
-    x = np.array([1.0, 0.0, 0.0], complex)
-    sigma = np.inf
+    x, sigma = np.array([1.0, 0.0, 0.0], complex), np.inf
     for _ in range(4):
         H = (A.conj().T * w) @ A + 1e-9 * np.eye(3)
         x = np.linalg.solve(H, (A.conj().T * w) @ y)
         r = np.abs(y - A @ x)
-        usual = max(np.median(r) / 1.18, 1e-3)
+        usual = max(np.median(r) / MEDIAN_RADIUS, 1e-3)
         w = np.minimum(1.0, 2 * usual / np.maximum(r, 1e-9))
         sigma = usual * np.sqrt(lag * np.linalg.inv(H)[0, 0].real) / max(abs(x[0]), 1e-9)
+    # |x_0| is 1 if the accelerations are those of the track; half: judgement
     return float(np.angle(x[0])), float(sigma) if abs(x[0]) >= 0.5 else np.inf
 
 
@@ -285,8 +287,9 @@ def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
     v_n = (C_nb @ forward_b(yaw, 0.0)) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
-    return State(t, p_n, v_n, C_nb, np.tile(section.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
-                 np.zeros((N, 3)), constants)
+    return State(t, p_n, v_n, C_nb, gyro_bias=np.tile(section.bias, (N, 1)),
+                 accel_bias=np.zeros((N, 3)), travel_error=np.zeros(N), slow_n=np.zeros((N, 3)),
+                 constants=constants)
 
 
 def _join_sections(leg: SmootherLeg, sections: list[_Section], K: float, yaw: float) -> State:

@@ -67,7 +67,7 @@ def _increments(t: Floats, w_b: Floats, first: int, last: int,
 
 def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """
-    Return the excess of a cubic over its chord in each inner interval: (3, m - 2).
+    Return the height of the chord over its cubic in each inner interval: (3, m - 2).
 
     bow : chord minus cubic in the middle.
     twist : rise of the chord minus slope of the cubic in the middle times the interval.

@@ -94,7 +94,7 @@ class LocatedFixes:
 
 
 def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
-    """Return the fixes in a frame n at their median position, and the approximate scale."""
+    """Return the fixes in n, from ``median_origin``, and the approximate scale."""
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):
         return LocatedFixes(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)

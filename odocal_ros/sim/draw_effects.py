@@ -1,7 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Effects of a drawn vehicle, after the tables of docs/zoo.md: IMU, wheels, body, receiver."""
+"""
+Effects of a drawn vehicle, after the tables of docs/zoo.md: IMU, wheels, body, receiver.
+
+Each function draws one effect. ``Drawn`` holds figures of the real vehicle (`sim/real.py`) and
+options of the simulation (`sim/options.py`). ``vehicle.size`` and ``vehicle.row`` are one figure
+and a pair of figures from the tables, by the class of the vehicle; ``vehicle.alone`` is True if
+the effect is requested alone and must be present.
+"""
 
 import math
 
@@ -14,7 +21,8 @@ from odocal_ros.sim.zoo import DEG, Drawn, flat, G, KMH, lognormal, MG, Vehicle
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Draw scale and misalignment of each axis, and a rotation between gyro and accelerometer."""
     x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
-    rotation = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it for each triad
+    # the rotation, of size 'between', is split: half of its variance to each triad
+    rotation = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     figures = {}
     for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
         M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * rotation / math.sqrt(2)
