@@ -105,7 +105,7 @@ def test_two_counters_on_one_topic_are_a_named_cause(made, leg):
     both = join([leg.odometer, two.odometer])
     order = np.argsort(both.stamp_ns, kind='stable')
     result, said = run(replace(leg, odometer=take(both, order)), made)
-    assert 'two publishers on one topic' in said[Code.COUNTER_ROLLOVER]
+    assert 'two publishers on the topic' in said[Code.COUNTER_ROLLOVER]
     assert rejecting(result)
 
 

@@ -1,4 +1,5 @@
-# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The IMU rows of a stream that dead reckoning still needs, without spikes and isolated outliers.

@@ -1,4 +1,5 @@
-# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """fleet.html: the results of a fleet as one page that needs no network."""
 

@@ -1,4 +1,5 @@
-# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Selection of usable fixes and GNSS velocities, and the uncertainty of each fix.

@@ -1,4 +1,5 @@
-# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Orientation of an IMU in the vehicle by its accelerations, and checks of its units and axes.

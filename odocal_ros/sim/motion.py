@@ -1,4 +1,5 @@
-# Copyright 2026 odocal_ros maintainers SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """
 True motion of a vehicle on the WGS 84 ellipsoid, from a speed and a turn-rate profile.
