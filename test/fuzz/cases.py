@@ -236,11 +236,13 @@ def judged(place, before, code, seconds, memory, said, truth) -> str:
     """Return what is wrong with an outcome, '' if nothing is."""
     # what a journal is read with is told before
     lines = [line for line in said.strip().splitlines() if ' is a journal: ' not in line]
-    lists_topics = any(line.startswith('  ') for line in lines)     # on lines of their own
+    # topics, and clauses that end in a semicolon, have lines of their own
+    sentences = [line for previous, line in zip(['', *lines], lines, strict=False)
+                 if not line.startswith('  /') and not previous.endswith(';')]
     if code not in (0, 1, 2):
         return f'exit {code}'
-    if code == 2 and len(lines) != 1 and not lists_topics:
-        return f'{len(lines)} lines for exit 2'
+    if code == 2 and len(sentences) != 1:
+        return f'{len(sentences)} sentences for exit 2'
     if 'Warning' in said or 'Traceback' in said or 'broke' in said or 'out of memory' in said:
         return 'more than a sentence on stderr'
     if seconds > SECONDS:

@@ -77,7 +77,7 @@ def test_poses_give_the_values_of_fixes(options, monkeypatch):
         a, b = by_fix[name], by_pose[name]
         # estimates of nested data differ by a variance that is the difference of theirs
         lost = np.sqrt(abs(b.sigma**2 - a.sigma**2))
-        assert abs(b.value - a.value) < limit * a.sigma + lost, name
+        assert abs(b.value - a.value) < np.hypot(limit * a.sigma, lost), name
         assert b.sigma == pytest.approx(a.sigma, rel=0.1)
     assert off(by_pose, made, *NAMES) < 3
 

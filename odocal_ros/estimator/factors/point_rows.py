@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Factors of sensors that measure at single times, such as fixes.
+Factors of sensors that measure at single times, such as fixes; ``PointRows`` is the base class.
 
-``PointRows`` is their base class. A row at a time between two keyframes depends on the keyframe
-before it, on the constants and, for fixes, on the time-correlated error of the keyframe after it.
-Outliers are down-weighted: docs/method.md (S25).
+A row at a time between two keyframes depends on the keyframe before it, on the constants and, for
+fixes, on the time-correlated error of the keyframe after it. Outliers have less weight, (S25).
 
 ``ExternalRows`` is the base class of other sensors, with a sigma for each measured component. A
 new sensor is one subclass of it, listed in ``equations.FACTORS``.

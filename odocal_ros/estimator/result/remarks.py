@@ -33,14 +33,13 @@ IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswi
     ('gyro_scale', 'accelerometer_scale')))
 AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
 IMU_ERROR_LIMIT = 4.0       # statistical: sigmas of the grade, for scales and axes
-# sigmas of unmodelled errors of scale, yaw and pitch, F of (S31): relative, rad, rad. Physical: a
-# body on springs within a second (docs/conventions.md)
+# F of (S31), relative, rad, rad: physical, a body on springs in a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                       'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                       'Use wheel pulses, or a wheel that is not driven.')
-# variance factor of the random walk of a bias above which it has a step, judgement: reported steps
-# have 480 and more, 60 drives without steps at most 7.3 (docs/decisions/0016)
+# judgement: variance factor of a bias walk above which it has a step. Steps have 480 and more, 60
+# drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
 # relative or rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
