@@ -24,7 +24,7 @@ from odocal_ros.calib.result import Estimate, Source
 from odocal_ros.data.arrays import by_row, by_step, Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.geodesy import A
+from odocal_ros.nav.geodesy import SEMI_MAJOR_AXIS
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
 # m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: 6.4 % of
@@ -162,7 +162,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'odometer_delay': (_odometer_delay_effect(f, t, D, q_nb, start, end)
                            * odometer_time_sigma)[:, None],
         'height': (D[-1] * (np.sqrt(height / 2) if start.height_known and end.height_known
-                            else HEIGHT_UNKNOWN) / A)[:, None],
+                            else HEIGHT_UNKNOWN) / SEMI_MAJOR_AXIS)[:, None],
         'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)

@@ -30,7 +30,15 @@ from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.levels import LevelInformation, LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import LN_K, PITCH, Priors, State, WITH_SLOW, WITHOUT_SLOW, YAW
+from odocal_ros.estimator.state import (
+    LN_K,
+    PITCH,
+    Priors,
+    SIZE_WITH_SLOW,
+    SIZE_WITHOUT_SLOW,
+    State,
+    YAW,
+)
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
@@ -79,7 +87,7 @@ class Weighted:
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
-        self.n = WITH_SLOW if levels.correlation_time else WITHOUT_SLOW
+        self.n = SIZE_WITH_SLOW if levels.correlation_time else SIZE_WITHOUT_SLOW
         self.m = equations.constants_in_use
         self.factors = {name: factor.weighted_copy(levels, self.m)
                         for name, factor in equations.factors.items() if factor.is_used(levels)}

@@ -124,7 +124,7 @@ def long_span_factors(fixes: Fixes, levels: Levels,
         b = end[a]
         grown = float((1 - np.exp(-(t[b] - t[a]) / time)).mean())
         spans = (t[-1] - t[0]) / span
-        for (name, columns), white in zip(SLOW_COLUMNS.items(), Fixes.levels_of, strict=True):
+        for (name, columns), white in zip(SLOW_COLUMNS.items(), Fixes.level_columns, strict=True):
             power, noise = (levels[level] * components[level][0] / max(components[level][1], 1e-9)
                             for level in (name, white))
             expected = 2 * noise * float(stated[a, columns].mean()) + power * time * grown

@@ -43,7 +43,12 @@ OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Sums over K intervals, in the axes of b at their starts; g, a : constants GYRO, ACCEL."""
+    """
+    Sums over K intervals, in the axes of b at their starts, and their derivatives.
+
+    R, dv, dp and S are those of docs/method.md (S4); g, a : constants GYRO, ACCEL, M_g and M_a of
+    (S3). A derivative by an accelerometer error has the name A or F, that of dp a double letter.
+    """
 
     T: Floats        # (K,) s, length
     R: Floats        # (K, 3, 3) attitude at the end

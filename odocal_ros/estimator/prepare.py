@@ -101,7 +101,7 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
         unshared_constants, total_turn(leg, imu), config.gnss.correlation_time,
         mean_rates_at(leg.t_imu, leg.w_b, t), imu.angle_covariances(), drift_time(leg, t),
         # poses can be from motion capture; fixes and points are less accurate
-        MIN_NOISE.fix if not leg.origin.local or config.reference.points else MIN_NOISE.pose)
+        MIN_NOISE.fix if not leg.origin.is_local or config.reference.points else MIN_NOISE.pose)
     for kind in FACTORS:
         if kind.is_present(problem):
             initial, minimum = kind.initial_levels(problem)
@@ -158,8 +158,9 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     # at least the biases of the grade, also for a calibrated IMU: otherwise a bias would be
     # estimated as an axis error, and change the yaw of a tilted IMU
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
-    if leg.origin.local:     # without latitude or north, the unknown Earth rate is a bias too
-        gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local.sigma_n)))
+    # without latitude or north, the unknown Earth rate is a bias too
+    if leg.origin.local_earth_rate:
+        gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local_earth_rate.sigma_n)))
     # gravity times the scale error is a bias too
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)

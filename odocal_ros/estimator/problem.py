@@ -42,7 +42,7 @@ class Problem:
     angle_covariances: np.ndarray    # (K, 3, 3) rad^2, scatter of the attitude in an interval
     drift_time: np.ndarray   # (K,) s, time in which the correlated fix error changes
     min_fix_sigma: float     # m, of the white and of the correlated fix error each
-    # variances by the name of their level
+    # by name: variances, or factors on stated variances (``PointRows``)
     initial_levels: Levels = field(default_factory=lambda: Levels({}))
     min_levels: dict[str, float] = field(default_factory=dict)
     vibrating_levels: dict[str, float] = field(default_factory=dict)  # initial, of a vibrating IMU

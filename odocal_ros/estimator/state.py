@@ -27,7 +27,8 @@ BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
     BLOCK.values(), accumulate(BLOCK.values()), strict=True))
 E = TRAVEL.start
-WITHOUT_SLOW, WITH_SLOW = SLOW.start, SLOW.stop     # sizes of a block, as the fixes are modelled
+# columns of a block: the slow fix error is an unknown if gnss.correlation_time is not 0
+SIZE_WITHOUT_SLOW, SIZE_WITH_SLOW = SLOW.start, SLOW.stop
 
 # Errors of the IMU's axes: (axis with the error, signal that it contains), (S3). Signals of the
 # gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
@@ -135,7 +136,7 @@ VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.s
 # heights by air pressure, (S19a): zero, m; weather, m/s; dynamic pressure, m per (m/s)^2; air
 # temperature, relative
 PRESSURE = constants_from('pressure_offset', 'pressure_scale')
-M = len(CONSTANTS)
+M = len(CONSTANTS)      # number of constants c, (S2): (M,) in the shapes of arrays
 NO_ERROR = 1e-12    # definition: prior sigma of a constant that is fixed, in any unit
 
 
@@ -197,7 +198,7 @@ class State:
 
     def updated(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state after a step of every unknown: (N, n), (M,)."""
-        slow = self.slow_n + step[:, SLOW] if step.shape[1] > WITHOUT_SLOW else self.slow_n
+        slow = self.slow_n + step[:, SLOW] if step.shape[1] > SIZE_WITHOUT_SLOW else self.slow_n
         return replace(
             self, p_n=self.p_n + step[:, P], v_n=self.v_n + step[:, V],
             C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],

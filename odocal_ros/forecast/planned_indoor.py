@@ -253,7 +253,7 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
         covariance_n=leg.covariance_n[used],
         wheels=tuple(replace(leg.travel, s=leg.travel.s + sign * half_difference, name=side)
                      for sign, side in zip((-1, 1), settings.SIDES, strict=True)),
-        origin=replace(leg.origin, local=rate_without_north(leg.origin.latitude)))
+        origin=replace(leg.origin, local_earth_rate=rate_without_north(leg.origin.latitude)))
     # the positions of a rest share one error
     ideal = replace(ideal, leg=leg, fixes_in_one=1.0 if robot.at_rests else ideal.fixes_in_one)
     problem = make_problem(leg, config, ideal.imu)

@@ -191,7 +191,7 @@ def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,
     by_yaw = level_rate * np.array(
         [min(yaw_sigma, 1.0), min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0])
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
-    unknown = np.array(origin.local.sigma_n) if origin.local else 0.0
+    unknown = np.array(origin.local_earth_rate.sigma_n) if origin.local_earth_rate else 0.0
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2 + unknown**2)
     measured = C_nb @ level.mean_rate_b - origin.earth_rate_n
     # sigmas of noise and turn-on bias: with a larger rate the grade is wrong

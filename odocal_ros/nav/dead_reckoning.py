@@ -33,18 +33,24 @@ class Origin:
     """
     Origin of n, a geodetic position.
 
-    local : the Earth rate of a local frame, whose y axis does not point to north; None: it does.
+    local_earth_rate : of a local frame, whose y axis does not point to north; None: it does.
     """
 
     latitude: float     # rad
     longitude: float    # rad
     height: float       # m, ellipsoidal
-    local: geodesy.PartlyKnownRate | None = None
+    local_earth_rate: geodesy.PartlyKnownRate | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Return True if north is unknown: y of n is that of a local frame."""
+        return self.local_earth_rate is not None
 
     @property
     def earth_rate_n(self) -> Floats:
         """Return the known part of the Earth's turn rate in n, rad/s: (3,)."""
-        return np.array(self.local.rate_n) if self.local else geodesy.earth_rate_n(self.latitude)
+        return geodesy.earth_rate_n(self.latitude) if self.local_earth_rate is None else (
+            np.array(self.local_earth_rate.rate_n))
 
     def to_n(self, geodetic: Floats) -> Floats:
         """Return positions in n, m, from (..., 3) latitude, longitude (rad), height (m)."""

@@ -22,7 +22,7 @@ from odocal_ros.nav.rotations import arctan2
 from odocal_ros.settings.config import ProjectionConfig
 
 # physical: all of WGS 84 (NIMA TR8350.2)
-A = 6378137.0                  # m, semi-major axis
+SEMI_MAJOR_AXIS = 6378137.0    # m
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
 OMEGA = 7.292115e-5            # rad/s, Earth rate
@@ -45,7 +45,7 @@ ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
     """Return meridian and normal radius of curvature, m, at a latitude, rad: (...)."""
     w2 = 1 - E2 * np.sin(latitude) ** 2
-    normal = A / np.sqrt(w2)
+    normal = SEMI_MAJOR_AXIS / np.sqrt(w2)
     return normal * (1 - E2) / w2, normal
 
 
@@ -57,7 +57,8 @@ def gravity(latitude: FloatOrFloats, height: FloatOrFloats) -> FloatOrFloats:
     gamma_0 = gamma_e * (1 + k_gamma * s2) / np.sqrt(1 - E2 * s2)
     m_gamma = 0.00344978650684    # omega^2 a^2 b / GM
     gamma: FloatOrFloats = gamma_0 * (
-        1 - 2 / A * (1 + F + m_gamma - 2 * F * s2) * height + 3 / A**2 * height**2)
+        1 - 2 / SEMI_MAJOR_AXIS * (1 + F + m_gamma - 2 * F * s2) * height
+        + 3 / SEMI_MAJOR_AXIS**2 * height**2)
     return gamma
 
 
@@ -104,15 +105,15 @@ def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayL
 def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Return latitude, longitude, rad, height, m, of (..., 3) m (Bowring; within 1e-9 m)."""
     x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
-    b = A * (1 - F)
+    b = SEMI_MAJOR_AXIS * (1 - F)
     p = np.hypot(x, y)
-    beta = arctan2(A * z, b * p)
+    beta = arctan2(SEMI_MAJOR_AXIS * z, b * p)
     for _ in range(3):
         latitude = arctan2(z + E2 / (1 - E2) * b * np.sin(beta) ** 3,
-                           p - E2 * A * np.cos(beta) ** 3)
+                           p - E2 * SEMI_MAJOR_AXIS * np.cos(beta) ** 3)
         beta = arctan2((1 - F) * np.sin(latitude), np.cos(latitude))
     s, c = np.sin(latitude), np.cos(latitude)
-    height = p * c + z * s - A * np.sqrt(1 - E2 * s * s)
+    height = p * c + z * s - SEMI_MAJOR_AXIS * np.sqrt(1 - E2 * s * s)
     return latitude, arctan2(y, x), height
 
 

@@ -148,7 +148,7 @@ class PreparedLeg(LocatedFixes):
 
     def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
         """Return the reference point at a mark, () if the path does not start or end there."""
-        if not name or self.origin.local:      # surveyed points are geodetic
+        if not name or self.origin.is_local:      # surveyed points are geodetic
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
@@ -213,7 +213,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     fields: dict[str, Any] = {
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}
-    if not prepared.origin.local:       # else the position on the Earth is unknown
+    if not prepared.origin.is_local:       # else the position on the Earth is unknown
         fields |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
                               prepared.origin.height)}
     pin, between, path_length, found = _compared_section(prepared, after, start)

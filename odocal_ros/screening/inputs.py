@@ -101,7 +101,7 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     origin = median_origin(inputs.t_fix, inputs.geodetic)
     if inputs.local:
         latitude = np.deg2rad(config.reference.latitude_deg)
-        origin = replace(origin, local=rate_without_north(float(latitude)))
+        origin = replace(origin, local_earth_rate=rate_without_north(float(latitude)))
     geodetic = inputs.geodetic.copy()
     lost = np.isnan(geodetic[:, 2])
     geodetic[lost, 2] = origin.height

@@ -19,8 +19,8 @@ from odocal_ros.estimator.state import (
     M,
     ODO_DELAY,
     PITCH,
+    SIZE_WITHOUT_SLOW,
     State,
-    WITHOUT_SLOW,
     YAW,
 )
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
@@ -129,4 +129,4 @@ def along_axis(problem, state, axis, constants):
     part = Equations(problem, state).factors['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     return ((C_vn @ part.raw[:, D, None])[:, axis, 0],
-            (C_vn @ part.jacobians(WITHOUT_SLOW)[2][:, D, constants])[:, axis])
+            (C_vn @ part.jacobians(SIZE_WITHOUT_SLOW)[2][:, D, constants])[:, axis])

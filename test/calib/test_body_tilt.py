@@ -32,7 +32,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     c = state.constants.copy()
     c[layout.BODY_TILT.start] = centre
     there, here = (
-        Equations(problem, one).factors['motion'].jacobians(layout.WITHOUT_SLOW)[2]
+        Equations(problem, one).factors['motion'].jacobians(layout.SIZE_WITHOUT_SLOW)[2]
         for one in (replace(state, constants=c), state))
     np.testing.assert_allclose(there[:, D, layout.LN_K], here[:, D, layout.LN_K], atol=1e-9)
 

@@ -25,7 +25,7 @@ from odocal_ros.estimator.factors.pseudo_observations import (
     STILL_TURN,
 )
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.state import E, IMPERFECTIONS, M, SLOW, WITH_SLOW, WITHOUT_SLOW
+from odocal_ros.estimator.state import E, IMPERFECTIONS, M, SIZE_WITH_SLOW, SIZE_WITHOUT_SLOW, SLOW
 
 pytestmark = pytest.mark.core
 N, STATES, BORDER = 6, 4, 3
@@ -41,7 +41,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     state = truth(drive, config, leg)
     parts = Equations(problem, state, fitted=True).factors
     motion, fixes = parts['motion'], parts['fixes']
-    n, N = (WITH_SLOW if correlation_time else WITHOUT_SLOW), len(state.t)
+    n, N = (SIZE_WITH_SLOW if correlation_time else SIZE_WITHOUT_SLOW), len(state.t)
     size = N * n + M
     rows = []
 
@@ -74,7 +74,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         u = root @ fixes.raw[i]
         weight = np.array([min(1.0, 3 / np.hypot(u[0], u[1]))] * 2 + [min(1.0, 3 / abs(u[2]))])
         end = np.zeros((3, n))
-        if n == WITH_SLOW:
+        if n == SIZE_WITH_SLOW:
             end[:, SLOW] = -np.eye(3) * fixes.share[i]
         add(np.concatenate([J[i], end, Jc[i]], axis=1), (block(k), block(k + 1), border),
             np.diag(weight) @ root)
@@ -90,7 +90,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         if problem.at_rest[k] and problem.at_rest[k + 1]:
             add(np.concatenate([-single[6:9], single[6:9]], axis=1), (block(k), block(k + 1)),
                 np.diag(1 / (STILL_TURN * np.sqrt(T))))
-        if n == WITH_SLOW:
+        if n == SIZE_WITH_SLOW:
             decay = np.exp(-T / correlation_time)
             power = correlation_time / 2 * np.array([levels['slow']] * 2 + [levels['slow_up']])
             add(np.concatenate([-decay * single[SLOW], single[SLOW]], axis=1),
@@ -98,7 +98,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     first = np.concatenate([*(np.broadcast_to(sigma, 3) for _, sigma in START_SIGMAS.values()),
                             problem.priors.gyro_bias_sigma, problem.priors.accel_bias_sigma])
     add(single[:15], (block(0),), np.diag(1 / first))
-    if n == WITH_SLOW:
+    if n == SIZE_WITH_SLOW:
         add(single[SLOW], (block(0),), np.diag(1 / np.sqrt(power)))
     prior = problem.priors.sigma.copy()
     prior[IMPERFECTIONS] *= np.sqrt(SIZE)         # the first sizes

@@ -17,7 +17,7 @@ from odocal_ros.estimator.factors.motion import Motion
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.state import M, PHI, WITH_SLOW
+from odocal_ros.estimator.state import M, PHI, SIZE_WITH_SLOW
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -41,7 +41,7 @@ def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
     _, state = perfect
     step = np.zeros(layout.M)
     step[layout.PITCH] = turned
-    moved = state.updated(np.zeros((len(state.t), layout.WITHOUT_SLOW)), step)
+    moved = state.updated(np.zeros((len(state.t), layout.SIZE_WITHOUT_SLOW)), step)
     assert abs(moved.constants[layout.PITCH]) <= np.pi / 2
     np.testing.assert_allclose(moved.forward, forward_b(
         state.constants[layout.YAW], state.constants[layout.PITCH] + turned), atol=1e-12)
@@ -119,7 +119,7 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     motion = Equations(problem, state).factors['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
     by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(
-        layout.WITHOUT_SLOW)[2][:, 15:18, layout.BODY_LEAN]
+        layout.SIZE_WITHOUT_SLOW)[2][:, 15:18, layout.BODY_LEAN]
     sizes = np.linalg.norm(by, axis=1).max(axis=0)
     assert (sizes > 0.1).all()
     # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
@@ -177,7 +177,7 @@ def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     _, problem, state = at_truth(scenario='town')
     c = np.zeros(layout.M)
     c[layout.BODY_LEAN.start] = 0.1
-    unmoved = np.zeros((len(state.t), layout.WITHOUT_SLOW))
+    unmoved = np.zeros((len(state.t), layout.SIZE_WITHOUT_SLOW))
     level, leaning = (Equations(problem, state.updated(unmoved, step)).factors['motion'].motion
                       for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
@@ -216,7 +216,7 @@ def test_a_turn_at_rest_has_the_variance_that_makes_it_an_outlier_of_three_sigma
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     k = int(np.flatnonzero(problem.at_rest[:-1] & problem.at_rest[1:])[3])
-    step, tilt = np.zeros((len(state.t), WITH_SLOW)), 0.01
+    step, tilt = np.zeros((len(state.t), SIZE_WITH_SLOW)), 0.01
     step[k + 1:, PHI.start] = tilt
     part = Equations(problem, state.updated(step, np.zeros(M))).factors['standstills']
     T = float(np.diff(state.t)[k])

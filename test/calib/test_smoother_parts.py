@@ -24,7 +24,7 @@ from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow
-N = layout.WITH_SLOW
+N = layout.SIZE_WITH_SLOW
 # clocks, and the delays they grow to
 CLOCKS = {layout.GNSS_CLOCK: layout.GNSS_DELAY, layout.ODO_CLOCK: layout.ODO_DELAY}
 END = 60.0      # s
@@ -104,7 +104,7 @@ def part_at(problem, state, name):
 def test_derivatives_are_those_of_finite_differences(moved, stepping, name, local, monkeypatch):
     problem, state = stepping if name == 'steps' else moved
     if local:
-        origin = replace(problem.leg.origin, local=rate_without_north(0.7))
+        origin = replace(problem.leg.origin, local_earth_rate=rate_without_north(0.7))
         problem = replace(problem, leg=replace(problem.leg, origin=origin))
     stated = 1 + np.sin(problem.leg.t_fix)[:, None] * [0.3, 0.5, 0.7]     # m, sigmas that change
     problem = replace(problem, leg=replace(problem.leg,

@@ -40,8 +40,8 @@ def test_there_and_back_poles_and_date_line_included():
     lat2, lon2, h2 = geodesy.geodetic_from_ecef(r_e)
     assert_allclose(geodesy.ecef_from_geodetic(lat2, lon2, h2), r_e, rtol=0, atol=METRES)
     assert_allclose(h2, h, rtol=0, atol=METRES)
-    assert_allclose(lat2, lat, rtol=0, atol=METRES / geodesy.A)
-    b = geodesy.A * (1 - geodesy.F)
+    assert_allclose(lat2, lat, rtol=0, atol=METRES / geodesy.SEMI_MAJOR_AXIS)
+    b = geodesy.SEMI_MAJOR_AXIS * (1 - geodesy.F)
     lat, lon, h = geodesy.geodetic_from_ecef(np.array([0.0, 0.0, -b - 7.0]))
     assert lat == -np.pi / 2
     assert np.isfinite(lon)
@@ -62,9 +62,10 @@ def test_axes_of_enu():
 
 
 def test_radii_at_equator_and_pole_and_along_the_meridian_quadrant():
-    b = geodesy.A * (1 - geodesy.F)
-    assert_allclose(geodesy.radii(0.0), [b**2 / geodesy.A, geodesy.A], rtol=1e-14)
-    assert_allclose(geodesy.radii(np.pi / 2), [geodesy.A**2 / b] * 2, rtol=1e-14)
+    a = geodesy.SEMI_MAJOR_AXIS
+    b = a * (1 - geodesy.F)
+    assert_allclose(geodesy.radii(0.0), [b**2 / a, a], rtol=1e-14)
+    assert_allclose(geodesy.radii(np.pi / 2), [a**2 / b] * 2, rtol=1e-14)
     x, weight = np.polynomial.legendre.leggauss(20)
     lat = (x + 1) * np.pi / 4
     assert weight @ geodesy.radii(lat)[0] * np.pi / 4 == pytest.approx(10_001_965.729, abs=5e-4)
@@ -89,9 +90,9 @@ def test_gravity_gradient_is_that_of_bruns(latitude):
 
 def test_gravity_far_up_falls_with_the_square():
     """At 20 km, minus the centrifugal part, as (R / (R + h))^2 to the third order left out."""
-    h, omega2 = 20e3, geodesy.OMEGA**2
-    bare = geodesy.gravity(0.0, 0.0) + omega2 * geodesy.A
-    there = bare * (geodesy.A / (geodesy.A + h))**2 - omega2 * (geodesy.A + h)
+    h, omega2, a = 20e3, geodesy.OMEGA**2, geodesy.SEMI_MAJOR_AXIS
+    bare = geodesy.gravity(0.0, 0.0) + omega2 * a
+    there = bare * (a / (a + h))**2 - omega2 * (a + h)
     # third order: 4 (h / a)^3 = 1.2e-7; the quadrupole's faster fall: 2 * 1.5 J2 * 2 h / a = 2e-5
     assert geodesy.gravity(0.0, h) == pytest.approx(there, rel=2.5e-5)
     assert geodesy.gravity(0.0, h) == pytest.approx(9.780 - 0.0613, abs=2e-3)

@@ -121,7 +121,7 @@ def test_the_leg_is_placed_in_the_frame_as_sent(made, latitude_deg):
     inputs, _ = screen(posed(made, latitude_deg), config)
     there = locate_fixes(inputs, config)
     assert inputs.local
-    assert there.origin.local == rate_without_north(math.radians(latitude_deg))
+    assert there.origin.local_earth_rate == rate_without_north(math.radians(latitude_deg))
     sent = made.positions()[:len(there.fixes_n)]
     off = there.fixes_n - there.fixes_n[0] - (sent - sent[0])
     assert np.abs(off).max() < 0.2       # m: frames at places 300 m apart differ by 5e-5 rad
@@ -187,7 +187,7 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
     grade = grade_of(config.imu)
     np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias_sigma,
                                math.hypot(1e-6, OMEGA))
-    north = replace(leg, origin=replace(there.origin, local=None))
+    north = replace(leg, origin=replace(there.origin, local_earth_rate=None))
     np.testing.assert_allclose(_priors(config, grade, north).gyro_bias_sigma, 1e-6)
 
 

@@ -3,7 +3,6 @@
 
 """The smoother as a member of the pipeline; limits made for cars do not refuse short runs."""
 
-from dataclasses import replace
 
 import drives
 from drives import ANGLES, drive, everything_said, off, settings, spoilt, TOWN
@@ -256,7 +255,7 @@ def test_limits_are_those_of_the_frame_the_smaller_of_both():
 
 def origin(local):
     """Return an origin on the equator, of a local frame or not."""
-    return replace(Origin(0.0, 0.0, 0.0), local=rate_without_north(0.7) if local else None)
+    return Origin(0.0, 0.0, 0.0, rate_without_north(0.7) if local else None)
 
 
 def room(rng):

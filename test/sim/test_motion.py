@@ -7,7 +7,14 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.geodesy import A, C_en, E2, ecef_from_geodetic, gravity, OMEGA
+from odocal_ros.nav.geodesy import (
+    C_en,
+    E2,
+    ecef_from_geodetic,
+    gravity,
+    OMEGA,
+    SEMI_MAJOR_AXIS,
+)
 from odocal_ros.nav.rotations import exp_so3, skew
 from odocal_ros.sim import motion as true_motion
 from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
@@ -82,7 +89,7 @@ def test_the_papers_drive_is_11200_m_of_loxodrome():
         e, s = np.sqrt(E2), np.sin(latitude)
         return np.arctanh(s) - e * np.arctanh(e * s)
     east = (end.longitude[0] - 0.2) - (isometric(end.latitude[0]) - isometric(np.radians(40)))
-    assert east * A == pytest.approx(0, abs=2e-8)
+    assert east * SEMI_MAJOR_AXIS == pytest.approx(0, abs=2e-8)
 
 
 def integrate(motion, rate, arm):

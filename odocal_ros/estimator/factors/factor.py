@@ -22,7 +22,7 @@ from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import Priors, State, WITH_SLOW, WITHOUT_SLOW
+from odocal_ros.estimator.state import Priors, SIZE_WITH_SLOW, SIZE_WITHOUT_SLOW, State
 
 # levels of the IMU: white noises, and random walks of its biases
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
@@ -86,7 +86,7 @@ class Factor:
         """Return a copy with weighted rows and the first m constants."""
         new = copy(self)
         new.levels, new.m = levels, m
-        new.n = WITH_SLOW if levels.correlation_time else WITHOUT_SLOW
+        new.n = SIZE_WITH_SLOW if levels.correlation_time else SIZE_WITHOUT_SLOW
         new.weigh(levels)
         return new
 

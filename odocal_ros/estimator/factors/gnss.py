@@ -41,7 +41,7 @@ class Fixes(PointRows):
     """Rows of the fixes: measured minus predicted position of the antenna, ENU, m."""
 
     name, source = 'fixes', 'fixes'
-    levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
+    level_columns = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
     share: Floats
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
@@ -101,7 +101,7 @@ class Fixes(PointRows):
         by_gyro = -self.C @ self.points.dp_by_gyro - skew(
             self.arm_n) @ self.C @ self.points.R_by_gyro
         J[:, :, layout.BG], c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
-        if n > layout.WITHOUT_SLOW:
+        if n > layout.SIZE_WITHOUT_SLOW:
             J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
         c[:, :, layout.YAW] = -self.C_t @ (by_yaw @ self.arm_v)
@@ -121,7 +121,7 @@ class Fixes(PointRows):
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         minimum = (problem.min_fix_sigma / problem.fix_sigma)**2
-        return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, minimum)
+        return dict.fromkeys(cls.level_columns, 1.0), dict.fromkeys(cls.level_columns, minimum)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -172,7 +172,7 @@ class VelocityRows(ExternalRows):
     """Rows of a GNSS velocity: measured minus predicted, east and north, m/s."""
 
     name, source = 'velocity', 'fix_velocity'
-    levels_of = {'velocity': slice(0, 2)}
+    level_columns = {'velocity': slice(0, 2)}
     constants = layout.VELOCITY
 
     @classmethod
@@ -215,7 +215,7 @@ class VelocityRows(ExternalRows):
         factor = 1 + state.constants[layout.VELOCITY_SCALE]
         m, rate = len(k), point.intervals.mean_rate[k]
         measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
-        J, c = np.zeros((m, 3, layout.WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
+        J, c = np.zeros((m, 3, layout.SIZE_WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
         J[:, :, layout.V] = -np.eye(3)
         J[:, :, layout.PHI] = skew(dv + swing)
         J[:, :, layout.BA] = C @ points.A

@@ -19,7 +19,7 @@ from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
 from odocal_ros.estimator.leg import convergence, ExternalSamples, thinned
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BG, GYRO, HEADING, M, PHI, WITHOUT_SLOW
+from odocal_ros.estimator.state import BG, GYRO, HEADING, M, PHI, SIZE_WITHOUT_SLOW
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import arctan2, matrix_from_quat, transpose, wrap, yaw_from_heading
@@ -44,7 +44,7 @@ class HeadingRows(ExternalRows):
     """Rows of a heading: measured minus predicted yaw, rad."""
 
     name, source = 'heading', 'heading_noise'
-    levels_of = {'heading': slice(0, 1)}
+    level_columns = {'heading': slice(0, 1)}
     constants = slice(HEADING, HEADING + 1)
 
     @classmethod
@@ -86,7 +86,7 @@ class HeadingRows(ExternalRows):
         # derivative of the yaw by a rotation vector in n
         yaw_by_rotation = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
                                     np.ones(len(k))], -1)
-        J, c = np.zeros((len(k), 1, WITHOUT_SLOW)), np.zeros((len(k), 1, M))
+        J, c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         J[:, 0, PHI] = -yaw_by_rotation
         by_gyro = np.einsum('ki,kij->kj', yaw_by_rotation, C @ points.R_by_gyro)
         J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]

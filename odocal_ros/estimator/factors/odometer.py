@@ -136,7 +136,7 @@ class SpeedSteps(PointRows):
     """Rows at speed steps: K times the odometer speed minus the forward speed at the odometer."""
 
     name, source = 'steps', 'speed_steps'
-    levels_of = {'steps': slice(0, 1)}
+    level_columns = {'steps': slice(0, 1)}
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points[self.name]

@@ -25,7 +25,7 @@ from odocal_ros.estimator.leg import ExternalSamples
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import CONSTANTS, SLOW, State, WITH_SLOW, WITHOUT_SLOW
+from odocal_ros.estimator.state import CONSTANTS, SIZE_WITH_SLOW, SIZE_WITHOUT_SLOW, SLOW, State
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 from odocal_ros.screening.inputs import Inputs
@@ -47,7 +47,8 @@ class PointRows(Factor):
     keyframe after, or None.
     """
 
-    levels_of: ClassVar[dict[str, slice]]     # components of each level, a factor on variances
+    # columns of the residuals that each level applies to, as a factor on their stated variances
+    level_columns: ClassVar[dict[str, slice]]
     source: ClassVar[str]                     # name in the budget
     k: Ints                         # (m,) the keyframes before
     raw: Floats                     # (m, d) residuals
@@ -78,7 +79,7 @@ class PointRows(Factor):
         """Compute r and J_end with the weights of outliers."""
         white = self.whiten(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
-        for level, columns in self.levels_of.items():
+        for level, columns in self.level_columns.items():
             factor[columns] /= np.sqrt(levels[level])
         white = white * factor
         self.weight = self._weights(white)
@@ -86,7 +87,7 @@ class PointRows(Factor):
         self.r = root_weight * white
         self._root = (root_weight * factor)[:, :, None]
         self.J_end = None
-        if self.n == WITH_SLOW and self.share is not None:
+        if self.n == SIZE_WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
             self.J_end = -self.whiten(one) * self._root * self.share[:, None, None]
         logs = np.log(np.tile(factor, (len(white), 1)))
@@ -105,7 +106,7 @@ class PointRows(Factor):
 
     def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
         """Yield the components of each level, and the norms of their residuals, in sigmas."""
-        for columns in self.levels_of.values():
+        for columns in self.level_columns.values():
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
 
     def _weights(self, white: Floats) -> Floats:
@@ -178,14 +179,14 @@ class PointRows(Factor):
         r2 = np.where(known, self.r, 0.0)**2 * self.rows_per_independent
         return {level: (float(r2[:, columns].sum()),
                         float(known[:, columns].sum() - fitted[:, :, columns].sum()))
-                for level, columns in self.levels_of.items()}
+                for level, columns in self.level_columns.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
         if len(self.k) < LEAST_ROWS:
             return
-        columns = out.columns(self.levels_of)
+        columns = out.columns(self.level_columns)
         q = np.zeros((*self.r.shape, len(columns)))
-        for i, components in enumerate(self.levels_of.values()):
+        for i, components in enumerate(self.level_columns.values()):
             q[:, components, i] = self.r[:, components]
         for present, gather in self._intervals():
             q_i = gather(q)
@@ -239,7 +240,7 @@ class Rows:
     """The rows of an external sensor at one state."""
 
     raw: np.ndarray             # (m, d) residuals
-    J: np.ndarray               # (m, d, WITHOUT_SLOW) derivatives by the keyframes before
+    J: np.ndarray               # (m, d, SIZE_WITHOUT_SLOW) derivatives by the keyframes before
     J_constants: np.ndarray     # (m, d, M) derivatives by the constants
     inverse_sigma: np.ndarray   # (m, d)
 
@@ -284,7 +285,7 @@ class ExternalRows(PointRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        return dict.fromkeys(cls.levels_of, 1.0), cls.min_levels(problem.external[cls.name])
+        return dict.fromkeys(cls.level_columns, 1.0), cls.min_levels(problem.external[cls.name])
 
     @staticmethod
     def min_levels(samples: Any) -> dict[str, float]:
@@ -292,7 +293,7 @@ class ExternalRows(PointRows):
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        columns = 0, n - WITHOUT_SLOW
+        columns = 0, n - SIZE_WITHOUT_SLOW
         return np.pad(self._rows.J, ((0, 0), (0, 0), columns)), self._rows.J_constants
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:

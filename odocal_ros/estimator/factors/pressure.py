@@ -18,7 +18,7 @@ from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
 from odocal_ros.estimator.leg import ExternalSamples
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BA, BG, GYRO, M, P, PHI, PRESSURE, V, WITHOUT_SLOW
+from odocal_ros.estimator.state import BA, BG, GYRO, M, P, PHI, PRESSURE, SIZE_WITHOUT_SLOW, V
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.rotations import rotate, skew
 from odocal_ros.screening.inputs import Inputs
@@ -46,7 +46,7 @@ class PressureRows(ExternalRows):
     """Rows of the heights: by pressure minus predicted, m."""
 
     name, source = 'pressure', 'air_pressure'
-    levels_of = {'pressure': slice(0, 1)}
+    level_columns = {'pressure': slice(0, 1)}
     constants = PRESSURE
 
     @classmethod
@@ -85,7 +85,7 @@ class PressureRows(ExternalRows):
         p_n = state.p_n[k] + state.v_n[k] * tau[:, None] + dp + g * (tau**2 / 2)[:, None]
         height = p_n[:, 2] + (p_n[:, :2]**2).sum(axis=1) / (2 * EARTH_RADIUS)
         raw = samples.height - height - by_constants @ state.constants[PRESSURE]
-        J, c = np.zeros((len(k), 1, WITHOUT_SLOW)), np.zeros((len(k), 1, M))
+        J, c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         up = np.concatenate([p_n[:, :2] / EARTH_RADIUS, np.ones((len(k), 1))], axis=1)[:, None]
         t = tau[:, None, None]
         J[:, :, P], J[:, :, V] = -up, -up * t - by_velocity

@@ -150,7 +150,7 @@ def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[
     named = {layout.CONSTANTS[i] for i in remarks.deviating_lever_arms(fit.state.constants, sigma)}
     names = [name for name in ratio if name in estimates and estimates[name].value is None
              and name not in named]
-    return [not_observable_reason('this drive', names, bool(problem.leg.origin.local))] \
+    return [not_observable_reason('this drive', names, problem.leg.origin.is_local)] \
         if names else []
 
 

@@ -22,7 +22,7 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import imperfection_sigmas
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.nav.geodesy import A
+from odocal_ros.nav.geodesy import SEMI_MAJOR_AXIS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import FAULT_SIGMAS, FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS
@@ -65,7 +65,8 @@ IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it firs
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     """Return the sigma of ln K if the positions, in a local frame, contain the wheels, else 0."""
     share = c[layout.FIX_BY_MOTION]
-    if not problem.leg.origin.local or not contains_odometer(share, sigma[layout.FIX_BY_MOTION]):
+    if not (problem.leg.origin.is_local
+            and contains_odometer(share, sigma[layout.FIX_BY_MOTION])):
         return 0.0
     # the drift of the map is filtered together with the wheels, and not modelled. Within a time
     # constant of the filter it cannot be distinguished from the wheel error, which is averaged
@@ -86,8 +87,8 @@ def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[Er
     """Return the errors that the fit does not contain; sigma : (M,) of the constants."""
     by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
     leg = problem.leg
-    by_height = 0.0 if leg.origin.local or not np.isnan(leg.fixes_n[:, 2]).all() \
-        else HEIGHT_UNKNOWN / A
+    by_height = 0.0 if leg.origin.is_local or not np.isnan(leg.fixes_n[:, 2]).all() \
+        else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
     # which of the two values a later drive has is unknown
     of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
                  for step in fit.constant_steps
@@ -148,7 +149,7 @@ def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
                    f'{factor:.1f} times as large as their covariance states (limit '
                    f'{FIX_NOISE_LIMIT:g})',
-                   POSE_COVARIANCE_REMEDY if problem.leg.origin.local else '')]
+                   POSE_COVARIANCE_REMEDY if problem.leg.origin.is_local else '')]
 
 
 def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
@@ -161,7 +162,7 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
     far = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {total} fixes ({100 * count / total:.0f} %) '
                    f'are outliers, up to {far:.1f} m from the track; they were down-weighted',
-                   POSE_OUTLIER_REMEDY if problem.leg.origin.local else '')]
+                   POSE_OUTLIER_REMEDY if problem.leg.origin.is_local else '')]
 
 
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:

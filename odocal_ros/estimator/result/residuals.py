@@ -108,7 +108,7 @@ def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     fixes = fit.weighted[Fixes]
     covariance_root = np.linalg.inv(fixes.whitening)
     factor = np.ones(3)
-    for level, columns in fixes.levels_of.items():
+    for level, columns in fixes.level_columns.items():
         factor[columns] = np.sqrt(fixes.levels[level])
     scale = np.sqrt(fixes.weight / fixes.rows_per_independent) / factor
     value = -(covariance_root @ (fixes.r / scale)[:, :, None])[:, :, 0]
