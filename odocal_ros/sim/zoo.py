@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Distributions of the errors of random vehicles, by IMU grade; sources in docs/zoo.md."""
+"""
+Distributions from which a random vehicle and its errors are drawn, by IMU grade.
+
+``sim/draw.py`` draws the vehicle, ``sim/draw_effects.py`` its errors; docs/zoo.md has the sources.
+"""
 
 from dataclasses import dataclass, field
 import math
@@ -15,42 +19,42 @@ GRADES = ('consumer', 'industrial', 'tactical')
 # definition: units of data sheets in SI; G as rounded there, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
 
-# one number for each class: a sigma (normal), a share or a size
-SIZES = {
+# by grade, as in GRADES: a sigma (normal distribution), a share of the vehicles or a fixed value
+VALUES_BY_GRADE = {
     'gyro scale': (0.01, 1.5e-3, 3e-4),                                # relative, sigma
     'accelerometer scale': (0.01, 2e-3, 3e-4),
-    'cross': (0.4 * DEG, 0.05 * DEG, 3e-4),                            # rad, between axes, sigma
-    'between': (0.5 * DEG, 0.1 * DEG, 1e-3),                           # rad, triads, sigma
+    'misalignment': (0.4 * DEG, 0.05 * DEG, 3e-4),                     # rad, of axes, sigma
+    'triad rotation': (0.5 * DEG, 0.1 * DEG, 1e-3),       # rad, gyro to accelerometer, sigma
     'g sensitivity': (0.05 * DEG / G, 0.008 * DEG / G, DEG_H / G),     # rad/s per m/s^2, sigma
     'gyro bias': (DEG, 0.1 * DEG, 5 * DEG_H),                          # rad/s, sigma
     'accelerometer bias': (25 * MG, 3 * MG, MG),                       # m/s^2, sigma
     'gyro wander': (200 * DEG_H, 25 * DEG_H, 0.5 * DEG_H),             # rad/s, sigma
     'accelerometer wander': (MG, 0.2 * MG, 0.05 * MG),                 # m/s^2, sigma
-    'rectified': (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G),    # m/s^2 per (m/s^2)^2: mg per g^2
+    'rectification': (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G),    # m/s^2 per (m/s^2)^2, size
     'imu jitter': (3e-3, 1e-3, 1e-5),                                  # s, sigma
     'nominal scale': (0.015, 0.025, 0.005),                            # relative, sigma
     'rtk': (0.1, 0.4, 0.9),                                            # share of the vehicles
-    'arm error': (0.15, 0.03, 0.01),                                   # m, each axis, sigma
-    'arm at zero': (0.3, 0.1, 0.0),                                    # share of the vehicles
+    'lever arm error': (0.15, 0.03, 0.01),                             # m, each axis, sigma
+    'unmeasured lever arms': (0.3, 0.1, 0.0),                          # share of the vehicles
 }
-# several for each class: (median, sigma of the logarithm), a range, or one for each of a list
-ROWS: dict[str, tuple[tuple[float, ...], ...]] = {
+# by grade: (median, sigma of the logarithm), or as stated
+TUPLES_BY_GRADE: dict[str, tuple[tuple[float, ...], ...]] = {
     'gyro slope': ((0.02 * DEG, 0.7), (0.002 * DEG, 0.5), (0.5 * DEG_H, 0.5)),     # rad/s per K
     'accelerometer slope': ((0.5 * MG, 0.5), (0.05 * MG, 0.5), (0.02 * MG, 0.5)),  # m/s^2 per K
-    'warmth': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),                  # K, range
+    'temperature rise': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),        # K, range
     'latency': ((0.010, 0.6), (0.005, 0.5), (0.002, 0.5)),             # s
     'filter': ((0.002, 0.019), (0.002, 0.010), (0.001, 0.016)),        # s, range
     'mounting': ((3.0, 3.0, 3.0), (1.5, 1.5, 2.0), (0.5, 0.5, 0.5)),   # deg, roll, pitch, yaw
-    'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),  # fine, coarse, speeds
+    'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),  # fine, coarse, speed
 }
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """An effect of a vehicle: fields of Real, and of SimOptions; none if it is absent."""
+class Effect:
+    """An effect as the values that cause it; without any the effect is absent."""
 
-    real: dict[str, Any] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
+    real: dict[str, Any] = field(default_factory=dict)       # fields of ``real.Real``
+    options: dict[str, Any] = field(default_factory=dict)    # fields of ``SimOptions``
 
 
 @dataclass(frozen=True)
@@ -58,16 +62,20 @@ class Vehicle:
     """Properties of a vehicle that effects depend on."""
 
     grade: str       # consumer, industrial or tactical
-    kind: str        # of drive
-    rtk: bool
+    kind: str        # scenario of the drive
+    rtk: bool        # GNSS with RTK
     city: bool       # multipath, outages, worse covariances
     robot: bool      # small, slow, without springs
-    options: dict[str, Any]    # SimOptions drawn so far
-    alone: bool      # the effect alone is requested: it must be present
+    options: dict[str, Any]    # fields of SimOptions, before any effect
+    effects_requested: bool    # by name: then each effect is present, not by chance
 
-    def size(self, name: str) -> float:
-        """Return the entry of SIZES for the vehicle's class."""
-        return SIZES[name][GRADES.index(self.grade)]
+    def grade_value(self, name: str) -> float:
+        """Return the entry of VALUES_BY_GRADE for the vehicle's grade."""
+        return VALUES_BY_GRADE[name][GRADES.index(self.grade)]
+
+    def grade_values(self, name: str) -> tuple[float, ...]:
+        """Return the entry of TUPLES_BY_GRADE for the vehicle's grade."""
+        return TUPLES_BY_GRADE[name][GRADES.index(self.grade)]
 
     @property
     def speed_options(self) -> dict[str, Any]:
@@ -75,14 +83,10 @@ class Vehicle:
         return {'odometer': 'speed', 'nominal_scale': 1.0,
                 'scale': self.options['scale'] / self.options['nominal_scale']}
 
-    def row(self, name: str) -> tuple[float, ...]:
-        """Return the entry of ROWS for the vehicle's class."""
-        return ROWS[name][GRADES.index(self.grade)]
 
-
-def lognormal(rng: np.random.Generator, median: float, spread: float) -> float:
-    """Return a draw of a log-normal distribution. spread: sigma of the logarithm."""
-    return float(median * np.exp(spread * rng.standard_normal()))
+def lognormal(rng: np.random.Generator, median: float, log_sigma: float) -> float:
+    """Return a sample of a log-normal distribution; log_sigma: sigma of the logarithm."""
+    return float(median * np.exp(log_sigma * rng.standard_normal()))
 
 
 def flat(values: Floats) -> tuple[float, ...]:
