@@ -1,7 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odocal command: subcommands, exit codes, errors as text, safe output to the terminal."""
+"""
+The odocal command: imports and runs the module of a subcommand.
+
+Every error ends as one line on stderr and an exit code. Text goes to the terminal through
+``print_text`` and ``warn``, since names in bags are untrusted. ``OdocalCommand`` is the same
+command as an extension of ros2cli, ``ros2 odocal``.
+"""
 
 import argparse
 import importlib

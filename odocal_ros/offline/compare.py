@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal compare: changes of the vehicle since earlier calibrations."""
+"""odocal compare: print changes between calibration.json files of one vehicle, in sigmas."""
 
 import argparse
 from typing import TYPE_CHECKING

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal doctor: installed packages and output folders, as one screen to paste."""
+"""odocal doctor: print versions, installed packages and output folders, for bug reports."""
 
 import argparse
 from importlib.metadata import PackageNotFoundError, version

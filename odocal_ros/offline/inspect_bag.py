@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal inspect: content of a bag, its problems, missing data, and the replay command."""
+"""odocal inspect: print the content of a bag, its problems and the replay command (or JSON)."""
 
 import argparse
 from pathlib import Path
@@ -23,9 +23,9 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.settings.config import Config, with_settings
     config = with_settings(Config(), replay.settings_from_arguments(args))
     with open_bag(Path(args.bag)) as bag:
-        found = inspect(bag, args.bag, config, replay.topics_from_arguments(args))
+        content = inspect(bag, args.bag, config, replay.topics_from_arguments(args))
     if args.json:
-        print_json(found)
+        print_json(content)
     else:
-        print_text(text(found))
+        print_text(text(content))
     return 0

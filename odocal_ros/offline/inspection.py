@@ -1,19 +1,22 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Content of odocal inspect: facts of topics, likely inputs, findings, replay command."""
+"""
+The content of a bag for odocal inspect and try, as one dict that becomes text or JSON.
+
+In: an open bag. Out: facts of each topic, the most likely topic of each input, facts of the drive,
+findings (problems and missing data), and the replay command with the settings that it needs.
+"""
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
 from typing import Any
 
-import numpy as np
-
 from odocal_ros.bagio.read import Bag, TopicInfo
-from odocal_ros.data.arrays import Floats, Ints, medians
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.samples import OdometerForm, take
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import OdocalError
 from odocal_ros.library.topics import REFERENCES
 from odocal_ros.messages import cdr
@@ -28,7 +31,6 @@ from odocal_ros.offline.survey import fix_path, FixPath, Match
 from odocal_ros.output.files import plain
 from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.glitches import is_impossible
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES, with_settings
 from odocal_ros.settings.config_file import parse_set
@@ -76,10 +78,10 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     samples_by_topic, refused = _make_samples(bag, config, overrides)
     collectors = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
     # these readers store samples and return none, so that the second argument is not called
-    bag.read({**samples_by_topic, **collectors, **_static(samples_by_topic, bag)}, print)
+    bag.read({**samples_by_topic, **collectors, **_static_readers(samples_by_topic, bag)}, print)
     mapping, config = likely_mapping(bag.topics, config, overrides)
     imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
-    turn_rate = _turn_rate(imu) if imu else None
+    turn_rate = survey.turn_rate_to_left(imu.recorder.rows('imu')) if imu else None
     fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
     motions = {name: topic_samples.values.facts(turn_rate, fixes)
                for name, topic_samples in samples_by_topic.items() if topic_samples.values}
@@ -90,13 +92,14 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
               for name, info in bag.topics.items()]
     for facts in topics:
         if 'odometer' in facts:
-            facts['odometer']['still'] = facts['name'] in not_following
+            facts['odometer']['not_following'] = facts['name'] in not_following
         if fixes and (fields := collectors.get(facts['name'])) and not fields.trouble:
             facts['fields'] = fields.facts(fixes)
     odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
-    found = _bag_facts(bag, path) | {
-        'topics': topics, 'mapping': mapping, 'still': sorted(not_following), 'mounting': None,
-        'drive': None, 'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
+    content = _bag_facts(bag, path) | {
+        'topics': topics, 'mapping': mapping, 'not_following': sorted(not_following),
+        'mounting': None, 'drive': None, 'standstills': [], 'legs': [], 'each_stop': [],
+        'straight': []}
     findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
     no_topic_follows = 'odometer' not in overrides and matches and not any(
         match.follows for match in matches.values())
@@ -112,15 +115,15 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         _read_again(bag, samples_by_topic, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         options += inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config,
-                                 found, findings)
+                                 content, findings)
     if 'fix' in mapping:
         config = settings_by_frame(samples_by_topic[mapping['fix']].recorder.rows('fix'), config)
-    findings += missing_input_reasons(found, mapping, config)
-    found['findings'] = _finding_facts(findings, config, options)
-    found['open'] = replay_refusal(bag.topics, initial_config, overrides)
-    found['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping,
+    findings += missing_input_reasons(content, mapping, config)
+    content['findings'] = _finding_facts(findings, config, options)
+    content['replay_error'] = replay_refusal(bag.topics, initial_config, overrides)
+    content['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping,
                                       options)
-    return dict(plain(found))
+    return dict(plain(content))
 
 
 def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
@@ -134,11 +137,11 @@ def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
 
 def _finding_facts(findings: list[Reason], config: Config,
                    options: list[str]) -> list[dict[str, Any]]:
-    """Return findings as facts; ``only`` : the method that they affect, None: all."""
+    """Return findings as facts; ``method`` : the only one that they affect, None: all."""
     has_wheels = config.odometer.keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
     codes = TWO_POINT_CODES - {Code.NO_STANDSTILL} if has_wheels else TWO_POINT_CODES
-    return [reason.as_dict() | {'only': 'two_point' if (
+    return [reason.as_dict() | {'method': 'two_point' if (
         config.method != 'two_point' and reason.code in codes) else None}
         for reason in dict.fromkeys(findings)]
 
@@ -163,26 +166,26 @@ def _make_samples(bag: Bag, config: Config,
     return samples_by_topic, refused
 
 
-def _static(samples_by_topic: dict[str, _TopicSamples], bag: Bag) -> dict[str, _TopicSamples]:
+def _static_readers(samples_by_topic: dict[str, _TopicSamples],
+                    bag: Bag) -> dict[str, _TopicSamples]:
     """Return the readers of static transforms; they share the recorder of their TF topic."""
     readers = {name: topic_samples.reader for name, topic_samples in samples_by_topic.items()}
-    found = {name: _TopicSamples(reader) for name, reader in add_static_readers(
+    static = {name: _TopicSamples(reader) for name, reader in add_static_readers(
         readers, bag.topics).items() if name not in readers}
-    for name, static in found.items():
-        static.recorder = samples_by_topic[name.removesuffix(STATIC)].recorder
-    return found
+    for name, topic_samples in static.items():
+        topic_samples.recorder = samples_by_topic[name.removesuffix(STATIC)].recorder
+    return static
 
 
 def _topic_facts(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
-           trouble: str) -> dict[str, Any]:
+                 trouble: str) -> dict[str, Any]:
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
                              'rate_hz': survey.rate_of(info.count, seconds)}
     if topic_samples is None:
         return facts | ({'trouble': trouble} if trouble else {})
-    slot = topic_samples.reader.slot
+    reader, slot = topic_samples.reader, topic_samples.reader.slot
     rows = topic_samples.recorder.rows(slot)
-    reader = topic_samples.reader
     trouble = topic_samples.trouble or (
         f'{counted(reader.unreadable, "message")} skipped: {reader.trouble}'
         if reader.unreadable else '')
@@ -239,7 +242,7 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
         topic_samples, values = samples_by_topic[facts['name']], motions[facts['name']]
         facts['values'] = values
         if len(values) > 1:
-            facts['moves'] = wheel_survey.motion_texts(values)
+            facts['motions'] = wheel_survey.motion_texts(values)
         form = topic_samples.reader.form
         assert form is not None      # a topic of lists is an odometer's
         if form.chosen:
@@ -251,9 +254,8 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
                 options += [f'odometer.{side}={key}' for side, key in zip(
                     SIDES, named, strict=True)]
             else:
-                options += (wheel_survey.wheel_settings(values)
-                            or wheel_survey.single_wheel_setting(values,
-                                                                 topic_samples.reader.wheels))
+                options += wheel_survey.wheel_settings(values) or (
+                    wheel_survey.single_wheel_setting(values, topic_samples.reader.wheels))
     odometer = samples_by_topic.get(mapping.get('odometer', ''))
     if odometer and odometer.form_by_fixes:
         options.append(f'odometer.quantity={odometer.form_by_fixes.quantity}')
@@ -268,16 +270,6 @@ def _read_again(bag: Bag, samples_by_topic: dict[str, _TopicSamples], topic: str
     bag.read({topic: topic_samples}, print)
     facts = next(facts for facts in topics if facts['name'] == topic)
     facts.update(_topic_facts(bag, bag.topics[topic], topic_samples, '') | facts)
-
-
-def _turn_rate(imu: _TopicSamples) -> tuple[Ints, Floats] | None:
-    """Return stamps, ns, and the turn rate to the left, rad/s, (n,); None without usable rows."""
-    rows = imu.recorder.rows('imu')
-    rows = take(rows, ~(is_impossible('f_i', rows.f_i) | is_impossible('w_i', rows.w_i)))
-    if not len(rows.stamp_ns):
-        return None
-    up_i = medians(rows.f_i)
-    return rows.stamp_ns, rows.w_i @ (up_i / max(float(np.linalg.norm(up_i)), 1e-9))
 
 
 def _combined_recorder(samples_by_topic: dict[str, _TopicSamples],

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Findings of odocal inspect from all inputs together: units, axes, standstills, legs."""
+"""
+The drive in a bag, for odocal inspect: what IMU, odometer and fixes show only together.
+
+In: the samples of the selected topics. Out: path, speeds, standstills, legs and IMU orientation,
+findings on units, axes and missing data, and the settings that correct them.
+"""
 
 from dataclasses import replace
 import math
@@ -41,12 +46,12 @@ from odocal_ros.settings.nominal import nominal_scale
 MOST_OF_TRAVEL = 0.5
 
 
-def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
+def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, content: dict[str, Any],
                   findings: list[Reason]) -> list[str]:
     """
     Inspect the inputs together.
 
-    Fills mounting, drive, standstills and legs of ``found``, adds to ``findings``, and returns
+    Fills mounting, drive, standstills and legs of ``content``, adds to ``findings``, and returns
     options for the replay: settings, and --leg.
     """
     if not all(len(recorder.rows(slot).stamp_ns) for slot in ('imu', 'odometer')):
@@ -81,7 +86,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
     scale = path_length / travel if is_long and travel else located.rough or None
     # speeds with the printed scale
     scale_ratio = scale / located.rough if scale and located.rough else 1.0
-    found['drive'] = {
+    content['drive'] = {
         'distance': path_length, 'chord': chord, 'fix_sigma': located.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': speeds[0] * scale_ratio, 'fastest': speeds[1] * scale_ratio,
@@ -89,10 +94,10 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, found: dict[s
     if scale:
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
-    found['standstills'] = [[base + a, base + b] for a, b in stops.tolist()]
-    return [*options, *_axis_options(inputs, located, w_i, f_i, config, found, findings),
+    content['standstills'] = [[base + a, base + b] for a, b in stops.tolist()]
+    return [*options, *_axis_options(inputs, located, w_i, f_i, config, content, findings),
             *_sigma_limit(recorder, config),
-            *_describe_legs(bag, recorder, inputs, located, stops, first, config, found)]
+            *_describe_legs(bag, recorder, inputs, located, stops, first, config, content)]
 
 
 def _travel_between_fixes(inputs: Inputs) -> float:
@@ -133,7 +138,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 
 
 def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, config: Config,
-                  found: dict[str, Any], findings: list[Reason]) -> list[str]:
+                  content: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return settings for odometer sign and IMU orientation; check the gyro."""
     is_configured = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
@@ -146,9 +151,9 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         axes = replace(axes, C_bi=None)      # gravity is assumed
     agrees = axes.C_bi is not None and np.allclose(
         axes.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
-    found['mounting'] = {
+    content['mounting'] = {
         'accelerometer': inputs.has_accelerometer, 'rpy': axes.rpy,
-        'assumed_forward': axes.assumed, 'off': axes.deviation,
+        'assumed_forward': axes.assumed, 'deviation': axes.deviation,
         'unclear': axes.unclear + '; imu.mounting_rpy is used as set' * is_configured,
         'forward_i': None if axes.forward_i is None else axes.forward_i.tolist(),
         'forward_sigma': axes.forward_sigma if axes.forward_i is not None else None,
@@ -157,17 +162,18 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         if inputs.has_accelerometer and located.rough else None
     ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
                                  config.imu.gyro_scale)
-    found['drive']['gyro_over_course'] = ratio
+    content['drive']['gyro_over_course'] = ratio
     findings += axis_faults
     # no rotation corrects a mirrored axis
-    if axis_faults or axes.rpy is None or not found['mounting']['needed']:
+    if axis_faults or axes.rpy is None or not content['mounting']['needed']:
         return options
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in axes.rpy)}]']
 
 
 def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: LocatedFixes,
-                   rests: Floats, first: int, config: Config, found: dict[str, Any]) -> list[str]:
-    """Return the legs that replay would use, and better ones for the two-point method."""
+                   rests: Floats, first: int, config: Config,
+                   content: dict[str, Any]) -> list[str]:
+    """Add the legs that replay would use to ``content``; return options for better ones."""
     if not len(inputs.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
@@ -182,22 +188,22 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
 
     marks = marked_legs(bag)
     stops = standstills_of(inputs, first, config)
-    found['legs'] = [described(a, b, marked=bool(marks))
+    content['legs'] = [described(a, b, marked=bool(marks))
                      for a, b in find_legs(recorder, bag, [], marks, config, stops)]
     each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(rests) > 2 else []
-    found['each_stop'] = [described(a, b) for a, b in each]
-    found['straight'] = [
+    content['each_stop'] = [described(a, b) for a, b in each]
+    content['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(rests, *ends)
             for ends in survey.straight_sections(inputs, located, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
-    if marks or config.method != 'two_point' or not all(is_closed(leg) for leg in found['legs']):
+    if marks or config.method != 'two_point' or not all(is_closed(leg) for leg in content['legs']):
         return []
-    open_legs = [leg for leg in found['each_stop']
+    open_legs = [leg for leg in content['each_stop']
                  if leg['distance'] >= config.leg.min_distance and not is_closed(leg)]
-    if len(open_legs) > 1 and len(open_legs) == len(found['each_stop']):
+    if len(open_legs) > 1 and len(open_legs) == len(content['each_stop']):
         return ['--leg each-stop']
-    return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['straight']]
+    return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in content['straight']]
 
 
 def is_closed(leg: dict[str, Any]) -> bool:
@@ -211,10 +217,10 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
     return begin, end
 
 
-def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
+def missing_input_reasons(content: dict[str, Any], mapping: dict[str, str],
                           config: Config) -> list[Reason]:
     """Return the reasons for missing or unusable inputs, and for parts that the drive lacks."""
-    topics = {topic['name']: topic for topic in found['topics']}
+    topics = {topic['name']: topic for topic in content['topics']}
     reasons = []
     for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,
                              'odometer'), ('fix', Code.NO_FIX, 'fixes')):
@@ -231,18 +237,18 @@ def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
                                   f'{facts["trouble"]}',
                                   'Check the type and the driver of the topic, '
                                   'or name another topic.'))
-    drive = found['drive']
+    drive = content['drive']
     if not drive:
         return reasons
-    legs = found['legs']
-    if not found['standstills']:
+    legs = content['legs']
+    if not content['standstills']:
         slowest = (f': its lowest speed (mean over 1 s) is {drive["slowest"]:.2f} '
                    'm/s') * (drive['slowest'] > 0)
         reasons.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
     elif legs and not any(abs(leg['start'] - stop) < 1.0
-                          for leg in legs for _, stop in found['standstills']):
+                          for leg in legs for _, stop in content['standstills']):
         reasons.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
-                              f'at {found["standstills"][0][0]:.1f} s'))
+                              f'at {content["standstills"][0][0]:.1f} s'))
     short = [leg for leg in legs if leg['distance'] < config.leg.min_distance]
     loops = [leg for leg in legs if leg not in short and is_closed(leg)]
     limit = f'{config.leg.min_distance:g} m'
@@ -260,15 +266,15 @@ def missing_input_reasons(found: dict[str, Any], mapping: dict[str, str],
         reasons.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
                               f'{drive["fastest"]:.1f} m/s; the limit is '
                               f'{config.leg.min_speed:g} m/s'))
-    return reasons + _heading_reasons(found, mapping, config)
+    return reasons + _heading_reasons(content, mapping, config)
 
 
-def _heading_reasons(found: dict[str, Any], mapping: dict[str, str],
+def _heading_reasons(content: dict[str, Any], mapping: dict[str, str],
                      config: Config) -> list[Reason]:
     """Return the reason for a missing or poor heading, with possible sources."""
     if 'heading' in mapping or math.isfinite(config.alignment.heading):
         return []
-    facts = next(t for t in found['topics'] if t['name'] == mapping['imu'])['imu']
+    facts = next(t for t in content['topics'] if t['name'] == mapping['imu'])['imu']
     if not facts['orientation']:
         cause = 'no heading topic, and the IMU publishes no orientation'
     elif facts['yaw_sigma'] is None:

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of ``odocal inspect``: the values of ``inspection.inspect`` as one screen."""
+"""
+Text of ``odocal inspect``: the content of a bag as one screen.
+
+In: the dict of ``inspection.inspect``, with the topics, the drive and the findings. Out: lines of
+blocks: topics, statements on each input, drive, findings, suggested command.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 import math
@@ -15,28 +20,29 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
           str(LOCAL): 'positions in a local frame'}
 
 
-def text(found: dict[str, Any]) -> str:
-    """Return the text of a bag; ``found``: result of ``inspection.inspect``."""
-    roles = {topic: slot for slot, topic in found['mapping'].items()}
-    blocks = [_head(found), _topics(found, roles)]
-    blocks += [_details(topic, roles) for topic in found['topics']
-               if {'timing', 'moves', 'fields', 'trouble'} & topic.keys()]
-    blocks += [_drive(found), _findings(found), _command(found)]
+def text(content: dict[str, Any]) -> str:
+    """Return the text for the content of a bag, the result of ``inspection.inspect``."""
+    roles = {topic: slot for slot, topic in content['mapping'].items()}
+    blocks = [_head(content), _topics(content, roles)]
+    blocks += [_details(topic, roles) for topic in content['topics']
+               if {'timing', 'motions', 'fields', 'trouble'} & topic.keys()]
+    blocks += [_drive(content), _findings(content), _command(content)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
 
-def _head(found: dict[str, Any]) -> list[str]:
-    lines = [one_line(found['path']), f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
-             f'{found["messages"]} messages in {counted(len(found["files"]), "file")}']
-    return lines + [line for note in found['notes'] for line in wrapped(f'note: {note}')]
+def _head(content: dict[str, Any]) -> list[str]:
+    lines = [one_line(content['path']),
+             f'  {content["duration"]:.1f} s from {content["start_utc"]}, {content["messages"]} '
+             f'messages in {counted(len(content["files"]), "file")}']
+    return lines + [line for note in content['notes'] for line in wrapped(f'note: {note}')]
 
 
-def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
-    wide = max((len(topic['name']) for topic in found['topics']), default=0)
-    short = {topic['type']: topic['type'].replace('/msg/', '/') for topic in found['topics']}
+def _topics(content: dict[str, Any], roles: dict[str, str]) -> list[str]:
+    wide = max((len(topic['name']) for topic in content['topics']), default=0)
+    short = {topic['type']: topic['type'].replace('/msg/', '/') for topic in content['topics']}
     kinds = max(map(len, short.values()), default=0)
     lines = []
-    for topic in found['topics']:
+    for topic in content['topics']:
         name, kind = one_line(topic['name']), one_line(short[topic['type']])
         rate = '' if topic['count'] < 2 else (
             f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] else f'{"unknown":>8} Hz')
@@ -53,14 +59,14 @@ def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     texts = [text for key, statements in STATEMENTS.items() if topic.get(key)
              for text in statements(topic, topic[key])]
     if topic['name'] not in roles and not any('warning:' in text for text in texts):
-        texts = texts[:2 + len(topic.get('moves', ()))]     # of a topic that is not used
+        texts = texts[:2 + len(topic.get('motions', ()))]     # of a topic that is not used
     return [one_line(topic['name']), *(line for text in texts for line in wrapped(text))]
 
 
-def _of_fields(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
+def _field_statements(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
     """Return a statement for each field of an unknown type that follows the path of the fixes."""
     for field in fields['found']:
-        unit = 'm/count' if field['whole'] and field['quantity'] != 'rate' else 'm per unit'
+        unit = 'm/count' if field['is_integer'] and field['quantity'] != 'rate' else 'm per unit'
         grows = (f'is proportional to the speed, {field["scale"]:.3g} m/s per unit'
                  if field['quantity'] == 'rate' else f'grows with distance, '
                  f'{field["scale"]:.3g} {unit}' + ' (counts since the previous message)' * (
@@ -72,7 +78,7 @@ def _of_fields(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
                'tried)')
 
 
-def _of_imu(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str]:
+def _imu_statements(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str]:
     unit = imu['force_unit']
     if not imu['gravity']:
         yield 'no specific force: no accelerometer, or its data is not published'
@@ -95,30 +101,30 @@ def _of_imu(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str]:
         yield f'has an orientation, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
 
 
-def _of_odometer(_topic: dict[str, Any], odometer: dict[str, Any]) -> Iterator[str]:
+def _odometer_statements(_topic: dict[str, Any], odometer: dict[str, Any]) -> Iterator[str]:
     what = {'cumulative': 'running count', 'increment': 'counts since the previous message',
             'rate': 'speed'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
     unit += '/s' * (odometer['quantity'] == 'rate')
-    if odometer['least'] is None:
+    if odometer['minimum'] is None:
         yield 'warning: no valid value'
         return
-    if odometer['quantity'] == 'rate' and odometer.get('still'):
+    if odometer['quantity'] == 'rate' and odometer.get('not_following'):
         what = 'one component of a velocity, not the speed along the path of the fixes'
     form = '.5g' if odometer['quantity'] == 'rate' else '.12g'
-    yield f'{what}: {odometer["least"]:{form}} to {odometer["most"]:{form}} {unit}'
+    yield f'{what}: {odometer["minimum"]:{form}} to {odometer["maximum"]:{form}} {unit}'
     if odometer['meaning']:
         yield f'follows the fixes as a {what} only: --set {odometer["meaning"]}'
     if odometer['not_finite']:
         yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
 
 
-def _of_fix(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]:
+def _fix_statements(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]:
     status = ', '.join(f'{count} {STATUS.get(value, "status " + value)}'
                        for value, count in fix['status'].items())
     if fix['sigma']:
         sigma = (f'sigma {fix["sigma"]["median"]:.2f} m '
-                 f'({fix["sigma"]["least"]:.2f} to {fix["sigma"]["most"]:.2f})')
+                 f'({fix["sigma"]["minimum"]:.2f} to {fix["sigma"]["maximum"]:.2f})')
     else:
         sigma = 'no covariance'
     partly = f', covariance in {fix["covariance_known"]} of {topic["count"]}' \
@@ -130,7 +136,7 @@ def _of_fix(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]:
         yield f'position resolution {fix["position_step"]:.2f} m'
 
 
-def _of_timing(topic: dict[str, Any], timing: dict[str, Any]) -> Iterator[str]:
+def _timing_statements(topic: dict[str, Any], timing: dict[str, Any]) -> Iterator[str]:
     if timing['headerless']:
         jitter = timing['arrival_jitter']
         yield 'no header: arrival time (bag time) is used as stamp' + (
@@ -153,15 +159,16 @@ def _of_timing(topic: dict[str, Any], timing: dict[str, Any]) -> Iterator[str]:
                f'longest {longest["length"]:.2f} s at {longest["at"]:.2f} s')
 
 
-# facts of a topic: function of the topic and of these facts that yields statements
+# key of a topic's facts: function of the topic and of these facts that yields statements on them
 STATEMENTS: dict[str, Callable[[dict[str, Any], Any], Iterable[str]]] = {
-    'fields': _of_fields, 'imu': _of_imu, 'chosen': lambda _topic, chosen: [chosen],
-    'moves': lambda _topic, moves: moves, 'odometer': _of_odometer, 'fix': _of_fix,
-    'timing': _of_timing, 'trouble': lambda _topic, trouble: [trouble]}
+    'fields': _field_statements, 'imu': _imu_statements, 'chosen': lambda _topic, chosen: [chosen],
+    'motions': lambda _topic, motions: motions, 'odometer': _odometer_statements,
+    'fix': _fix_statements, 'timing': _timing_statements,
+    'trouble': lambda _topic, trouble: [trouble]}
 
 
-def _drive(found: dict[str, Any]) -> list[str]:
-    drive = found['drive']
+def _drive(content: dict[str, Any]) -> list[str]:
+    drive = content['drive']
     if not drive:
         return []
     lines = ['drive (seconds from the first message)']
@@ -171,16 +178,16 @@ def _drive(found: dict[str, Any]) -> list[str]:
                      f'{drive["fastest"]:.1f} m/s')
     if drive['rough_scale'] and drive['scale_unit'] != '1':
         lines.append(f'  scale factor about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
-    stops = found['standstills']
+    stops = content['standstills']
     shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
     lines += wrapped(f'standstills: {shown} s' if stops else 'standstills: none')
-    lines += _legs(found['legs'])
-    if len(found['each_stop']) > 1:
-        lines.append(f'  --leg each-stop: {len(found["each_stop"])} legs, '
-                     + ', '.join(f'{leg["distance"]:.0f} m' for leg in found['each_stop'][:8])
-                     + ', ...' * (len(found['each_stop']) > 8))
-    lines += [f'  straight: {_leg(leg)}' for leg in found['straight'][:3]]
-    return lines + _mounting(found['mounting'])
+    lines += _legs(content['legs'])
+    if len(content['each_stop']) > 1:
+        lines.append(f'  --leg each-stop: {len(content["each_stop"])} legs, '
+                     + ', '.join(f'{leg["distance"]:.0f} m' for leg in content['each_stop'][:8])
+                     + ', ...' * (len(content['each_stop']) > 8))
+    lines += [f'  straight: {_leg(leg)}' for leg in content['straight'][:3]]
+    return lines + _mounting(content['mounting'])
 
 
 def _legs(legs: list[dict[str, Any]]) -> list[str]:
@@ -216,7 +223,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
         uncertainty = whole_degrees(mounting['forward_sigma'])
         source = ('forward direction from accelerations and turns, uncertainty '
                   f'{uncertainty} deg (1 sigma); the measured mounting differs by '
-                  f'{math.degrees(mounting["off"]):.1f} deg')
+                  f'{math.degrees(mounting["deviation"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else \
         'imu.mounting_rpy is correct to the nearest quarter turn:'
     return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {source})')
@@ -228,25 +235,25 @@ def whole_degrees(angle: float) -> str:
     return f'{degrees:.0f}' if degrees >= 0.5 else f'{degrees:.1g}'
 
 
-def _findings(found: dict[str, Any]) -> list[str]:
-    if not found['findings']:
-        return ['all data for a calibration is available'] if found['command'] else []
+def _findings(content: dict[str, Any]) -> list[str]:
+    if not content['findings']:
+        return ['all data for a calibration is available'] if content['command'] else []
     lines = []
-    for only, title in ((None, 'before calibrating (counts of the whole recording)'), (
+    for method, title in ((None, 'before calibrating (counts of the whole recording)'), (
             'two_point', 'for the two-point method only; the smoother is not affected')):
-        reasons = [reason for reason in found['findings'] if reason['only'] == only]
+        reasons = [reason for reason in content['findings'] if reason['method'] == method]
         lines += [title] * bool(reasons)
         for reason in reasons:
             lines += wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}')
     return lines
 
 
-def _command(found: dict[str, Any]) -> list[str]:
+def _command(content: dict[str, Any]) -> list[str]:
     lines = []
-    if found['open']:
+    if content['replay_error']:
         lines.append('replay without options fails:')
-        lines += [part for line in found['open'].split('\n')
+        lines += [part for line in content['replay_error'].split('\n')
                   for part in wrapped(line.strip(), '  ' + '  ' * line.startswith(' '))]
-    if found['command']:
-        lines += ['suggested command', f'  {found["command"]}']
+    if content['command']:
+        lines += ['suggested command', f'  {content["command"]}']
     return lines

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search for an odometer among topics without a defined meaning, by the path of the fixes."""
+"""
+Search for an odometer in messages whose type does not say so, such as those of a vehicle bus.
+
+In: all numeric fields of a topic. Out: the fields whose travel is proportional to the path of the
+fixes, with their meaning (count, increment or speed), scale and settings.
+"""
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -47,7 +52,7 @@ class Fields:
     def __init__(self, count: int) -> None:
         self.count, self.trouble = count, ''
         self.paths: list[str] = []
-        self.is_whole: list[bool] = []
+        self.is_integer: list[bool] = []
         self._stride, self._messages_seen, self._times, self._values = 1, 0, array('q'), array('d')
         self._t_ns, self._travel = np.empty(0, np.int64), dict[str, Floats]()
 
@@ -84,7 +89,7 @@ class Fields:
         if not found:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in found]
-        self.is_whole = [isinstance(value, Integral) for _, value in found]
+        self.is_integer = [isinstance(value, Integral) for _, value in found]
         self._stride = max(1, -(-self.count // min(MOST_MESSAGES, MOST_VALUES // len(found))))
 
     def facts(self, path: FixPath) -> dict[str, Any]:
@@ -93,8 +98,9 @@ class Fields:
         values = np.array(self._values).reshape(len(t_ns), len(self.paths))
         keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
         self._t_ns = t_ns[keep]
-        tested = [_best_meaning(name, is_whole, self._t_ns, value, path, self._stride) for name,
-                  is_whole, value in zip(self.paths, self.is_whole, values[keep].T, strict=True)]
+        fields = zip(self.paths, self.is_integer, values[keep].T, strict=True)
+        tested = [_best_meaning(name, is_integer, self._t_ns, value, path, self._stride)
+                  for name, is_integer, value in fields]
         self._travel = {one[0]['path']: one[1] for one in tested if one}
         found = sorted((one[0] for one in tested if one), key=rank)
         return {'tried': len(self.paths), 'found': [field | {
@@ -110,7 +116,7 @@ class Fields:
         best, t_ns = found[0], self._t_ns
         scale_tolerance = 0.3  # judgement: scales of the wheels of a vehicle differ less, relative
         wheels = [field for field in found if all(
-            field[key] == best[key] for key in ('quantity', 'wrap', 'whole'))
+            field[key] == best[key] for key in ('quantity', 'wrap', 'is_integer'))
             and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]
         if turn_rate is not None and 1 < len(wheels) <= len(WHEELS):
             s = np.stack([self._travel[field['path']] for field in wheels], -1)
@@ -124,7 +130,7 @@ class Fields:
 
 def _settings(field: dict[str, Any], *names: str) -> list[str]:
     """Return the settings that name a field, then those for its meaning."""
-    usual = 'cumulative' if field['whole'] else 'rate'
+    usual = 'cumulative' if field['is_integer'] else 'rate'
     return [*names, *[f'odometer.quantity={field["quantity"]}'] * (field['quantity'] != usual),
             *[f'odometer.wrap={field["wrap"]}'] * (field['wrap'] > 0),
             *['odometer.reversed=true'] * (field['scale'] < 0)]
@@ -154,7 +160,7 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
         yield from _numbers(value, f'{path}.')
 
 
-def _best_meaning(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
+def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes: FixPath,
                   stride: int) -> tuple[dict[str, Any], Floats] | None:
     """
     Return the meaning of a field that follows the path best, and its travel; or None.
@@ -164,15 +170,16 @@ def _best_meaning(path: str, is_whole: bool, t_ns: Ints, value: Floats, fixes: F
     found: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
     for quantity in _quantities(path):
-        counts = is_whole and quantity == 'cumulative'
+        counts = is_integer and quantity == 'cumulative'
         wrap = _rollover(value) if counts else 0
         s = make_travel(seconds, value.astype(np.int64) if counts else value,
                         OdometerForm(quantity, wrap, ''))[0].s
         s = s * stride if quantity == 'increment' else s
         match = fixes.match(t_ns, s)
         if match.follows:
-            found.append(({'path': path, 'whole': is_whole, 'quantity': quantity, 'wrap': wrap,
-                           'scale': match.scale, 'explained': match.explained}, s))
+            found.append(({
+                'path': path, 'is_integer': is_integer, 'quantity': quantity, 'wrap': wrap,
+                'scale': match.scale, 'explained': match.explained}, s))
     return max(found, key=lambda one: one[0]['explained'], default=None)
 
 

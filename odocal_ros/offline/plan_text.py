@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of odocal plan: predicted sigmas, their error budgets and improvements as one screen."""
+"""Text of odocal plan: the sigmas and budgets of ``library.plan.Planned`` as one screen."""
 
 import math
 import textwrap

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal simulate: a bag of a drive with known truth; --fleet: the bags of many vehicles."""
+"""
+odocal simulate: write a bag of a simulated drive, with its truth and its settings as files.
+
+The options are fields of ``sim.options.SimOptions``; --fleet writes the bags of many vehicles.
+"""
 
 import argparse
 from dataclasses import fields

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Facts of the topics of a bag (timing, units, quality) and of its drive (path, standstills)."""
+"""
+Facts that odocal inspect computes from samples, as dicts: see ``inspection.inspect``.
+
+Of each topic: timing, units and quality. Of the drive: the path of the fixes and how well a
+travel follows it, standstills, speeds and straight sections.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +15,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_chord
 from odocal_ros.data.arrays import Floats, Ints, lengths, median, medians, reduce_columns
-from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
+from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
 from odocal_ros.screening.fix_screen import has_position, usable_fixes
 from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
@@ -109,11 +114,20 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
         'yaw_sigma': float(np.sqrt(np.median(known))) if len(known) else None}
 
 
+def turn_rate_to_left(samples: ImuSamples) -> tuple[Ints, Floats] | None:
+    """Return stamps, ns, and the turn rate about the vertical, rad/s, (n,); None without rows."""
+    rows = take(samples, ~(is_impossible('f_i', samples.f_i) | is_impossible('w_i', samples.w_i)))
+    if not len(rows.stamp_ns):
+        return None
+    up_i = medians(rows.f_i)
+    return rows.stamp_ns, rows.w_i @ (up_i / max(float(np.linalg.norm(up_i)), 1e-9))
+
+
 def odometer_facts(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return quantity, unit and range of an odometer topic."""
     finite = samples.value[~is_impossible('value', samples.value)]
     order = np.sort(finite)
-    ends = {'first': finite[:1], 'last': finite[-1:], 'least': order[:1], 'most': order[-1:]}
+    ends = {'first': finite[:1], 'last': finite[-1:], 'minimum': order[:1], 'maximum': order[-1:]}
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
             **{name: x.item() if len(x) else None for name, x in ends.items()},
             'not_finite': len(samples.value) - len(finite)}
@@ -131,10 +145,10 @@ def fix_facts(samples: FixSamples) -> dict[str, Any]:
     return {
         'status': dict(zip(map(str, values.tolist()), counts.tolist(), strict=True)),
         'positions': int(has_place.sum()), 'covariance_known': int(known.sum()),
-        'sigma': {'least': float(sigma.min()), 'median': float(np.median(sigma)),
-                  'most': float(sigma.max())} if len(sigma) else None,
+        'sigma': {'minimum': float(sigma.min()), 'median': float(np.median(sigma)),
+                  'maximum': float(sigma.max())} if len(sigma) else None,
         'position_step': _grid_step(samples.latitude[has_place]),
-        'height': {'least': float(heights.min()), 'most': float(heights.max())}
+        'height': {'minimum': float(heights.min()), 'maximum': float(heights.max())}
         if len(heights) else None}
 
 

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal try: inspect a bag, replay it with the suggested options, open the report."""
+"""
+odocal try: calibrate a bag with one command, without knowledge of its topics.
+
+It inspects the bag, prints the selected topics and settings with reasons, replays with them, and
+opens the report in a browser.
+"""
 
 import argparse
 from collections.abc import Collection
@@ -60,19 +65,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Inspect a bag, replay it and open the report; return the exit code of the replay."""
     output = replay.output_folder(args.output, args.bag, args.force)
-    found, choices = _inspect_with_choices(args)
-    if not found['command']:
+    content, choices = _inspect_with_choices(args)
+    if not content['command']:
         from odocal_ros.offline.inspection_text import text
-        missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
+        missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in content['mapping']]
         # the error below states the missing topics
         codes = {f'NO_{slot.upper()}' for slot in missing}
-        print_text(text(found | {'open': '', 'findings': [
-            finding for finding in found['findings'] if finding['code'] not in codes]}))
+        print_text(text(content | {'replay_error': '', 'findings': [
+            finding for finding in content['findings'] if finding['code'] not in codes]}))
         labels = ', '.join(INPUTS[slot].label for slot in missing)
         raise BadData(f'{args.bag}: no usable topic for: {labels}; '
-                      + '; '.join(_missing_action(slot, found['topics']) for slot in missing))
-    options = [*_suggested_options(found['command'], bool(args.leg)), *_user_options(args)]
-    print_text('\n'.join(_overview(found, choices, options, args.settings)))
+                      + '; '.join(_missing_action(slot, content['topics']) for slot in missing))
+    options = [*_suggested_options(content['command'], bool(args.leg)), *_user_options(args)]
+    print_text('\n'.join(_overview(content, choices, options, args.settings)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
     parser.set_defaults(brief=True)
@@ -101,21 +106,21 @@ def _inspect_with_choices(args: argparse.Namespace) -> tuple[dict[str, Any], lis
     config = with_settings(Config(), replay.config_from_arguments(args))
     topics = replay.topics_from_arguments(args)
     with open_bag(Path(args.bag)) as bag:
-        found = inspect(bag, args.bag, config, topics)
-        choices = _choices(bag, config, topics, found)
+        content = inspect(bag, args.bag, config, topics)
+        choices = _choices(bag, config, topics, content)
         if choices and sys.stdin and sys.stdin.isatty() and sys.stdout.isatty():
             choices = [_choice_of_user(bag, choice) for choice in choices]
-            found = inspect(bag, args.bag, config, topics | {
+            content = inspect(bag, args.bag, config, topics | {
                 choice.slot: choice.topic for choice in choices})
-        return found, choices
+        return content, choices
 
 
 def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
-             inspected: dict[str, Any]) -> list[_Choice]:
+             content: dict[str, Any]) -> list[_Choice]:
     """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.library.topics import candidates
     from odocal_ros.offline.suggest import likely_mapping, other_candidates, reason_for_choice
-    mapping, not_following = inspected['mapping'], inspected['still']
+    mapping, not_following = content['mapping'], content['not_following']
     _, config = likely_mapping(bag.topics, config, topics, not_following)
     found = []
     for slot in mapping.keys() - topics.keys():
@@ -167,15 +172,15 @@ def _user_options(args: argparse.Namespace) -> list[str]:
     return words + ['--strict'] * args.strict
 
 
-def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
-              own_settings: Collection[str]) -> list[str]:
+def _overview(content: dict[str, Any], choices: list[_Choice], options: list[str],
+              user_settings: Collection[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.output.value_text import wrapped
     because = {choice.slot: f', because {choice.reason}; other candidates: '
                f'{", ".join(choice.other_candidates)} ({topic_option(choice.slot)})'
                for choice in choices}
     lines = ['topics']
-    mapping = found['mapping']
+    mapping = content['mapping']
     wheels = {'odometer': 0, 'odometer_right': 1}
     for slot in sorted(mapping, key=lambda slot: wheels.get(slot, 2)):
         left = 'left ' * (slot == 'odometer' and 'odometer_right' in mapping)
@@ -184,20 +189,20 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str],
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)
     for setting in settings:
-        lines += wrapped(f'{setting}: {_setting_reason(setting, found, own_settings)}')
+        lines += wrapped(f'{setting}: {_setting_reason(setting, content, user_settings)}')
     legs = [value for option, value in pairs if option == '--leg'] or [
-        f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['legs']]
+        f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in content['legs']]
     lines += ['legs, seconds from the first message'] * bool(legs)
     return [*lines, *wrapped(', '.join(legs)), '']
 
 
-def _setting_reason(setting: str, found: dict[str, Any], own_settings: Collection[str]) -> str:
+def _setting_reason(setting: str, content: dict[str, Any], user_settings: Collection[str]) -> str:
     """Return the reason why a setting has its value for this bag."""
     name, _, value = setting.partition('=')
-    if setting in own_settings:
+    if setting in user_settings:
         return 'given by --set'
     if name == 'imu.mounting_rpy':
-        return _mounting_reason(found['mounting'])
+        return _mounting_reason(content['mounting'])
     return SETTING_REASONS.get(name) or (BY_TOPIC_NAME if value == 'topic' else BY_MOTION)
 
 

@@ -180,7 +180,7 @@ def test_wheels_are_the_joints_that_follow_the_fixes(tmp_path, capsys):
     path = write(tmp_path / 'bag', made, rows)
     found, text = inspected(path, capsys)
     assert found['mapping']['odometer'] == '/joint_states'
-    assert found['still'] == ['/arm/joint_states']
+    assert found['not_following'] == ['/arm/joint_states']
     assert found['command'].endswith('--set odometer.left=b --set odometer.right=a')
     assert all(f'  {name} travels' in text for name in names)
     assert ': a wheel, 0.42' in text
@@ -239,7 +239,7 @@ def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
         tmp_path / 'bag', made, velocity('/vel', made.velocity)), capsys)
     block = text.partition('\n/vel\n')[2].partition('\n\n')[0]
     assert block.strip().startswith('one component of a velocity')
-    assert found['still'] == ['/vel']
+    assert found['not_following'] == ['/vel']
 
 
 def test_without_messages_nothing_is_said_of_standing(tmp_path, capsys):

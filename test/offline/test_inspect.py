@@ -46,7 +46,7 @@ def test_a_good_drive_lacks_only_a_heading(inspect_drive):
     assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.05)
     assert seen['mounting'] == seen['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
     assert seen['command'] == f'odocal replay {seen["path"]}'
-    assert seen['open'] == ''
+    assert seen['replay_error'] == ''
     assert 'imu.mounting_rpy is correct to the nearest quarter turn: [0, 0, 0]' in text
 
 
@@ -59,7 +59,7 @@ def test_axes_are_told(inspect_drive, capsys, rpy):
     seen, _ = inspect_drive(drive(C_ib=C_bi.T @ small.T))
     assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
     assert seen['mounting']['needed']
-    assert seen['mounting']['off'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
+    assert seen['mounting']['deviation'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
     setting = shlex.split(seen['command'])[-1]
     assert setting.startswith('imu.mounting_rpy=[')
     # set as seen, nothing is left to say about the axes
@@ -275,7 +275,7 @@ def test_topic_named_by_the_user(inspect_drive, capsys):
     seen, _ = inspect_drive(sorted(rows, key=lambda row: row[1]))
     path = seen['path']
     assert seen['mapping']['odometer'] == '/odometer'     # a counter before a speed
-    assert '2 topics can be the odometer' in seen['open']
+    assert '2 topics can be the odometer' in seen['replay_error']
     assert '--odometer-topic /odometer' in seen['command']
     seen, _ = inspect(path, capsys, '--odometer-topic', 'speed')
     assert seen['mapping']['odometer'] == '/speed'
