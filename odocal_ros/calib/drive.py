@@ -24,20 +24,20 @@ LEAST_SHARE = 0.01          # judgement, of the path
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """Return as ``check_path_and_speed``, with a reason if the leg is not straight."""
-    distance, found = check_path_and_speed(track, t_stop, metres_per_unit, leg)
+    distance, reasons = check_path_and_speed(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
     if len(t) < 2:
-        return distance, found
+        return distance, reasons
     step, yaw = np.abs(np.diff(s)), np.unwrap(yaw_from_quat(track.q_nb[inside]))
     turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
     limit = 0.1         # judgement: manoeuvres at the ends are shorter
     if share > limit:
-        found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
-                         f'in turns above {leg.max_yaw_rate:g} rad/s; the limit is '
-                         f'{100 * limit:.0f} %'),)
-    return distance, found
+        reasons += (Reason(
+            Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven in turns '
+            f'above {leg.max_yaw_rate:g} rad/s; the limit is {100 * limit:.0f} %'),)
+    return distance, reasons
 
 
 def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
@@ -50,17 +50,17 @@ def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
     distance = float(np.abs(np.diff(s)).sum())
-    found: tuple[Reason, ...] = ()
+    reasons: tuple[Reason, ...] = ()
     if distance < leg.min_distance:
-        found += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks; the limit is '
-                         f'{leg.min_distance:g} m'),)
+        reasons += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks; the limit is '
+                           f'{leg.min_distance:g} m'),)
     if len(t) < 2:
-        return distance, found
+        return distance, reasons
     top_speed = float(np.abs(rate_over_second(t, s)).max())
     if top_speed < leg.min_speed:
-        found += (Reason(Code.SPEED_TOO_LOW, f'highest speed (mean over 1 s) {top_speed:.2f} m/s; '
-                         f'the limit is {leg.min_speed:g} m/s'),)
-    return distance, found
+        reasons += (Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
+                           f'{top_speed:.2f} m/s; the limit is {leg.min_speed:g} m/s'),)
+    return distance, reasons
 
 
 def rate_over_second(t: Floats, x: Floats) -> Floats:
@@ -88,7 +88,10 @@ def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                    t_stop: float, least: float) -> tuple[Reason, ...]:
     """Return the reason if wheels or fixes do not move between the marks; least: of fixes, m."""
-    rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
+    # judgement: with slow fixes a mark is between two of them; three before it give the position
+    mark_margin, count_before = 0.5, 3      # s
+    rows = slice(max(0, np.searchsorted(t_fix, -mark_margin) - count_before),
+                 np.searchsorted(t_fix, t_stop + mark_margin))
     t, fixes = t_fix[rows], fixes_n[rows, :2]
     if len(fixes) < 2:
         return (Reason(Code.NO_FIX, f'{len(fixes)} usable fix{"es" * (len(fixes) != 1)} between '
@@ -102,6 +105,7 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
+    # three counts: a wheel at rest on the edge of a pulse may count once in each direction
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
         return _stopped_counter_reasons(travel, t, fixes, fix_sigma)
@@ -144,13 +148,19 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 
 def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
-    """Return intervals in which fixes move and wheels stand, as on a ferry, (k, 2) s."""
+    """
+    Return intervals in which fixes move and wheels stand, as on a ferry, (k, 2) s.
+
+    An interval begins when the fixes leave their place at its start, and ends when they reach the
+    last one: the standstill on either side is not a ferry.
+    """
     spans = []
     for distance, begin, end in _motion_without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
         if end >= travel.t[-1]:
             continue
         t, p, few = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
+        # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
         has_left, is_before_end = (np.hypot(*(p - np.median(at, axis=0)).T) > limit
                                    for at in (p[:few], p[-few:]))

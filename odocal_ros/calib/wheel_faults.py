@@ -56,8 +56,8 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     if pair is None or not metres_per_unit:
         return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)
-    signals = regression.regressors(pair, metres_per_unit)
-    x, covariance = regression.fit_signals(pair, signals, metres_per_unit)
+    regressors = regression.right_path_regressors(pair, metres_per_unit)
+    x, covariance = regression.fit_right_path(pair, regressors, metres_per_unit)
     if x is None or covariance is None or x[0] <= 0:
         return (), slip.NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
@@ -66,10 +66,10 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     reasons = regression.side_reasons(pair, x[1] * per_right,
                                       np.sqrt(covariance[1, 1]) * per_right, track_width)
     reasons += regression.counter_reasons(pair, ratio, width, max_deviation)
-    residual = (pair.right - signals @ x) * per_right
+    residual = (pair.right - regressors @ x) * per_right
     events, slow_events = _find_events(pair, residual, per_right * (1 + ratio) / 2, width)
     found, change = regression.find_ratio_change(
-        _without_slips(pair, events), signals, metres_per_unit, count)
+        _without_slips(pair, events), regressors, metres_per_unit, count)
     reasons += found
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + slow_events)

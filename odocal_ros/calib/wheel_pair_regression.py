@@ -45,7 +45,7 @@ def without_gyro_drift(pair: WheelPair) -> WheelPair:
     return replace(pair, turn=pair.turn - running_sum(bias * pair.step))
 
 
-def regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
+def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
     """
     Return the regressors of the right path, at the edges of the cells: (n, 6).
 
@@ -67,11 +67,11 @@ def _smooth(x: Floats, reach: int) -> Floats:
     return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
 
 
-def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
-                ) -> tuple[Floats, Floats] | tuple[None, None]:
+def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
+                   ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return coefficients, (k,), of (n, k) regressors by cells of a second, and covariance."""
     at = np.arange(0, len(pair.t), MEAN_STEPS)
-    A, y = np.diff(signals[at], axis=0), np.diff(pair.right[at])
+    A, y = np.diff(regressors[at], axis=0), np.diff(pair.right[at])
     keep = np.logical_and.reduceat(pair.known, at[:-1])[:len(y)]
     keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < 20:
@@ -82,7 +82,7 @@ def fit_signals(pair: WheelPair, signals: Floats, metres_per_unit: float,
     load_sigma = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
     prior = np.array([np.inf, width_sigma, np.inf, delay_sigma,
                       delay_sigma * usual_width / metres_per_unit, load_sigma])
-    prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
+    prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
     floor = 0.4 * pair.quantum + 1e-3 / metres_per_unit
     x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
     return x, covariance
@@ -105,7 +105,7 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
                    f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)
 
 
-def find_ratio_change(pair: WheelPair, signals: Floats, metres_per_unit: float,
+def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: float,
                       count: int) -> tuple[tuple[Reason, ...], float]:
     """
     Return a reason if the ratio of the wheels changes at a place of the path, and the change.
@@ -118,7 +118,8 @@ def find_ratio_change(pair: WheelPair, signals: Floats, metres_per_unit: float,
     for share in np.arange(1, 8) / 8:       # of the path
         at = int(np.searchsorted(path, share * path[-1]))
         left_after = np.where(np.arange(len(path)) > at, pair.left - pair.left[at], 0.0)
-        x, covariance = fit_signals(pair, np.column_stack([signals, left_after]), metres_per_unit)
+        x, covariance = fit_right_path(
+            pair, np.column_stack([regressors, left_after]), metres_per_unit)
         if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
