@@ -9,11 +9,13 @@ from odocal_reproductions.paper.cells import Cell, TABLE_1, TABLE_2
 from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, STATES
 
 # definition: errors in Shi et al. 2015
-DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
-LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # rad, 0.5' and 3.6'
+GYRO_DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
+# definition: rad, of phi_E and phi_N, 0.5', and of phi_U, 3.6'
+TILT_ERROR, HEADING_ERROR = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)
 # factors of table 2, the sizes of the errors: rad, rad/s
-SIZES = {'dL': 10.0 / PAPER_RADIUS, 'phi_E': LEVEL, 'phi_N': LEVEL, 'phi_U': HEADING,
-         'eps_E': DRIFT, 'eps_N': DRIFT, 'eps_U': DRIFT}
+SIZES = {'dL': 10.0 / PAPER_RADIUS,
+         'phi_E': TILT_ERROR, 'phi_N': TILT_ERROR, 'phi_U': HEADING_ERROR,
+         'eps_E': GYRO_DRIFT, 'eps_N': GYRO_DRIFT, 'eps_U': GYRO_DRIFT}
 DRIFT_OF = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
 # remarks on printed values that differ from the computed ones
 REMARKS_1 = {

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_reproductions.paper.coefficients import DRIFT, HEADING, LEVEL
+from odocal_reproductions.paper.coefficients import GYRO_DRIFT, HEADING_ERROR, TILT_ERROR
 from odocal_reproductions.paper.error_forms import chord_error, plane_error, SpeedProfile
-from odocal_reproductions.paper.error_model import propagate
+from odocal_reproductions.paper.error_model import LAT, LON, propagate, U
 from odocal_reproductions.paper.path import Path, planned_path
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats
@@ -47,8 +47,9 @@ SOURCES = {
 def errors_of(source: str) -> tuple[Floats, Floats]:
     """Return phi_n (3,), rad, and eps_b (3,), rad/s in forward-left-up, of a row of table 3."""
     phi, eps = SOURCES[source]
-    right_forward_up = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return np.multiply(phi, (LEVEL, LEVEL, HEADING)), right_forward_up @ eps * DRIFT
+    flu_from_rfu = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return (np.multiply(phi, (TILT_ERROR, TILT_ERROR, HEADING_ERROR)),
+            flu_from_rfu @ eps * GYRO_DRIFT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +91,10 @@ class PaperDrive:
         """Return the true alignment plus the errors of a source."""
         phi_n, eps_b = errors_of(source)
         return Alignment(
-            t=0.0, C_nb=exp_so3(-phi_n) @ self.C_nb, gyro_bias=-eps_b, level_sigma=LEVEL,
-            heading_sigma=HEADING, gyro_bias_sigma=np.full(3, DRIFT), gyro_noise=GYRO_NOISE,
-            gyro_bias_walk=0.0, heading_source='fixed', heading_shared=True,
-            standstill=(-self.start, 0.0))
+            t=0.0, C_nb=exp_so3(-phi_n) @ self.C_nb, gyro_bias=-eps_b, level_sigma=TILT_ERROR,
+            heading_sigma=HEADING_ERROR, gyro_bias_sigma=np.full(3, GYRO_DRIFT),
+            gyro_noise=GYRO_NOISE, gyro_bias_walk=0.0, heading_source='fixed',
+            heading_shared=True, standstill=(-self.start, 0.0))
 
     def outcome(self, source: str) -> Outcome:
         """Return the pipeline result with the errors of a source."""
@@ -126,15 +127,17 @@ class PaperDrive:
         """Return the growth of the errors of a source: (15)-(23), then (13), (14), (12)."""
         phi_n, eps_b = errors_of(source)
         path = self.path()
-        x = propagate(path, [*phi_n, 0.0, 0.0, 0.0], eps_b)
+        x = propagate(path, [*phi_n, 0.0, 0.0, 0.0], eps_b)     # no position error at the start
         meridian = path.longitude[0]
         north, east = plane_for(self.config.projection, meridian).forward(
             path.latitude, path.longitude)
         north, east = north - north[0], east - east[0]
-        dx, dy = plane_error(path.latitude, path.longitude, meridian, x[:, 3], x[:, 4])
+        dx, dy = plane_error(path.latitude, path.longitude, meridian,
+                             x[:, LAT], x[:, LON])
         chord = np.hypot(north, east)
         with np.errstate(invalid='ignore', divide='ignore'):
             _, yaw = chord_error(north, east, dx, dy, chord, 1.0)
             across = (north * dy - east * dx) / chord
         moved = chord > 1.0      # m: before, a chord has no direction
-        return Growth(path.t, np.where(moved, yaw, np.nan), np.where(moved, across, 0.0), x[:, 2])
+        return Growth(path.t, np.where(moved, yaw, np.nan), np.where(moved, across, 0.0),
+                      x[:, U])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_reproductions.paper.cells import Cell, CONVENTION, TABLE_3, TABLE_4
-from odocal_reproductions.paper.coefficients import DRIFT, HEADING, table_1, table_2
+from odocal_reproductions.paper.coefficients import GYRO_DRIFT, HEADING_ERROR, table_1, table_2
 from odocal_reproductions.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
 from odocal_reproductions.paper.error_forms import SpeedProfile
 
@@ -91,8 +91,8 @@ def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row
 
 def _table_4(third: dict[str, Row],
              profile: SpeedProfile) -> dict[str, dict[str, dict[str, Cell]]]:
-    formula = {'eps_z': profile.heading_and_drift(0.0, DRIFT),
-               'phi_U0': profile.heading_and_drift(HEADING, 0.0)}
+    formula = {'eps_z': profile.heading_and_drift(0.0, GYRO_DRIFT),
+               'phi_U0': profile.heading_and_drift(HEADING_ERROR, 0.0)}
 
     def line(source: str, name: str) -> dict[str, Cell]:
         if name == 'simulated':
