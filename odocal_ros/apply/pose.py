@@ -24,7 +24,11 @@ NONE = (0.0,) * 6      # definition
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose at an IMU stamp, mean motion since the last; raw: 85 floats of nav_msgs/Odometry."""
+    """
+    Pose at the stamp of an IMU sample, and mean velocity and turn rate since the previous one.
+
+    raw : the 85 floats of pose and twist with covariances, as in nav_msgs/Odometry.
+    """
 
     stamp_ns: int
     raw: bytes

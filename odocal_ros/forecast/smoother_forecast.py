@@ -160,7 +160,11 @@ def format_value(value: float, sigma: float) -> str:
 
 
 def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> Forecast:
-    """Return the planar estimator's forecast; raises Abandoned: not needed, BadData: no fit."""
+    """
+    Return the forecast of a leg by the planar estimator.
+
+    Raises Abandoned: ``is_needed`` returns False during the fit; BadData: no fit is possible.
+    """
     def check_needed(_: Stage | None = None) -> None:
         if not is_needed():
             raise Abandoned

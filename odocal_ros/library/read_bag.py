@@ -53,7 +53,11 @@ class JournalNotes:
 
 
 def journal_notes(bag: Path) -> JournalNotes | None:
-    """Return a journal's metadata, None for other bags; BadUsage, BadConfig: wrong settings."""
+    """
+    Return the metadata of a journal; None for other bags.
+
+    Raises BadUsage: the settings file is not regular; BadConfig: its settings are not valid.
+    """
     path = (bag if bag.is_dir() else bag.parent) / JOURNAL
     if not path.exists():
         return None

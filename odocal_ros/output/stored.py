@@ -105,7 +105,11 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
 
 
 def known_imu(config: Config) -> CarriedInformation | None:
-    """Return the IMU information of the result at ``imu.constants``, if any; raises BadUsage."""
+    """
+    Return the information on the IMU in the result at ``imu.constants``; None if it is not set.
+
+    Raises BadUsage: the result cannot be read, is of another IMU or contains no IMU constants.
+    """
     if not config.imu.constants:
         return None
     try:

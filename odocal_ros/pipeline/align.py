@@ -151,7 +151,12 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                     config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """Return yaw and sigma of L's x axis, rad, source, True if shared by legs, and reasons."""
+    """
+    Return the heading by the first source that has one, and the reasons of those that do not.
+
+    The heading is the ENU yaw of L's x axis and its sigma, rad, the name of its source, and True
+    if its error is the same in every leg.
+    """
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']

@@ -136,7 +136,11 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
 
 def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
                     carried: CarriedInformation | None, local: bool) -> MethodResult:
-    """Return the combination of (result, time, number) not rejected; of all if all are."""
+    """
+    Return the combination of results that are not rejected, or of all if all are rejected.
+
+    driven : result, start time, ns, and number of each leg.
+    """
     usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or driven), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,

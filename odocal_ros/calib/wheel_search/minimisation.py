@@ -122,7 +122,12 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
 
 
 class _BoxSearch:
-    """State of a search: middle q and half width w of the box, (n,); half range of x, (3,)."""
+    """
+    State of a search: the box around the best point so far, within a range about zero.
+
+    q, w : (n,) middle and half width of the box, in the coordinates of ``space``.   half : (3,)
+    half of the range of x.   least : criterion at the middle.
+    """
 
     def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
                  x: Floats) -> None:
