@@ -4,8 +4,8 @@
 """
 Detection of an IMU topic that is not one IMU, fixed in the vehicle, with one unit.
 
-During a leg gravity or the forward direction turns in its frame, the unit changes, or the messages
-of two IMUs alternate.
+Faults: gravity or the forward direction turns in its axes during a leg, the unit changes, or the
+messages of two IMUs alternate. Each function returns the reasons for one fault, () without it.
 """
 
 from collections import Counter
@@ -38,19 +38,21 @@ MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not
 # judgement, for the test of alternating rows: rows of a block; least and largest number of blocks,
 # from the end of the leg; ratio of an outlier to the median; largest share of repeated rows
 MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
-# statistical: F of a constant and the signals in the differences of odd and even rows. For one IMU
-# it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
+# statistical: F of the regression of odd minus even rows on a constant and the signals. For one
+# IMU it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
 LEAST_F = 30.0
-# judgement: least explained variance, in variances of a mean of white noise; 8/3 is that of a mean
-# over that of a row. Smooth signals without noise are below it
+# judgement: least explained variance, a tenth of that of white noise in a mean of a block. White
+# samples in differences with the weights 1/4, 1/2, 1/4 give a mean 8/3 of the variance of a row
+# over the number of rows. Smooth signals without noise are below the limit
 LEAST_POWER = 0.1 * 8 / 3
-# judgement: a vibration near half the rate changes its size and phase. Largest correlation of
-# adjacent residuals, and largest size of it over the explained part; two IMUs exceed at most one
+# judgement: the difference by a vibration near half the rate changes slowly, as its phase does.
+# Largest correlation of adjacent residuals, and largest share of their product in the explained
+# sum of squares; two IMUs exceed at most one of them
 CORRELATION_LIMIT, SLOW_SHARE_LIMIT = 0.5, 0.05
 
 
 def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
-    """Return the edges of the tenths of the rows, (11,), their median force, (10, 3), or none."""
+    """Return the edges of tenths of the leg, (11,) rows, and their median force, (10, 3) in b."""
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
     if not inputs.has_accelerometer or edges[1] < LEAST_TENTH_ROWS:
         return edges[:0], np.empty((0, 3))
@@ -61,15 +63,15 @@ def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
 def unit_change_reasons(inputs: Inputs) -> tuple[Reason, ...]:
     """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
     edges, force = _tenths(inputs)
-    size = [float(np.linalg.norm(one)) for one in force]
-    odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
-    if not odd or len(odd) == len(size):      # all tenths: the unit of the whole leg
+    gravity = np.linalg.norm(force, axis=1).tolist()
+    wrong = [k for k, g in enumerate(gravity) if not LEAST_RATIO * G < g < MOST_RATIO * G]
+    if not wrong or len(wrong) == len(gravity):      # all tenths: the unit of the whole leg
         return ()
-    begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
+    begin, end = inputs.t_imu[edges[wrong[0]]], inputs.t_imu[edges[wrong[-1] + 1] - 1]
     return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
-                   f'gravity of {size[odd[0]]:.3g} m/s^2 instead of 9.8 m/s^2', 'Check the IMU '
-                   'driver for a change of unit or range during the drive, or mark a leg on one '
-                   'side of it with --leg.'),)
+                   f'gravity of {gravity[wrong[0]]:.3g} m/s^2 instead of 9.8 m/s^2',
+                   'Check the IMU driver for a change of unit or range during the drive, or mark '
+                   'a leg on one side of it with --leg.'),)
 
 
 def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
@@ -78,10 +80,10 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
     for k in range(1, len(force) - 1):
         sides = force[:k], force[k + 1:]
         before, after = (side.mean(axis=0) for side in sides)
-        # a bend, or another unit, also changes the size
-        size = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
+        # a bend, or another unit, also changes the magnitude
+        ratio = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
         turn_deg = _angle_between(before, after)
-        if (turn_deg > LEAST_IMU_TURN and 1 / GRAVITY_RATIO < size < GRAVITY_RATIO
+        if (turn_deg > LEAST_IMU_TURN and 1 / GRAVITY_RATIO < ratio < GRAVITY_RATIO
                 and all(_angle_between(one, mean) < GRAVITY_SCATTER for side, mean in zip(
                     sides, (before, after), strict=True) for one in side)):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
@@ -95,7 +97,7 @@ def forward_turn_reasons(found: Accelerations | None) -> tuple[Reason, ...]:
     if found is None:
         return ()
     edges = np.linspace(0, len(found.t), 11).astype(int)
-    seen = []
+    turns = []      # sigma and angle, deg, begin and end, s
     for a, b in zip(edges[1:-2], edges[2:-1], strict=True):
         sides = orientation_of(found[:a]), orientation_of(found[b:])
         if sides[0] is None or sides[1] is None:
@@ -103,10 +105,10 @@ def forward_turn_reasons(found: Accelerations | None) -> tuple[Reason, ...]:
         turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
         sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
         if LEAST_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
-            seen.append((sigma, -turn_deg, float(found.t[a]), float(found.t[b])))
-    if not seen:
+            turns.append((sigma, -turn_deg, float(found.t[a]), float(found.t[b])))
+    if not turns:
         return ()
-    sigma, turn_deg, begin, end = min(seen)
+    sigma, turn_deg, begin, end = min(turns)      # the most certain one
     return (_imu_moved_reason(f'the forward direction turns by {turn_deg:+z.0f} '
                           f'± {max(sigma, 1.0):.0f} deg', begin, end),)
 
@@ -144,7 +146,7 @@ def other_frame_reasons(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
 
 
 def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
-    """Return SEVERAL_IMUS if every second row is from another IMU; (n, 3) in any unit."""
+    """Return SEVERAL_IMUS if every second row is from another IMU; (n, 3) in i, any unit."""
     share = max(_share_of_second_imu(w_i), _share_of_second_imu(f_i))
     if not share:
         return ()
@@ -156,10 +158,11 @@ def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
 
 def _share_of_second_imu(x: Floats) -> float:
     """
-    Return the share of odd minus even rows, x (n, 3), that a second IMU explains; 0: none.
+    Return the share of the variance of odd minus even rows that a second IMU explains; 0: none.
 
-    In the means of blocks, a constant (other bias) and factors of the signals (other axes) are
-    fitted to the differences; the F test decides.
+    Half the difference of a row and the mean of its two neighbours is averaged in blocks. A second
+    IMU adds a constant (another bias) and a combination of the signals (other axes); the F test
+    decides whether a fit of both is significant.   x : (n, 3) rows.
     """
     x = x[-MOST_MEANS * MEAN_ROWS - 2:]
     count = (len(x) - 2) // MEAN_ROWS
@@ -173,18 +176,19 @@ def _share_of_second_imu(x: Floats) -> float:
     good = size <= OUTLIER_RATIO * np.median(size)
     mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[good]
     # blocks of equal noise: one that tilts and vibrates more would dominate the fit
-    blocks, A = blocks[good], np.column_stack([np.ones(len(mean)), mean])
+    blocks, design = blocks[good], np.column_stack([np.ones(len(mean)), mean])
     noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
     noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
-    difference, A, blocks = difference[good] / noise, A / noise, blocks / noise[:, None]
-    freedom = len(difference) - A.shape[1]
+    difference, design = difference[good] / noise, design / noise
+    blocks = blocks / noise[:, None]
+    freedom = len(difference) - design.shape[1]
     if freedom < FEWEST_MEANS // 2:
         return 0.0
-    residual = difference - A @ np.linalg.lstsq(A, difference, rcond=None)[0]
+    residual = difference - design @ np.linalg.lstsq(design, difference, rcond=None)[0]
     unexplained, total = (residual**2).sum(axis=0), (difference**2).sum(axis=0)
     lagged = (residual[1:] * residual[:-1]).sum(axis=0)
     explained, power = total - unexplained, (blocks**2).mean(axis=(0, 1))
-    significant = (explained * freedom > LEAST_F * A.shape[1] * unexplained) & (
+    significant = (explained * freedom > LEAST_F * design.shape[1] * unexplained) & (
         explained / len(difference) > LEAST_POWER * power / MEAN_ROWS)
     vibrating = lagged > np.maximum(CORRELATION_LIMIT * unexplained, SLOW_SHARE_LIMIT * explained)
     if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:

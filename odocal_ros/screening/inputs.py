@@ -29,15 +29,19 @@ class UsableRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A screened leg: rising times since the start mark, SI, body frame."""
+    """
+    A screened leg in SI units, with rising times since the start mark.
+
+    b : axes of the IMU after its nominal mounting rotation; i : axes of the IMU messages.
+    """
 
     t_stop: float                      # s, the stop mark
     t_imu: NDArray[np.float64]         # (n,)
     w_b: NDArray[np.float64]           # (n, 3) rad/s
     f_b: NDArray[np.float64]           # (n, 3) m/s^2
-    q_ni: NDArray[np.float64]          # (n, 4) published orientation of frame i
+    q_ni: NDArray[np.float64]          # (n, 4) published orientation, i to n
     yaw_variance: NDArray[np.float64]  # (n,) rad^2, NaN: no orientation
-    C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
+    C_bi: NDArray[np.float64]          # (3, 3) nominal mounting, i to b
     travel: Travel                     # mean of the wheels
     travels: tuple[Travel, ...]        # of several wheels; () if one, or if sides are unknown
     uncertain_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
