@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Values of a vehicle over its legs, and comparison of the vehicles of a model.
+Values of a vehicle over its legs, and comparison of vehicles of the same vehicle model.
 
-Changes of a vehicle are steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
-The model of the values is a level, steps, a slope, outlier legs, and errors of known covariance:
-independent errors of each leg, shared errors, and the random walk of a scale. Forward selection
-adds the slope, step or outlier leg that explains most, while it is significant. Backward
+``history``: changes of a vehicle are steps in a value over its legs (tyres, pressure, a moved IMU)
+and drift. The values are the sum of a constant, steps, a slope, outlier legs, and errors of known
+covariance: independent errors of each leg, shared errors, and the random walk of a scale. Forward
+selection adds the slope, step or outlier leg that explains most, while it is significant. Backward
 elimination then drops terms that are no longer significant: no pair is kept if one alone explains
 the values.
+
+``population``: mean and spread of the vehicles of a vehicle model, with outliers.
 """
 
 from collections.abc import Sequence
@@ -21,7 +23,8 @@ from numpy.typing import NDArray
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
-MODEL_OUTLIER_SIGMAS = 4.0     # statistical: of a vehicle from its model; by chance 1 in 16,000
+# statistical: of a vehicle from the mean of its vehicle model; by chance 1 in 16,000
+MODEL_OUTLIER_SIGMAS = 4.0
 FEWEST_VEHICLES = 3            # judgement: for a spread
 
 
@@ -36,7 +39,7 @@ class Change:
 
 @dataclass(frozen=True)
 class History:
-    """The history of a value."""
+    """The history of a value; legs are counted from 0."""
 
     changes: tuple[Change, ...] = ()       # in order
     outliers: tuple[int, ...] = ()         # single outlier legs
@@ -74,10 +77,10 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     n = len(y)
     if n < 2:
         return History()
-    L = np.linalg.cholesky(V)
-    # candidates: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
     has_slope = t is not None and np.ptp(t) > 0 and n > 2
-    white = np.linalg.solve(L, np.column_stack([
+    # whitened columns: y, the constant, and the candidates W: n - 1 steps, from leg 1, 2, ... on;
+    # n - 2 outliers, legs 1 to n - 2 alone; and the slope
+    white = np.linalg.solve(np.linalg.cholesky(V), np.column_stack([
         y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
         *([t - t[0]] if t is not None and has_slope else [])]))
     z, level, W = white[:, 0], white[:, 1], white[:, 2:]
@@ -126,7 +129,7 @@ def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Values of one model's vehicles."""
+    """Values of the vehicles of a vehicle model."""
 
     mean: float           # robust
     sigma: float          # of the mean

@@ -19,8 +19,8 @@ from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, rotate,
 from odocal_ros.settings.nominal import Grade
 
 # limits of the alignment of a leg, recorded or planned
-MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level without standstill
-COURSE_DISTANCE = 30.0    # m, judgement: of track for a course
+MOTION_LEVEL = 30.0       # s, judgement: driving time that determines a level without standstill
+COURSE_DISTANCE = 30.0    # m, judgement: length of the track that determines a course
 HEADING_LIMIT = 0.5      # rad, judgement: limit of the sigma of an orientation used as heading
 COMPASS_LIMIT = 0.05      # rad, judgement: limit of the sigma of a gyrocompass
 # s, judgement: excluded at each end of a standstill: a slow start tilts the specific force
@@ -29,7 +29,7 @@ REST_EDGE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Attitude and gyro bias at one epoch; sigmas are 1 sigma."""
+    """Attitude and gyro bias at one epoch; frames n and b as in the package, 1 sigma."""
 
     t: float                  # s since the start mark, start of the strapdown
     C_nb: Floats              # (3, 3) b to n
@@ -39,7 +39,8 @@ class Alignment:
     gyro_bias_sigma: Floats   # (3,) rad/s
     gyro_noise: float         # rad/s/sqrt(Hz)
     gyro_bias_walk: float     # rad/s/sqrt(s)
-    heading_source: str       # that of ``course`` includes the mounting angle
+    # setting alignment.source; a heading by ``course`` includes the yaw mounting angle
+    heading_source: str
     heading_shared: bool      # True: its error is the same in every leg
     standstill: tuple[float, float] | None = None    # begin and end, s; None: in motion
     gyro_scale_sigma: float = 0.0    # relative
@@ -58,7 +59,11 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Level and turn rate before heading is known; L is level, its x the projection of b's x."""
+    """
+    Level and turn rate before the heading is known.
+
+    Frame L is level; its x axis is the horizontal projection of the x axis of b.
+    """
 
     t: float               # s since the start mark
     C_Lb: Floats           # (3, 3) b to L
@@ -66,7 +71,7 @@ class Level:
     mean_rate_b: Floats    # (3,) rad/s over the standstill, zero in motion
     rate_sigma: float      # rad/s, of the mean as bias at t
     standstill: tuple[float, float] | None    # begin and end, s; None: in motion
-    # (3, 3) ENU at the position p of the vehicle to n
+    # (3, 3) to n from p, east-north-up at the position of the vehicle
     C_np: Floats = field(default_factory=lambda: np.eye(3))
 
 
@@ -114,7 +119,7 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     Return the level from the mean specific force in motion, corrected for the change of velocity.
 
     In axes fixed at the start 0, the integral of C_0b f is the change of velocity plus g T up;
-    the velocity is along b's x axis up to the mounting angles, assumed to be within 3 deg.
+    the velocity is along b's x axis up to the mounting angles, assumed to be 0.05 rad, 1 sigma.
 
     t, f_b : (n,), (n, 3) IMU rows of the interval: s, m/s^2.   q_0b : (n, 4) attitude relative to
     the first row, from the gyro.   speed : (2,) speed at the first and the last row, m/s.
@@ -128,8 +133,10 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     up_0 = lift - (C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0])
     g = gravity(latitude, 0.0)
     fastest = np.abs(speed).max()
-    earth = OMEGA * (T / 2 + 2 * fastest / g)       # rotation of the level, and Coriolis
-    parts = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, fastest * 0.05 / (g * T))
+    # rotation of the level until half of the interval, and Coriolis acceleration 2 Omega v
+    earth = OMEGA * (T / 2 + 2 * fastest / g)
+    mounting = 0.05 * fastest / (g * T)
+    parts = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, mounting)
     return Level(float(t[0]), level_frame(up_0), float(np.linalg.norm(parts)), np.zeros(3),
                  0.0, None)
 
