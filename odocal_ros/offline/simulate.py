@@ -15,16 +15,12 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.cli import Phase, print_text
-from odocal_ros.safe_io.atomic_files import write_text
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.levels import DAY_NS
 
 if TYPE_CHECKING:
-    from odocal_ros.sim.fleet import FleetVehicle
     from odocal_ros.sim.options import SimOptions
-    from odocal_ros.sim.scenarios import Drive
 
-MANIFEST = 'manifest.csv'
 NUMBERS = {      # options that are fields of SimOptions: (metavar, help); below, help of angles
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
@@ -192,7 +188,7 @@ def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOpti
 def run(args: argparse.Namespace) -> int:
     """Simulate; write a bag with its two files, or those of a fleet; return 0."""
     if args.fleet is not None:
-        return simulate_fleet(args, options_of(args))
+        return _run_fleet(args)
     heading_sigma_deg = args.known_heading_sigma_deg
     if heading_sigma_deg is not None and not 0 <= heading_sigma_deg <= 180:
         raise BadUsage(f'--known-heading-sigma-deg {heading_sigma_deg:g}: required: 0 to 180')
@@ -214,70 +210,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
-    """
-    Write DIR/<vehicle>/bag_<nn>, DIR/<model>.yaml, DIR/manifest.csv and DIR/truth.yaml; return 0.
-
-    options : of each drive, except values that differ between vehicles.
-    """
-    from odocal_ros.library.simulate import write_yaml
-    from odocal_ros.output.tables import csv_text
-    from odocal_ros.sim.fleet import fleet_of
+def _run_fleet(args: argparse.Namespace) -> int:
+    """Write the bags of a fleet; return 0."""
+    from odocal_ros.library.simulate_fleet import simulate_fleet
     out = Path(args.out)
-    limit = 100_000    # vehicles
-    if not (1 <= args.fleet <= limit and 1 <= args.bags <= 1000):
-        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: required: 1 to {limit} vehicles '
-                       'with 1 to 1000 bags each')
-    if (out / MANIFEST).exists() and not args.force:
-        raise BadUsage(f'{out / MANIFEST} already exists; give --force to replace the fleet, or '
-                       'another --out')
-    vehicles = fleet_of(args.fleet, args.bags, options.seed)
-    rows, truth = [], []
-    with Phase('simulating', args.quiet) as phase:
-        for number, vehicle in enumerate(vehicles):
-            drives = [_bag(args, out, number, vehicle, bag, options) for bag in range(args.bags)]
-            rows += [row for row, _ in drives]
-            truth.append(_truth(vehicle, [made for _, made in drives]))
-            phase((number + 1) / len(vehicles), vehicle.name)
-    write_yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
-    write_text(out / MANIFEST, csv_text(rows))      # last: it marks a complete fleet
+    with Phase('simulating', args.quiet) as progress:
+        manifest = simulate_fleet(
+            out, options_of(args), args.fleet, args.bags, storage=args.storage,
+            compression=args.compression, force=args.force, progress=progress)
     if not args.quiet:
-        print_text(f'{out}: {len(vehicles)} vehicles, {len(rows)} bags; truth in '
-                   f'{out}/truth.yaml; next: odocal fleet {out / MANIFEST} --output result')
+        print_text(f'{out}: {args.fleet} vehicles, {args.fleet * args.bags} bags; truth in '
+                   f'{out}/truth.yaml; next: odocal fleet {manifest} --output result')
     return 0
-
-
-def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicle', bag: int,
-         options: 'SimOptions') -> 'tuple[dict[str, str], Drive]':
-    """Write a bag; return its row of the manifest, and its drive with options and truth."""
-    from odocal_ros.bagio.write import drive_topics, write_bag
-    from odocal_ros.library.simulate import write_yaml
-    from odocal_ros.sim.fleet import drive_options, MODELS, with_broken_counter
-    from odocal_ros.sim.scenarios import simulate
-    from odocal_ros.sim.truth import settings
-    drive = simulate(drive_options(vehicle, number, bag, options))
-    name = f'{vehicle.name}/bag_{bag + 1:02d}'
-    recorded = with_broken_counter(drive) if vehicle.has_broken_counter(bag) else drive
-    write_bag(out / name, drive_topics(recorded), args.storage, args.compression, args.force)
-    config = f'{vehicle.model.name}.yaml'
-    if number < len(MODELS) and not bag:      # one of each model
-        write_yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},
-                   f'Settings of the operator of a {vehicle.model.name}.')
-    return {'vehicle': vehicle.name, 'bag': name, 'config': config, 'model': vehicle.model.name,
-            'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}, drive
-
-
-def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
-    from odocal_ros.output.value_text import iso
-    last = drives[-1].truth
-    return {
-        'vehicle': vehicle.name, 'model': vehicle.model.name,
-        'scale_factor': [float(drive.truth.scale) for drive in drives],
-        'scale_ratio': last.scale_ratio,
-        'yaw_mounting_deg': [math.degrees(drive.truth.yaw) for drive in drives],
-        'pitch_mounting_deg': math.degrees(last.pitch),
-        'start': [iso(drive.truth.start_ns) for drive in drives],
-        'changes': [{'value': change.value, 'bag': change.bag + 1,
-                     'size': change.size, 'after': iso(drives[change.bag - 1].truth.start_ns),
-                     'by': iso(drives[change.bag].truth.start_ns)}
-                    for change in vehicle.changes]}
