@@ -20,7 +20,8 @@ from odocal_ros.settings.config import MECANUM, OMNI, SKID
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
-# relative, judgement: prior sigma of wheel differences if a robot moves sideways
+# relative, prior sigma of wheel differences if a robot moves sideways. Judgement, measured:
+# docs/decisions/0024
 WHEEL_DIFFERENCE = 0.03
 
 
