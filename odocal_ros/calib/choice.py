@@ -10,8 +10,8 @@ The methods on one leg are compared: differences beyond the sigmas, with their l
 from collections.abc import Iterable, Mapping
 import math
 
+from odocal_ros.calib.number_text import format_change
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
-from odocal_ros.calib.value_limits import format_relative
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
@@ -124,7 +124,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
         difference = b.value - a.value if name == 'scale_factor' else float(wrap(b.value
                                                                                  - a.value))
         if abs(difference) > REMARK_SIGMAS * sigma:
-            text = (format_relative(difference / a.value, '+') if name == 'scale_factor' else
+            text = (format_change(difference / a.value) if name == 'scale_factor' else
                     f'{math.degrees(difference):+z.3f} deg')
             found.append(Reason(
                 Code.METHODS_DISAGREE, f'{word}: {second.name} and {first.name} differ by {text}, '

@@ -19,9 +19,9 @@ import numpy as np
 from odocal_ros.calib import budget
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
+from odocal_ros.calib.number_text import with_limit
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
 from odocal_ros.calib.slip import slip_source
-from odocal_ros.calib.value_limits import format_relative
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
@@ -232,9 +232,9 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            'which includes the mounting angle: the end points only constrain the '
                            'sum of heading and yaw'),)
     elif heading_sigma > limit:
+        compared = with_limit(float(np.rad2deg(heading_sigma)), float(np.rad2deg(limit)), 'deg')
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'heading uncertainty '
-                           f'({alignment.heading_source}) is {np.rad2deg(heading_sigma):.3f} deg, '
-                           f'the yaw limit is {np.rad2deg(limit):.3f} deg: the end points only '
+                           f'({alignment.heading_source}) is {compared}: the end points only '
                            'constrain the sum of heading and yaw'),)
     deviation = abs(float(wrap(yaw - nominal_yaw(config))))
     if alignment.heading_separable and deviation > BACKWARDS_YAW:
@@ -278,7 +278,6 @@ def _plane_reasons(check: dict[str, dict[str, float]], K: float,
     limit = 3e-5 + 0.2 * sigma_relative
     if worst > limit:
         return (Reason(Code.PLANES_DISAGREE, 'the scale from the straight-line distance between '
-                       'the marks (in a map plane or on the ellipsoid) differs by '
-                       f'{format_relative(worst)} from the estimated scale; the limit is '
-                       f'{format_relative(limit)}'),)
+                       'the marks (in a map plane or on the ellipsoid) differs from the '
+                       f'estimated scale by {with_limit(100 * worst, 100 * limit, "%")}'),)
     return ()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from odocal_ros.calib.number_text import relative_with_limit, with_limit
 from odocal_ros.calib.result import Estimate
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -24,7 +25,6 @@ UNIT_RATIOS = {
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',
                 0.5: 'counting two edges per pulse (x2)'}}
-PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
 TYRE_CHANGE_LIMIT = 2 * TYRE_SPREAD    # relative, physical: largest change that tyres cause
 TYRE_CAUSE = 'tyre pressure, wear, load or another tyre'
 OTHER_CAUSE = 'another vehicle, gear, counter or unit: tyres do not change this much'
@@ -66,13 +66,13 @@ def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,
                                   f'limit is {100 * SCALE_LIMIT:g} %'))
         elif relative > limit:
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
-                                  f'{1e6 * relative:.0f} ppm; the limit is {1e6 * limit:.0f} ppm'))
+                                  + relative_with_limit(relative, limit)))
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
         sigma, sigma_limit = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
-        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw uncertainty is {sigma:.3f} deg; '
-                              f'the limit is {sigma_limit:.3f} deg'))
+        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, 'yaw uncertainty is '
+                              + with_limit(sigma, sigma_limit, 'deg')))
     return tuple(reasons)
 
 
@@ -88,19 +88,6 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
     return [Reason(Code.SCALE_FAR_FROM_NOMINAL, text, action)]
 
 
-def format_relative(relative: float, sign: str = '') -> str:
-    """Return a relative value as text: in ppm, or in per cent if at least 1 %."""
-    return f'{100 * relative:{sign}.1f} %' if abs(relative) >= PER_CENT_FROM else (
-        f'{1e6 * relative:{sign}.0f} ppm')
-
-
 def cause_of_change(relative: float) -> str:
     """Return the likely cause of a relative change of the scale."""
     return OTHER_CAUSE if abs(relative) > TYRE_CHANGE_LIMIT else TYRE_CAUSE
-
-
-def format_change(relative: float) -> str:
-    """Return a signed relative change as text: in ppm, or in per cent if at least 0.1 %."""
-    if abs(relative) < 1e-3:
-        return f'{1e6 * relative:+z.0f} ppm'
-    return f'{100 * relative:+.3g} %'

@@ -13,8 +13,9 @@ from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import fit_jointly, FREE_STEP, JointEstimate, scale_steps, ScaleStep
 from odocal_ros.calib.marginal_information import MarginalInformation
+from odocal_ros.calib.number_text import format_change
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.value_limits import cause_of_change, format_change
+from odocal_ros.calib.value_limits import cause_of_change
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 from odocal_ros.estimator.factors.pseudo_observations import SHARED, SIZE

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
+from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
-PERCENT_FROM = 0.01       # judgement: larger relative sigmas are printed in per cent, not ppm
 FARTHEST_LIMIT_M = 2e4    # judgement: longest remaining distance of a useful forecast
 # definition
 UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
@@ -40,10 +40,10 @@ class ParameterForecast:
 
     def as_text(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
         """Return the forecast as text, sigmas times ``factor`` in ``unit``, ``since`` m later."""
+        if unit == 'ppm':
+            factor, unit = relative_unit(self.sigma or 0.0, self.limit)
         limit = three_digits(float(f'{self.limit * factor:.2g}'))
         limit_with_unit = f'{limit} {unit}'
-        if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
-            unit, factor, limit = '%', 100.0, limit_with_unit
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         estimate = name if sigma is None else f'{name} {sigma} {unit}'
         if self.value_text and sigma is not None:

@@ -9,8 +9,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+from odocal_ros.calib.number_text import format_change
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.value_limits import format_change, OTHER_CAUSE, TYRE_CAUSE, TYRE_CHANGE_LIMIT
+from odocal_ros.calib.value_limits import OTHER_CAUSE, TYRE_CAUSE, TYRE_CHANGE_LIMIT
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.nav.rotations import wrap
@@ -240,7 +241,7 @@ def label(parameter: str) -> str:
 
 
 def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
-    """Return a change as text: scales in per cent or ppm, angles in deg."""
+    """Return a change as text: scales in per cent, angles in deg."""
     if change.parameter.startswith('scale_'):
         before = stored[difference.since].value(change.parameter)
         assert before is not None      # entries have a value

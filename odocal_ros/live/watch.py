@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 from std_msgs.msg import String
 
+from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.forecast.forecast import PREDICTED_REST_S, three_digits
 from odocal_ros.live.messages import LATCHED
 from odocal_ros.output.value_text import with_sigma
@@ -57,6 +58,9 @@ def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _result_sigmas(status)[name]
         # a sigma falls with the path length or its root: the ratio to the limit is a rough measure
         share = min(required / sigma, 1.0) if sigma > 0 else 0.0
+        if unit == 'ppm':
+            factor, unit = relative_unit(1e-6 * sigma, 1e-6 * required)
+            sigma, required = 1e-6 * factor * sigma, 1e-6 * factor * required
         sigma_text = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
         bars[name] = share, f'{sigma_text}, limit {three_digits(required)} {unit}'
     return bars

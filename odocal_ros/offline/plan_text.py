@@ -4,8 +4,8 @@
 """Text of odocal plan: the sigmas and budgets of ``library.plan.Planned`` as one screen."""
 
 import math
-import textwrap
 
+from odocal_ros.calib.number_text import significant
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
@@ -97,11 +97,7 @@ def _result(plan: Plan) -> str:
 def _shown(parameter: str, sigma: float | None) -> str:
     if sigma is None:
         return 'unknown'
-    if parameter == SCALE:
-        if sigma >= 0.01:
-            return share(sigma)
-        return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
-    return f'{math.degrees(sigma):#.3g} deg'
+    return share(sigma) if parameter == SCALE else f'{significant(math.degrees(sigma))} deg'
 
 
 def _budgets(plan: Plan) -> list[str]:
@@ -132,6 +128,5 @@ def _improvements(plan: Planned) -> list[str]:
 def _reasons(plan: Plan) -> list[str]:
     lines = []
     for reason in plan.reasons:
-        lines += textwrap.wrap(f'{reason}. {reason.remedy}', 96,
-                               initial_indent='  ', subsequent_indent='     ')
+        lines += wrapped(f'{reason}. {reason.remedy}', more='   ', width=96)
     return ['', *lines] if lines else []

@@ -112,11 +112,6 @@ def length_unit(metres: float) -> tuple[float, str]:
     return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
 
 
-def relative_unit(most: float) -> tuple[float, str]:
-    """Return the factor and the unit for relative values up to ``most``."""
-    return (100.0, '%') if most > 0.005 else (1e6, 'ppm')
-
-
 def new_figure(width: float, height: float) -> Any:
     """Return an empty figure, inches, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

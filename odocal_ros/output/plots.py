@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.evidence import Evidence
+from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import LOCAL
 from odocal_ros.output import plot_style as style
@@ -172,7 +173,7 @@ def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style
     middle = factor * (sections.begin + sections.end) / 2
     half = factor * (sections.end - sections.begin) / 2
     largest = max(np.nanmax(np.abs(sections.ratio - 1) + sections.sigma), scale_sigma or 0.0)
-    scale, scale_unit = style.relative_unit(largest)
+    scale, scale_unit = relative_unit(largest)
     difference, sigma = (sections.ratio - 1) * scale, sections.sigma * scale
     figure, (ax,) = style.new_figure_column(2.7)
     if scale_sigma:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib import result
+from odocal_ros.calib.number_text import significant
 from odocal_ros.output import tables, value_text as texts
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.reasons import Code, Reason
@@ -136,10 +137,10 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
         if max(shares, default=0.0) < least_share:
             small.append(label(source, local))
             continue
-        cells = [None if part < least_share else (texts.two_digits(_number(row, n) * factor), part)
+        cells = [None if part < least_share else (significant(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
-    totals = [texts.two_digits(math.sqrt(variance) * factor)
+    totals = [significant(math.sqrt(variance) * factor)
               for variance, factor in zip(variances, factors, strict=True)]
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
 

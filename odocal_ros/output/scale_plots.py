@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.calib.scale_variation import SpeedScale
 from odocal_ros.data.arrays import Floats
@@ -101,8 +102,7 @@ def _scale_panel(calibration: Calibration,
               for text, method, e in ((text, method, known(estimates, 'scale_factor'))
                                       for text, method, estimates in rows)
               if e.value is not None and result.value]
-    factor, unit = style.relative_unit(max((abs(x) + sigma for _, _, x, sigma in points),
-                                           default=0.0))
+    factor, unit = relative_unit(max((abs(x) + sigma for _, _, x, sigma in points), default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * factor) if result.value else None
     return f'scale minus result, {unit}', [
         (text, method, x * factor, sigma * factor) for text, method, x, sigma in points], band

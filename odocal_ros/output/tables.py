@@ -13,6 +13,7 @@ from typing import Any
 from odocal_ros.calib import result
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.number_text import significant
 from odocal_ros.output import value_text as texts
 from odocal_ros.pipeline.combination import overlapping_legs
 from odocal_ros.reasons import Verdict, verdict_of
@@ -193,7 +194,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
             small.append(source_label(name, local))
             continue
         cells = ['-' if share < least_share else
-                 f'{texts.two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
+                 f'{significant(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
         lines.append(texts.table_row([source_label(name, local), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))

@@ -12,6 +12,7 @@ import re
 import textwrap
 from typing import Any
 
+from odocal_ros.calib.number_text import relative_unit, significant
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.pipeline.acceptance import Acceptance, ValueDecision
 from odocal_ros.reasons import Reason, Verdict
@@ -23,6 +24,8 @@ NONE = Estimate(None, None, '')
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 MAIN_VALUES = {'scale_factor': 'scale', **ANGLES}
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
+# definition: the space between a number and its unit
+BEFORE_UNIT = re.compile(r'(?<=\d) (?=%|(?:deg|ppm|Hz|[ckm]?m|m?s|m/s)(?!\w))|(?<=±) ')
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 
@@ -42,27 +45,17 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
     return f'{value:{"+" if signed else ""}z.{places}f} ± {sigma:.{places}f}'
 
 
-def two_digits(x: float) -> str:
-    """Return a number with two significant digits, without an exponent if readable."""
-    if not math.isfinite(x):
-        return 'unknown'
-    if x == 0 or not 1e-4 <= abs(x) < 1e7:
-        return f'{x:.2g}'
-    places = 1 - math.floor(math.log10(abs(x)))
-    return f'{round(x, places):.{max(0, places)}f}'
-
-
 def beyond_one(ratio: float, sigma: float | None) -> str:
-    """Return a ratio minus 1 as text: in ppm, or in per cent if the sigma is 1 % or more."""
-    coarse = sigma is not None and math.isfinite(sigma) and sigma >= 0.01
-    factor, unit = (100.0, '%') if coarse else (1e6, 'ppm')
+    """Return a ratio minus 1 as text, in ppm or per cent."""
+    known_sigma = sigma if sigma is not None and math.isfinite(sigma) else 0.0
+    factor, unit = relative_unit(ratio - 1, known_sigma)
     return f'{with_sigma(ratio - 1, sigma, factor, signed=True)} {unit}'
 
 
 def share(relative: float) -> str:
-    """Return a relative sigma as text: ppm, or per cent from 1 % on."""
-    return f'{two_digits(100 * relative)} %' if relative >= 0.01 else (
-        f'{two_digits(1e6 * relative)} ppm')
+    """Return a relative sigma as text: two digits, in ppm or per cent."""
+    factor, unit = relative_unit(relative)
+    return f'{significant(factor * relative)} {unit}'
 
 
 def length(metres: float) -> str:
@@ -98,9 +91,11 @@ def counted(number: int, noun: str) -> str:
 
 
 def wrapped(text: str, indent: str = '  ', more: str = '  ', width: int = WIDTH) -> list[str]:
-    """Return a text in lines, all but the first indented by ``more``; words stay whole."""
-    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + more,
-                         break_long_words=False, break_on_hyphens=False)
+    """Return a text in lines, all but the first indented by ``more``; units stay at numbers."""
+    lines = textwrap.wrap(BEFORE_UNIT.sub('\xa0', text), width, initial_indent=indent,
+                          subsequent_indent=indent + more, break_long_words=False,
+                          break_on_hyphens=False)
+    return [line.replace('\xa0', ' ') for line in lines]
 
 
 def known(estimates: dict[str, Estimate], name: str) -> Estimate:

@@ -52,11 +52,12 @@ def test_good_and_undetermined_values_say_nothing():
 
 @pytest.mark.parametrize(('values', 'nominal', 'code', 'text'), [
     (estimates(relative=2e-3), 0.0, Code.SCALE_SIGMA_TOO_LARGE, '2000 ppm; the limit is 1000 ppm'),
-    (estimates(relative=0.0157), 0.0, Code.SCALE_SIGMA_TOO_LARGE, '15700 ppm; the limit is 1000 '
+    (estimates(relative=0.0157), 0.0, Code.SCALE_SIGMA_TOO_LARGE, ' 1.6 %; the limit is 0.1 %'),
+    (estimates(relative=1.004e-3), 0.0, Code.SCALE_SIGMA_TOO_LARGE, '1004 ppm; the limit is 1000 '
      'ppm'),
     (estimates(relative=12.0), 0.0, Code.SCALE_NOT_DETERMINED, '1200 %, too large for a '
      'usable value'),
-    (estimates(yaw_sigma=0.02), 0.0, Code.YAW_SIGMA_TOO_LARGE, '1.146 deg; the limit is 0.498'),
+    (estimates(yaw_sigma=0.02), 0.0, Code.YAW_SIGMA_TOO_LARGE, ' 1.1 deg; the limit is 0.498'),
     (estimates(scale=0.03), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '+50.0 % from the nominal value '),
     (estimates(scale=0.01), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '-50.0 %')])
 def test_each_limit_has_its_sentence(values, nominal, code, text):

@@ -213,7 +213,7 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
 def test_a_coarse_scale_is_said_in_per_cent():
     assert ParameterForecast(0.138, 1e-3, 2108.0, value_text='1.02').as_text('scale', 'ppm',
                                                                              1e6) == (
-        'scale 1.02 ± 13.8 % so far; drive 2200 m more to reach the limit of 1000 ppm')
+        'scale 1.02 ± 13.8 % so far; drive 2200 m more to reach the limit of 0.1 %')
     assert ParameterForecast(0.0099, 1e-3, 0.0).as_text('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 

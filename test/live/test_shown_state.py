@@ -110,6 +110,8 @@ def test_the_bars_are_shares_of_what_is_asked():
             'scale_factor_sigma': '0.00004', 'required_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
     assert progress_shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, limit 1000 ppm')
+    assert progress_shares(done | {'scale_factor_sigma': '0.0004'})['scale'] == (
+        pytest.approx(0.05), '2 %, limit 0.1 %')
     assert progress_shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
     assert progress_shares(done | {'state': 'recording'})['scale'] == (0.0,
                                                                        'not known, limit 1000 ppm')

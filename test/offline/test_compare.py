@@ -83,8 +83,8 @@ def test_a_yaw_about_half_a_turn_changes_by_the_short_way(compare):
 
 @pytest.mark.parametrize(('scale', 'delay', 'words'), [
     (0.0202, 0.0, 'tyre pressure'), (0.03, 0.0, 'another vehicle'),
-    (0.020002, 0.0, '+100 ppm (+0.5 sigma)'),        # 2e-6 of 0.02
-    (0.02 - 2e-10, 0.0, '+0 ppm (+0.0 sigma)'),
+    (0.020002, 0.0, '+0.01 % (+0.5 sigma)'),        # 2e-6 of 0.02
+    (0.02 - 2e-10, 0.0, '+0 % (+0.0 sigma)'),
     (0.02, 0.1, 'fix delay changed by +0.1 s'),
     (0.02, 0.1, 'a driver, bus or receiver has other settings')])
 def test_a_change_is_told_with_its_cause(compare, scale, delay, words):

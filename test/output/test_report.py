@@ -28,7 +28,7 @@ FIGURES = ('Track', 'Residuals', 'Scale by section', 'Speed and turn rate', 'Fix
 def test_a_leg_is_told_whole(good):
     page, text, parsed = page_of(drawn(good))
     assert 'accepted : ready to use; scale factor 0.0500000 ± 0.0000012 m/pulse' in text
-    for part in ('20.00000 ± 0.00048 pulses/m', '24 ppm', '+250000 ± 30 ppm',
+    for part in ('20.00000 ± 0.00048 pulses/m', '24 ppm', '+25.0000 ± 0.0030 %',
                  '-1.0000 ± 0.0029 deg', '-0.017453 ± 0.000050 rad', 'not determined',
                  'TOPIC_GAP', 'odometer gap of 1.2 s', 'Check the sender',
                  '1500 m', '0.10 m', '2018-08-02 08:53:20 UTC', 'ab' * 32, '/imu/data',

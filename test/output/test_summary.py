@@ -21,6 +21,7 @@ from odocal_ros.output.value_text import (
     length,
     time_span,
     with_sigma,
+    wrapped,
 )
 from odocal_ros.reasons import Code, Reason
 
@@ -63,8 +64,17 @@ def test_figures_have_the_digits_signs_and_units_asked_for():
     assert with_sigma(-1e-4, 0.5) == '0.00 ± 0.50'
     assert with_sigma(1234.5, 560.0) == '1230 ± 560'
     assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
-    assert beyond_one(1.065044, 78e-6) == '+65044 ± 78 ppm'
-    assert beyond_one(1.1, None) == '+100000 ppm'
+    assert beyond_one(1.065044, 78e-6) == '+6.5044 ± 0.0078 %'
+    assert beyond_one(1.005044, 78e-6) == '+5044 ± 78 ppm'
+    assert beyond_one(1.1, None) == '+10 %'
+
+
+def test_a_unit_stays_at_its_number():
+    text = 'scale uncertainty is 21 %, too large; the limit is 5 %, after 16.5 m, ± 0.2 m/s'
+    for width in range(12, 60):
+        lines = wrapped(text, width=width)
+        assert not any(line.lstrip()[0] in '%m0' for line in lines), width
+        assert ' '.join(line.strip() for line in lines) == text
 
 
 def test_the_screen_says_it_all_in_few_lines(good):
@@ -72,7 +82,7 @@ def test_the_screen_says_it_all_in_few_lines(good):
     for part in ('ACCEPTED', '1 leg, 11.20 km in 10 min 00 s',
                  '0.0500000 ± 0.0000012 m/pulse   (24 ppm)',
                  '20.00000 ± 0.00048 pulses/m',
-                 '1.250000 ± 0.000030   (+250000 ± 30 ppm)',
+                 '1.250000 ± 0.000030   (+25.0000 ± 0.0030 %)',
                  '-1.0000 ± 0.0029 deg   (-0.017453 ± 0.000050 rad)',
                  'pitch mounting      not determined', 'roll, pitch, yaw 0.000, 0.000, -1.000 deg',
                  '08-02 08:53:20', '1500 m', '0.10 m', 'TOPIC_GAP: odometer gap of 1.2 s',
