@@ -73,7 +73,8 @@ def _gyro_error_effect(r: Floats, q_nb: Floats) -> Floats:
     """
     Return the mean matrix -[r x] C_nb of each step: (n, 3), (n, 4) to (n - 1, 3, 3).
 
-    It maps a gyro error db, rad/s, to (C_nb db) x r, the rate of the chord error, m/s.
+    It maps a gyro error db, rad/s, to (C_nb db) x r, the rate of the chord error, m/s, with r the
+    displacement that remains until the end.
     """
     effect = -skew(r) @ matrix_from_quat(q_nb)
     mean = effect[:-1] + effect[1:]
@@ -135,7 +136,8 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
     ``height`` is the height error common to both marks, which scales the chord as a larger Earth
-    would. ``projection`` is zero: the chord is in space, not in a plane.
+    would. ``projection`` is zero, but part of the stored budgets: the chord is in space, not in a
+    plane.
 
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
     start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from alignment
@@ -146,6 +148,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     """
     forward = D[-1] / np.linalg.norm(D[-1])
     at_start = int(np.searchsorted(t, start.t - 1e-9))
+    # C_first: at the alignment, if that is before the start mark
     C_first, C_start, C_end = matrix_from_quat(q_nb[[0, at_start, -1]])
     height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
     chord = {
@@ -181,7 +184,8 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
     t_middle = (t[:-1] + t[1:]) / 2 - t[0]
     mean = weight @ t_middle
     by_bias = weight @ (t_middle - mean)**2 * np.max(alignment.gyro_bias_sigma)**2
-    # random walk of attitude: distance-weighted variance of a Wiener process, 1/6 T when even
+    # random walk of attitude: variance of a Wiener process over the distance, T / 6 at constant
+    # speed
     by_noise = alignment.gyro_noise**2 * (t[-1] - t[0]) / 6
     by_height = height_variance / (D[-1] @ D[-1])
     # the square of one Gaussian: mean m, standard deviation sqrt(2) m, rms sqrt(3) m

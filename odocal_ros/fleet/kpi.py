@@ -29,6 +29,7 @@ KPI = 'kpi.json'
 SIGMA_PER_MEDIAN = 1.4826        # statistical: sigma over the median of absolute errors
 FEWEST_LEGS = 3                  # judgement: legs of a reference; a tested leg is one of them
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
+# rates of a row; recall and false reject refer to good vehicles, false accept to bad ones
 SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
 WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
 Limits = dict[str, tuple[float, float]]
@@ -85,6 +86,7 @@ def _decision(row: dict[str, Any], limits: Limits) -> Decision:
     """Return the decision of the limits on a vehicle or a leg; rejected ones are undecided."""
     if row['verdict'] == Verdict.REJECTED.value:
         return Decision.UNDECIDED
+    # the worst of all values: Decision is in the order pass, undecided, fail
     return max((decide_value(name, Estimate(row[name], row[f'{name}_sigma'],
                                             'rad' if 'angle' in name else ''), *ends).decision
                 for name, ends in limits.items()), key=list(Decision).index)

@@ -4,7 +4,8 @@
 """
 Positions of one TF frame in another, through the frames between them, as tf2 computes them.
 
-Transforms are fed in order of arrival; positions are available once all transforms are known.
+``FrameChain`` takes transforms in order of arrival, and returns stamped positions once all
+transforms of the chain are known.
 """
 
 from collections.abc import Sequence
@@ -62,7 +63,7 @@ class FrameChain:
         self._moving: dict[str, _MovingFrame] = {}
         self._static: dict[str, tuple[str, Values]] = {}
         self._path: list[str] | None = None      # children, from the parent downwards
-        self._last: Values | None = None         # of the moving frame next to the parent
+        self._last_correction: Values | None = None    # of the moving frame next to the parent
         self._computed: list[StampedPositions] = []    # not yet popped
 
     def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
@@ -101,18 +102,18 @@ class FrameChain:
 
     def _walk(self) -> tuple[str, list[str]]:
         """Return the last known frame from the child upwards, and the children below it."""
-        here, path = self.child, list[str]()
-        while here != self.parent and here not in path:
-            if here not in self._moving and here not in self._static:
+        frame, path = self.child, list[str]()
+        while frame != self.parent and frame not in path:
+            if frame not in self._moving and frame not in self._static:
                 break
-            path.insert(0, here)
-            here = self._moving[here].parent if here in self._moving else self._static[here][0]
-        return here, path
+            path.insert(0, frame)
+            frame = self._moving[frame].parent if frame in self._moving else self._static[frame][0]
+        return frame, path
 
     def pop_positions(self) -> StampedPositions:
         """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
-        found, self._computed = [*self._computed, self._compute_positions()], []
-        stamps, received, position = (np.concatenate(some) for some in zip(*found, strict=True))
+        parts, self._computed = [*self._computed, self._compute_positions()], []
+        stamps, received, position = (np.concatenate(x) for x in zip(*parts, strict=True))
         return stamps, received, position
 
     def _compute_positions(self) -> StampedPositions:
@@ -133,9 +134,9 @@ class FrameChain:
         stamps, received = np.array(first.stamps[:n]), np.array(first.received[:n])
         position, good = np.zeros((n, 3)), np.ones(n, bool)
         if others:      # a repeated correction gives no position
-            before = [self._last or first.values[0], *first.values]
+            before = [self._last_correction or first.values[0], *first.values]
             good = np.array([a != b for a, b in zip(before, first.values[:n], strict=False)])
-            self._last = first.values[n - 1]
+            self._last_correction = first.values[n - 1]
         for name in reversed(self._path):
             values: Floats = np.array([self._static[name][1]]) if name not in self._moving else (
                 np.array(first.values[:n]))
@@ -174,11 +175,12 @@ def _to_parent_frame(values: Floats, position: Floats) -> Floats:
     values : (n, 7) or (1, 7). By products of columns: the last bits of a matrix product depend on
     the number of rows, so replay would differ.
     """
+    # position p, quaternion (u, w): p + 2 u x r / |q|^2, with r = u x p + w p
     x, y, z, w = values[:, 3:].T
-    a, b, c = position.T
+    px, py, pz = position.T
     with np.errstate(invalid='ignore', divide='ignore'):     # a quaternion of zeros: NaN
         twice = 2 / (x * x + y * y + z * z + w * w)
-        d, e, f = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-        rotated: Floats = np.stack([a + twice * (y * f - z * e), b + twice * (z * d - x * f),
-                                    c + twice * (x * e - y * d)], -1)
+        rx, ry, rz = y * pz - z * py + w * px, z * px - x * pz + w * py, x * py - y * px + w * pz
+        rotated: Floats = np.stack([px + twice * (y * rz - z * ry), py + twice * (z * rx - x * rz),
+                                    pz + twice * (x * ry - y * rx)], -1)
     return values[:, :3] + rotated

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a real IMU and receiver: triads, vibration, filters, multipath, wrong sigmas."""
+"""
+Errors of a real IMU and receiver, with the sizes in ``SimOptions.real``, for sensors.py.
+
+IMU: axes that are not orthogonal, vibration, drift, late stamps. Receiver: filters, an odometer in
+it, multipath, tunnels; and its published velocity.
+"""
 
 from dataclasses import replace
 
@@ -16,37 +21,43 @@ from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPOR
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 
-# physical: Hz, width, share: wheel hop, engine
+# physical: frequency, Hz, width, Hz, and relative power of wheel hop and of the engine
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
 LEAST_GAP_NS = 50_000    # judgement: between the stamps of one batch
-# definition: ages, in time constants, and weights of a first-order filter: Gauss-Legendre rule on
-# pieces, fine enough for the kinks of a route
-EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
-                        np.arange(20.0, 41.0, 4.0)])
-NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
-AVERAGING = np.exp(-NODES) * np.repeat(np.diff(EDGES) / 2, 2)
-AVERAGING /= AVERAGING.sum()
+# definition: ages of positions in a filter, in time constants: the nodes of two-point Gauss rules
+# on pieces, short enough for the corners of a route; and the lengths of the pieces, half each
+AGE_EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
+                            np.arange(20.0, 41.0, 4.0)])
+AGES = (AGE_EDGES[:-1, None] + np.diff(AGE_EDGES)[:, None] * (
+    0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
+AGE_LENGTHS = np.repeat(np.diff(AGE_EDGES) / 2, 2)
+# definition: weights of a first-order filter
+FIRST_ORDER = np.exp(-AGES) * AGE_LENGTHS
+FIRST_ORDER /= FIRST_ORDER.sum()
 # definition: of a second-order filter of position and velocity, damped by sqrt(1/2)
-TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
-TRACKING /= TRACKING.sum()
-UP = 2.0             # judgement: ratio of height errors to those of east and north
-ONSET = (0.5, 1.5)   # judgement: range, of the mean rise and fall time of a burst
+SECOND_ORDER = np.exp(-AGES / 2**0.5) * np.cos(AGES / 2**0.5) * AGE_LENGTHS
+SECOND_ORDER /= SECOND_ORDER.sum()
+UP_RATIO = 2.0       # judgement: height errors over those of east and north
+# judgement: range of the rise and fall times of bursts, over their mean
+ONSET_RANGE = (0.5, 1.5)
 HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
 OUTLIER_SIGMA = 5.0     # m/s, judgement: a wrong Doppler in a street
 
 
 def angles(d_b: Floats) -> tuple[float, float]:
-    """Return yaw and pitch mounting angle of the forward axis in b, rad."""
+    """Return yaw and pitch mounting angle for the forward axis of the vehicle in b, (3,), rad."""
     d = np.asarray(d_b, dtype=float)
     return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
 
 
-def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
+def sensor_axes(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     """
-    Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
+    Return the rotation to the frame of the matrices from that of the sensor axes, (3, 3).
 
-    The triads measure ``I + M`` times a vector. To first order the rotation is ``I + [theta x]``
-    with theta = (M_g,yz, -M_g,xz, -M_a,yx).
+    The sensors measure ``I + M`` times a vector. Their axes are defined by the measurements: z is
+    the axis of a turn that only the z gyro measures, x is perpendicular to it, in the direction of
+    a force that the y accelerometer does not measure. To first order the rotation is
+    ``I + [theta x]`` with theta = (M_g,yz, -M_g,xz, -M_a,yx).
     """
     gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
     z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
@@ -58,9 +69,9 @@ def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
 
 def mounting_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
                     accel_matrix: Floats) -> tuple[float, float, float, float]:
-    """Return yaw and pitch by the IMU's own axes, then by its housing, rad; matrices in i."""
+    """Return yaw and pitch of the sensor axes, then of the housing b, rad; matrices : in i."""
     d = np.asarray(C_vb)[0]
-    R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
+    R = sensor_axes(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
     return *angles(R.T @ d), *angles(d)
 
 
@@ -73,11 +84,11 @@ def with_triad_errors(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Flo
     return w_m, f_i + f_i @ accel.T if accel.any() else f_i
 
 
-def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
+def drift_and_vibration(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
     """Return gyro and accelerometer errors beyond noise and turn-on bias: (n, 3) or 0.0 each."""
     real = options.real
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
-    drifts_by_sensor = []
+    by_sensor = []
     for name, rms in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
         slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
         total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
@@ -87,13 +98,13 @@ def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float
             total = total + _wander(make_rng(options.seed, f'real {name} wander'), wander,
                                     real.wander_time, t)
         if rms:
-            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
-            total = total + level * vibration(make_rng(options.seed, f'real {name} vibration'),
+            share = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
+            total = total + share * vibration(make_rng(options.seed, f'real {name} vibration'),
                                               rms, options.imu_rate, len(t))
             if name == 'accel' and real.rectification:
-                total = total + real.rectification * (rms * level)**2
-        drifts_by_sensor.append(total)
-    return drifts_by_sensor
+                total = total + real.rectification * (rms * share)**2
+        by_sensor.append(total)
+    return by_sensor
 
 
 def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
@@ -133,31 +144,43 @@ def delayed_stamps(ns: Ints, rng: np.random.Generator, latency: float, jitter: f
 
 
 def positions(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
-    """Return latitude, longitude (rad), height (m) of a receiver without noise at t."""
+    """
+    Return latitude, longitude (rad), height (m) of a receiver without noise at t.
+
+    An odometer in the receiver with a scale error adds this share of the path that satellites have
+    not yet corrected: from the filtered position to the true one.
+    """
     real, true = options.real, _antenna(motion, t, options)
     position = true
-    for weights, time in ((AVERAGING, real.receiver_lag), (TRACKING, real.receiver_tracking)):
-        if time:
-            position = _filtered(motion, t, options, weights, time)
+    if real.receiver_lag:
+        position = _filtered(motion, t, options, FIRST_ORDER, real.receiver_lag)
+    if real.receiver_tracking:
+        position = _filtered(motion, t, options, SECOND_ORDER, real.receiver_tracking)
     if real.receiver_odometer:
-        mean = _filtered(motion, t, options, AVERAGING, real.receiver_odometer_time)
-        share = real.receiver_odometer
-        latitude, longitude, height = (x + share * (now - past) for x, now, past in zip(
-            position, true, mean, strict=True))
+        corrected = _filtered(motion, t, options, FIRST_ORDER, real.receiver_odometer_time)
+        latitude, longitude, height = (
+            x + real.receiver_odometer * (x_true - x_corrected)
+            for x, x_true, x_corrected in zip(position, true, corrected, strict=True))
         return latitude, longitude, height
     return position
 
 
 def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
               time: float) -> tuple[Floats, Floats, Floats]:
-    """Return positions weighted by age; before the first sample the vehicle is at rest."""
-    return tuple(sum(w * x for w, x in zip(weights, row, strict=True)) for row in zip(
-        *(_antenna(motion, np.maximum(t - time * node, 0.0), options) for node in NODES),
-        strict=True))
+    """
+    Return positions filtered with weights of AGES and a time constant, s.
+
+    Before the first sample the vehicle is at rest.
+    """
+    past = [_antenna(motion, np.maximum(t - time * age, 0.0), options) for age in AGES]
+    latitude, longitude, height = (
+        sum(w * x for w, x in zip(weights, coordinate, strict=True))
+        for coordinate in zip(*past, strict=True))
+    return latitude, longitude, height
 
 
 def fused_errors(t: Floats, errors: Floats, options: SimOptions) -> Floats:
-    """Return (n, 3) satellite errors after fusion with the odometer of the receiver."""
+    """Return satellite errors, (n, 3) m, low-pass filtered by a receiver with an odometer."""
     if not options.real.receiver_odometer:
         return errors
     decay = np.exp(-np.diff(t) / options.real.receiver_odometer_time)
@@ -172,28 +195,28 @@ def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Fl
     return point(motion.at(t), options.antenna_lever_arm, tilt)
 
 
-def errors(t: Floats, options: SimOptions) -> Floats | float:
-    """Return slow errors and bursts at (n,) times, ENU, m: (n, 3), or 0.0."""
+def position_errors(t: Floats, options: SimOptions) -> Floats | float:
+    """Return slow errors and bursts of the fixes at (n,) times, ENU: (n, 3) m, or 0.0."""
     real = options.real
     total: Floats | float = 0.0
     for k, (sigma, tau) in enumerate(real.slow_errors):
         slow = gauss_markov(make_rng(options.seed, f'real slow {k}'), sigma, tau, t)
-        total = total + slow * [1.0, 1.0, UP]
+        total = total + slow * [1.0, 1.0, UP_RATIO]
     return total + burst_errors(t, options) if real.bursts else total
 
 
 def burst_errors(t: Floats, options: SimOptions) -> Floats:
-    """Return errors by multipath: bursts to any side, of smooth onset: (n, 3)."""
+    """Return errors by multipath, (n, 3) m: bursts in random directions, with smooth edges."""
     real, rng = options.real, make_rng(options.seed, 'real bursts')
     total, hours = np.zeros((len(t), 3)), t[-1] / 3600
     for _ in range(rng.poisson(real.bursts * hours)):
-        begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
+        begin, azimuth = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
         size, length = (median * np.exp(real.burst_spread * rng.standard_normal())
                         for median in (real.burst_size, real.burst_time))
-        onset, up = real.burst_onset * rng.uniform(*ONSET), rng.normal()
+        onset, up = real.burst_onset * rng.uniform(*ONSET_RANGE), rng.normal()
         x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)
         shape = size * x**2 * (3 - 2 * x)
-        total += shape[:, None] * [np.cos(side), np.sin(side), up]
+        total += shape[:, None] * [np.cos(azimuth), np.sin(azimuth), up]
     return total
 
 
@@ -213,9 +236,9 @@ def tunnel_errors(t: Floats, error: Floats, position: Floats, options: SimOption
 
 
 def true_variance(white: Floats, options: SimOptions) -> Floats:
-    """Return the variance of the errors without bursts, ENU: (3,) m^2. white: of the noise."""
+    """Return the variance of fix errors without bursts, (3,) m^2; white : that of white noise."""
     slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
-    return white + slow * np.array([1.0, 1.0, UP**2])
+    return white + slow * np.array([1.0, 1.0, UP_RATIO**2])
 
 
 def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
@@ -224,8 +247,9 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     if sigma is None:
         return VelocitySamples.none()
     ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
-    smoothed = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
-    before, after = (np.stack(positions(motion, np.maximum(t + dt, 0.0), smoothed), -1)
+    # the velocity is the derivative of positions with its own filter
+    filtered = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
+    before, after = (np.stack(positions(motion, np.maximum(t + dt, 0.0), filtered), -1)
                      for dt in (-HALF_STEP, HALF_STEP))
     latitude, _, height = after.T
     meridian, normal = radii(latitude)
@@ -236,8 +260,8 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     error = (gauss_markov(rng, sigma, time, t) if time
              else sigma * rng.standard_normal((len(t), 3)))
     is_outlier = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
-    sent = true * (1 + options.velocity_scale_error) + (
+    published = true * (1 + options.velocity_scale_error) + (
         error + is_outlier * OUTLIER_SIGMA * rng.standard_normal((len(t), 3)))
     stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
-    return VelocitySamples(stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), sent,
-                           np.full(sent.shape, sigma**2))
+    return VelocitySamples(stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), published,
+                           np.full(published.shape, sigma**2))

@@ -40,8 +40,8 @@ class Truth:
 
     The scale of tyres that grow or slip is the mean of the leg by travel: the true path between
     the marks divided by the change of the count, before quantisation; likewise its ratio and the
-    scales of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
-    ``real_sensors.py``), which equal those of its housing for perpendicular triads.
+    scales of the wheels. Yaw and pitch are those of the sensor axes of the IMU (``sensor_axes`` of
+    real_sensors.py), which equal those of its housing if its axes are perpendicular.
     """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count

@@ -80,7 +80,7 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         w_v @ C_vi * (1 + options.gyro_scale_error), f_v @ C_vi * (1 + options.accel_scale_error),
         options.real)
     gyro, accel = imu_errors(options, len(t))
-    gyro_drift, accel_drift = real_sensors.drifts(t, state.speed, options)
+    gyro_drift, accel_drift = real_sensors.drift_and_vibration(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     variance = np.full(len(t), np.nan)
     if options.orientation_sigma is not None:
@@ -213,7 +213,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
     latitude, longitude, height = real_sensors.positions(motion, t, options)
-    error = fix_errors(t, options) + real_sensors.errors(t, options)
+    error = fix_errors(t, options) + real_sensors.position_errors(t, options)
     error = error + reference_drift(t, motion.at(t).travel, options)
     error = real_sensors.fused_errors(t, error, options)
     meridian, normal = radii(latitude)

@@ -63,7 +63,7 @@ def test_slow_errors_have_their_size_and_the_covariance_knows():
     drive = simulate(options)
     want = 0.3**2 + 1.2**2 + 0.9**2
     assert_allclose(drive.fix.covariance_n[0], 0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
-    made = np.array([real_sensors.errors(np.arange(0.0, 600, 1.0), replace(
+    made = np.array([real_sensors.position_errors(np.arange(0.0, 600, 1.0), replace(
         resolved(options), seed=s)) for s in range(60)])
     # 60 drives of 600 s hold 60 * 600 / (2 * 20) independent draws of the slower one, each axis
     n = 60 * 600 / 40
@@ -80,7 +80,7 @@ def test_bursts_come_and_go_smoothly():
     assert size.max() > 5
     assert (size == 0).mean() > 0.8
     # 3 x^2 - 2 x^3 rises by at most 1.5 of the size in an onset of a second
-    assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_sensors.ONSET[0]
+    assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_sensors.ONSET_RANGE[0]
 
 
 def test_the_antenna_leans_with_the_body():

@@ -14,7 +14,7 @@ from odocal_ros.sim import real_sensors
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.real_sensors import turn_and_push
+from odocal_ros.sim.real_sensors import sensor_axes
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.core
@@ -52,7 +52,7 @@ def test_a_bias_given_is_the_bias_and_warms_along_its_curve():
 
 def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
     t = np.arange(0.0, 100.0, 0.05)
-    ends = [real_sensors.drifts(t, np.zeros(len(t)), replace(options(
+    ends = [real_sensors.drift_and_vibration(t, np.zeros(len(t)), replace(options(
         gyro_wander=0.01, wander_time=200.0), seed=seed))[0] for seed in range(300)]
     assert all((one[0] == 0).all() for one in ends)
     # variance of x(T) - x(0): 2 s^2 (1 - exp(-T / tau)); 900 draws, 5 sigma
@@ -75,15 +75,15 @@ def test_vibration_shakes_as_said_and_goes_nowhere(rate):
 def test_vibration_comes_with_speed_and_moves_the_bias_by_its_square():
     t, speed = np.arange(MANY) / 20.0, np.full(MANY, 5.0)       # half of it at 5 m/s
     vibrating = options(vibration=0.8, rectification=0.01)
-    _, accel = real_sensors.drifts(t, speed, vibrating)
+    _, accel = real_sensors.drift_and_vibration(t, speed, vibrating)
     assert accel.mean(axis=0) == pytest.approx(0.01 * 0.4**2, rel=1e-6)
-    _, still = real_sensors.drifts(t, 0 * speed, vibrating)
+    _, still = real_sensors.drift_and_vibration(t, 0 * speed, vibrating)
     assert (still == 0).all()
 
 
 def test_a_bias_steps_once_by_its_size():
     t = np.arange(0.0, 20.0, 0.1)
-    gyro, accel = real_sensors.drifts(t, 0 * t, options(accel_step=(0.1, 0.0, -0.2),
+    gyro, accel = real_sensors.drift_and_vibration(t, 0 * t, options(accel_step=(0.1, 0.0, -0.2),
                                                         bias_step_at=7.0))
     assert gyro == 0.0
     assert (accel == np.where(t >= 7.0, [[0.1], [0.0], [-0.2]], 0.0).T).all()
@@ -130,9 +130,9 @@ def cross(x, y, z):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_in_the_own_frame_turn_and_push_are_felt_as_said(seed):
+def test_sensor_axes_are_those_of_measured_turns_and_forces(seed):
     gyro, accel = make_rng(seed, 'test').normal(0, 0.02, (2, 3, 3))
-    R = turn_and_push(gyro, accel)
+    R = sensor_axes(gyro, accel)
     assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     assert np.linalg.det(R) == pytest.approx(1)
     turned, pushed = (np.eye(3) + gyro) @ R, (np.eye(3) + accel) @ R

@@ -56,14 +56,14 @@ class Fixes(PointRows):
         g = gravity_n(state.p_n[k], leg.origin)
         self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ self.arm_v
-        self.C_t = self.C @ points.R
-        self.arm_n = self.C_t @ arm_b
+        self.C_nb = self.C @ points.R       # at the fix; C: at the keyframe before
+        self.arm_n = self.C_nb @ arm_b
         T = np.diff(state.t)[k]
         self.share = np.clip(points.tau / T, 0.0, 1.0)
         slow = state.slow_n[k] * (1 - self.share)[:, None] \
             + state.slow_n[k + 1] * self.share[:, None]
         self.v_n = v + rotate(self.C, points.dv) + g * tau + rotate(
-            self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
+            self.C_nb, np.cross(point.intervals.mean_rate[k], arm_b))
         imu_n = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.used_fixes] - imu_n - self.arm_n - slow
         # derivatives by accelerometer errors use the fitted force: noise in the measured one would
@@ -104,9 +104,9 @@ class Fixes(PointRows):
         if n > layout.SIZE_WITHOUT_SLOW:
             J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
-        c[:, :, layout.YAW] = -self.C_t @ (by_yaw @ self.arm_v)
-        c[:, :, layout.PITCH] = -self.C_t @ (by_pitch @ self.arm_v)
-        c[:, :, layout.GNSS_ARM] = -self.C_t @ self.state.C_bv
+        c[:, :, layout.YAW] = -self.C_nb @ (by_yaw @ self.arm_v)
+        c[:, :, layout.PITCH] = -self.C_nb @ (by_pitch @ self.arm_v)
+        c[:, :, layout.GNSS_ARM] = -self.C_nb @ self.state.C_bv
         # a stamp that is late by d belongs to the position d earlier
         c[:, :, layout.GNSS_DELAY] = self.v_n
         c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
@@ -199,11 +199,11 @@ class VelocityRows(ExternalRows):
         samples, k = problem.external['velocity'], points.interval
         assert isinstance(samples, Velocity)
         C, tau = state.C_nb[k], points.tau[:, None]
-        C_t = C @ points.R
+        C_nb = C @ points.R
         arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ arm_v
         dv, g = rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
-        swing = rotate(C_t, np.cross(points.rate, arm_b))
+        swing = rotate(C_nb, np.cross(points.rate, arm_b))
         _, v_keys = antenna(state, point.intervals.mean_rate, arm_b)
         acceleration = (np.diff(v_keys, axis=0) / point.intervals.T[:, None])[k]
         smoothed, by_lag = smoothing_error(state.t, v_keys, np.gradient(v_keys, state.t, axis=0),
@@ -220,12 +220,12 @@ class VelocityRows(ExternalRows):
         J[:, :, layout.PHI] = skew(dv + swing)
         J[:, :, layout.BA] = C @ points.A
         by_gyro = -C @ points.dv_by_gyro - skew(swing) @ C @ points.R_by_gyro
-        by_rate = -C_t @ skew(arm_b)
+        by_rate = -C_nb @ skew(arm_b)
         J[:, :, layout.BG] = by_gyro[:, :, :3] + by_rate
         c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
             by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
         by_yaw, by_pitch = state.C_bv_gradient
-        W = C_t @ skew(rate)
+        W = C_nb @ skew(rate)
         c[:, :, layout.YAW], c[:, :, layout.PITCH] = -W @ (by_yaw @ arm_v), -W @ (by_pitch @ arm_v)
         c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
         c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = acceleration, -by_lag

@@ -4,10 +4,11 @@
 """
 Noise of the motion in an interval between keyframes: docs/method.md (S13).
 
-The covariance of the 18 rows of an interval (motion.py) is a sum over independent noises: of the
-IMU, of the road under the wheels, and known ones such as gaps. ``IntervalNoise`` has the effect of
-each noise, at unit variance, on the rows. Those of IMU and road are multiplied by the roots of
-their levels, which the fit estimates.
+An interval has 18 rows (motion.py): position, velocity, attitude, the biases of gyro and
+accelerometer, and the displacement of the odometer. Their covariance is a sum over independent
+noises: of the IMU, of the road under the wheels, and known ones such as gaps. ``IntervalNoise``
+has the effects of each noise on the rows at unit variance. Those of IMU and road are multiplied by
+the roots of their levels, the variances that the fit estimates.
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
 time is a two-point Gauss rule: exact up to the third order, and 3 % off for the small terms of
@@ -51,12 +52,11 @@ PITCHING, PITCHING_LEAST = 0.03, 1e-4
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn angle: one corner does not determine sideslip, two do. Judgement
 CORNER_ANGLE = np.pi / 2
-ALONG = ('along', 'along_hard')     # levels along the path
-# levels whose lower limit is that of sideslip
-SIDEWAYS = ('side', 'side_turn', 'up')
-# levels of the motion that the odometer does not measure, m^2/s, and the index of their axis:
-# forward, left, up. _hard: while accelerating or braking; _turn: in turns; pitching: m^2/rad^2, by
-# the pitch of the body within the interval
+# levels of the motion that the odometer does not measure: those along the path, and those whose
+# lower limit is that of sideslip
+ALONG, SIDEWAYS = ('along', 'along_hard'), ('side', 'side_turn', 'up')
+# all of them, m^2/s, with the index of their axis: forward, left, up. _hard: while accelerating or
+# braking; _turn: in turns; pitching: m^2/rad^2, by the pitch of the body within the interval
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)    # all levels of an interval
 # definition: Gauss and Legendre's nodes and weights on 0 to 1
@@ -140,10 +140,12 @@ class IntervalNoise:
         force, displacement = skew(motion.dv / motion.T), skew(motion.displacement / motion.T)
         one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
         out = np.zeros((len(T), ROWS, len(self.component)))
+        imu_columns = 3 * len(IMU)      # of each Gauss point
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
             u = ((1 - x) * T)[:, None, None]        # s, from the noise to the end
+            at_point = out[:, :, imu_columns * point:imu_columns * (point + 1)]
             gyro, accel, gyro_walk, accel_walk = (
-                out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
+                at_point[:, :, first:first + 3] for first in range(0, imu_columns, 3))
             gyro[:, PHI], gyro[:, V] = -one, force * u
             gyro[:, P], gyro[:, D] = force * (u**2 / 2), displacement * u
             accel[:, V], accel[:, P] = one, one * u
@@ -153,14 +155,18 @@ class IntervalNoise:
             accel_walk[:, V], accel_walk[:, P] = -C * u, -C * (u**2 / 2)
             accel_walk[:, BA] = one
             root = np.sqrt(weight * T)[:, None] * np.repeat(self.imu[rows], 3, axis=1)
-            out[:, :, 12 * point:12 * (point + 1)] *= root[:, None]
-        for column, axis in enumerate(ROAD.values(), 12 * len(GAUSS_X)):
-            root = self.road[rows, column - 12 * len(GAUSS_X)]
-            out[:, D, column] = self.axes[rows, axis] * root[:, None]
+            at_point *= root[:, None]
+        for k, axis in enumerate(ROAD.values()):
+            out[:, D, imu_columns * len(GAUSS_X) + k] = (
+                self.axes[rows, axis] * self.road[rows, k, None])
         return out
 
     def variance_ratios(self, level_ratios: dict[str, float]) -> Floats:
-        """Return ratios of the variances of VARIANCE_FACTORS before JUMP, new to old: (K, 7)."""
+        """
+        Return ratios of variances, new to old, by the ratios of levels: (K, 7).
+
+        They are in the order of VARIANCE_FACTORS, without the last one, the jump of the fixes.
+        """
         out = np.ones((len(self.road), JUMP))
         out[:, IMU_NOISE] = [level_ratios[name] for name in IMU]
         for column, (name, axis) in enumerate(ROAD.items()):
@@ -182,8 +188,8 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     """
     Return the noises of a motion.
 
-    rest : (K,) bool, intervals at standstill: their odometer noise is known, since it does not
-        depend on the noise in motion.
+    rest : (K,) intervals at standstill: their odometer noise is known, since it does not depend on
+        the noise in motion.
     variance_factors : (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals.
     """
     K, T = len(motion.T), motion.T[:, 0]
@@ -212,9 +218,10 @@ def _known_columns(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) 
     """
     Return the effects of unit errors of a quantised speed on the rows: (K, 18, g).
 
-    Fine steps are rounding noise. Coarse steps are not used along the path; ``SpeedSteps`` uses
-    their transitions. In a turn, a quantisation error that changes within the interval displaces
-    the end sideways.
+    Fine steps are rounding noise, g = 1. Coarse steps, g = 2, are not used along the path;
+    ``SpeedSteps`` uses their transitions. In a turn, a quantisation error that changes within the
+    interval displaces the end sideways: if it changes by q from the first half to the second, by
+    q T / 8 times the angle of the turn.
     """
     coarse = leg.travel.coarse
     if coarse is None:

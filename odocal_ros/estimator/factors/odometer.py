@@ -8,6 +8,7 @@ The readings of the odometer: their delay and filter, rounding error, and steps 
 is the factor of the rounding error at each keyframe, docs/method.md (S10). ``SpeedSteps`` is that
 of a speed in coarse steps, (S14): it is known when it changes by a step. The integral of such a
 speed is not used along the path (interval_noise.py): between changes its error is up to a step.
+The methods of factors are described in ``Factor`` and ``PointRows``.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,14 +33,14 @@ from odocal_ros.nav.rotations import rotate
 SPEED_WINDOW = 0.4
 # s to each side of a time, judgement: for the derivatives of the travel at it. With a filter of
 # 0.4 s, the rounding error of a counter adds twice the error of a reading
-REACH = 0.5
+STENCIL_REACH = 0.5
 # definition: times of the readings, and their weights in the second and the third derivative
-STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
-BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
-# definition: nodes of Gauss-Laguerre quadrature, minus the mean delay, and weights: a first-order
-# filter with the time constant 1
-FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
+STENCIL = STENCIL_REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+SECOND_DERIVATIVE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / STENCIL_REACH**2
+THIRD_DERIVATIVE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / STENCIL_REACH**3
+# definition: a first-order filter with the time constant 1: nodes of Gauss-Laguerre quadrature,
+# ages less their mean, and weights
+FILTER_AGES, FILTER_WEIGHTS = np.polynomial.laguerre.laggauss(5)[0] - 1, \
     np.polynomial.laguerre.laggauss(5)[1]
 MIN_FILTER_TIME = 0.2      # s, judgement: speeds closer in time differ by vibration
 
@@ -62,12 +63,12 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
     travel : of the readings.   constants : (M,), with D, s, and T^2, s^2.
     """
     square = float(constants[ODO_LAG2])
-    weights = -square / 2 * BY_SQUARE + max(square, 0.0)**1.5 / 3 * BY_CUBE
+    weights = -square / 2 * SECOND_DERIVATIVE + max(square, 0.0)**1.5 / 3 * THIRD_DERIVATIVE
 
     def rolled(t: Floats) -> Floats:
         at = stamp_of(t, constants)
         # at the ends the derivative of the first and last second: there are no readings beyond
-        middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
+        middle = np.clip(at, travel.t[0] + STENCIL_REACH, travel.t[-1] - STENCIL_REACH)
         out: Floats = travel.at(at) + sum(
             weight * travel.at(middle + step)
             for weight, step in zip(weights.tolist(), STENCIL.tolist(), strict=True))
@@ -142,25 +143,27 @@ class SpeedSteps(PointRows):
         leg, state, points = problem.leg, point.state, point.points[self.name]
         self.state, self.instants = state, _within(problem)
         k, tau = points.interval, points.tau[:, None]
+        # attitude at the keyframe before; attitude, velocity and forward axis at the point
         C = state.C_nb[k]
-        C_t, dv, g = C @ points.R, rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
-        v_n, ahead = state.v_n[k] + dv + g * tau, C_t @ state.forward
+        C_nb, dv_n, g = C @ points.R, rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+        v_n, forward_n = state.v_n[k] + dv_n + g * tau, C_nb @ state.forward
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
         arm_b = state.C_bv @ self.arm_v
         # at the steps, and at the earlier times that the filter needs
-        speeds = (np.einsum('ki,ki->k', ahead, v_n) + np.cross(
-            points.rate, arm_b) @ state.forward).reshape(len(FILTER_X) + 1, -1)
+        speeds = (np.einsum('ki,ki->k', forward_n, v_n) + np.cross(
+            points.rate, arm_b) @ state.forward).reshape(len(FILTER_AGES) + 1, -1)
         self.speed = speeds[0]
-        self.by_lag = (FILTER_W @ speeds[1:] - self.speed) / filter_time(state.constants)**2
+        self.by_lag = (FILTER_WEIGHTS @ speeds[1:] - self.speed) / filter_time(state.constants)**2
         at_steps = np.arange(len(self.speed))
         points = self.points = points.take(at_steps)
-        self.C, self.C_t, self.dv, self.v_n, self.ahead, g = (
-            x[at_steps] for x in (C, C_t, dv, v_n, ahead, g))
+        self.C, C_nb, self.dv_n, self.v_n, self.forward_n, g = (
+            x[at_steps] for x in (C, C_nb, dv_n, v_n, forward_n, g))
         super().__init__(problem, points)
         self.sigma = self.instants.sigma * leg.rough_scale
-        self.v_b = rotate(np.swapaxes(self.C_t, 1, 2), self.v_n)
+        self.v_b = rotate(np.swapaxes(C_nb, 1, 2), self.v_n)
         # the forward axis rotates, and an IMU beside the axle moves relative to the axle
-        self.acceleration = np.einsum('ki,ki->k', self.ahead, rotate(self.C, points.force) + g)\
+        self.acceleration = np.einsum(
+            'ki,ki->k', self.forward_n, rotate(self.C, points.force) + g)\
             + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
             + np.cross(points.rate_change, arm_b) @ state.forward
         c = state.constants
@@ -185,27 +188,29 @@ class SpeedSteps(PointRows):
         """Return the times of the steps, s, then the times at which the filter needs a speed."""
         stamp, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
         t = stamp - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * stamp
-        delays = filter_time(constants) * FILTER_X
+        delays = filter_time(constants) * FILTER_AGES
         return np.concatenate([t, np.clip(
             t - delays[:, None], keyframes[0], keyframes[-1]).ravel()])
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        # factors on the variances by the step size; real steps are not more regular
+        # initial value and lower limit, factors on the variances by the step size; real steps are
+        # not more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
         return rows / self.sigma[some, None, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        state, ahead, v = self.state, self.ahead, self.v_n
-        J, c = np.zeros((len(v), n)), np.zeros((len(v), layout.M))
-        J[:, layout.V], J[:, layout.PHI] = -ahead, -np.cross(ahead, v - self.dv)
-        J[:, layout.BA] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.A)
+        state, forward_n, v_n = self.state, self.forward_n, self.v_n
+        J, c = np.zeros((len(v_n), n)), np.zeros((len(v_n), layout.M))
+        J[:, layout.V], J[:, layout.PHI] = -forward_n, -np.cross(forward_n, v_n - self.dv_n)
+        J[:, layout.BA] = np.einsum('ki,kij->kj', forward_n, self.C @ self.points.A)
         arm = state.C_bv @ self.arm_v
         by_rate = np.cross(arm, state.forward)
-        by_gyro = np.einsum('ki,kij->kj', np.cross(ahead, v), self.C @ self.points.R_by_gyro) \
-            - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by_gyro)
+        by_gyro = np.einsum(
+            'ki,kij->kj', np.cross(forward_n, v_n), self.C @ self.points.R_by_gyro) \
+            - np.einsum('ki,kij->kj', forward_n, self.C @ self.points.dv_by_gyro)
         J[:, layout.BG] = by_gyro[:, :3] + by_rate
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
@@ -220,7 +225,7 @@ class SpeedSteps(PointRows):
         c[:, layout.ODO_DELAY] = self.acceleration
         c[:, layout.ODO_CLOCK] = self.acceleration * self.instants.t
         c[:, layout.ODO_LAG2] = -self.by_lag
-        c[:, layout.ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
+        c[:, layout.ACCEL] = np.einsum('ki,kij->kj', forward_n, self.C @ self.points.F)
         return J[:, None], c[:, None]
 
 
