@@ -52,15 +52,15 @@ class Errors:
     """
     Covariance of the errors, (16, 16), and its updates by gravity and at standstill.
 
-    Arguments: grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.
+    Arguments: grade : of the IMU.   tilt_sigma, bias_sigma : rad, rad/s, at the start.
     earth_in_bias : True if the gyro bias contains the Earth rate.
 
     Attributes: shortening : (3,) m in n, second-order effect of attitude errors on the position.
     changed : True if the covariance has changed since the last ``pose_and_twist``.
     """
 
-    def __init__(self, grade: Grade, vehicle: Vehicle, tilt: float, bias_sigma: float | Floats,
-                 earth_in_bias: bool = True) -> None:
+    def __init__(self, grade: Grade, vehicle: Vehicle, tilt_sigma: float,
+                 bias_sigma: float | Floats, *, earth_in_bias: bool) -> None:
         self.grade, self._C_bv = grade, vehicle.C_vb.T
         # s, m, rad: duration, travel and turn since the last propagation
         self._pending_s, self._pending_travel, self._pending_turn = 0.0, ZERO, ZERO
@@ -70,7 +70,7 @@ class Errors:
         self._walks[BG], self._walks[BA] = grade.gyro_bias_walk**2, grade.accel_bias_walk**2
         self.cov = np.zeros((N, N))
         sigma = np.concatenate([
-            np.zeros(3), [tilt, tilt, 0.0], np.broadcast_to(bias_sigma, 3),
+            np.zeros(3), [tilt_sigma, tilt_sigma, 0.0], np.broadcast_to(bias_sigma, 3),
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_error]])
         self.cov[ALL, ALL] = sigma**2

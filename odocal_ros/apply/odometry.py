@@ -12,10 +12,10 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.arrivals import PERMANENT_ROWS, StampScreen, STEP_ROWS
 from odocal_ros.apply.odometry_start import find_start
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
+from odocal_ros.apply.stamp_screen import PERMANENT_ROWS, StampScreen, STEP_ROWS
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
@@ -62,16 +62,16 @@ class Odometry:
         """Return the lead of the odometer's clock over the IMU's, s, 0 if it may be a delay."""
         lead = self._odometer_lead_s()
         # a bag that is played fast has a coarser time of arrival
-        rates = (screen.rate for screen in self._arrivals.values())
-        limit = CLOCK_DIFFERENCE_LIMIT * max(1.0, *rates) if self._arrivals else math.inf
+        rates = (screen.rate for screen in self._screens.values())
+        limit = CLOCK_DIFFERENCE_LIMIT * max(1.0, *rates) if self._screens else math.inf
         return lead if abs(lead) > limit else 0.0
 
     def _odometer_lead_s(self) -> float:
         """Return the lead of the odometer's stamps over the IMU's, s, 0 if unknown."""
-        imu = self._arrivals.get('imu')
+        imu = self._screens.get('imu')
         if imu is None or imu.lag_ns is None:
             return 0.0
-        return max((imu.lag_ns - screen.lag_ns for screen in self._arrivals.values()
+        return max((imu.lag_ns - screen.lag_ns for screen in self._screens.values()
                     if screen.lag_ns is not None), key=abs) * 1e-9
 
     def restart(self, reason: str) -> None:
@@ -83,26 +83,26 @@ class Odometry:
     def _reset(self) -> None:
         self.wheels = Wheels(self.vehicle, self.config, self._notes)
         self.imu = ImuStream(self.config, self._notes)
-        self._arrivals: dict[str, StampScreen] = {}
+        self._screens: dict[str, StampScreen] = {}
         self._path: Reckoning | None = None
 
     def feed(self, slot: str,
              block: samples.ImuSamples | samples.OdometerSamples | list[samples.Reading],
              form: samples.OdometerForm | None = None) -> None:
         """Add rows of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
-        if slot not in self._arrivals:
-            self._arrivals[slot] = StampScreen()
-        arrivals = self._arrivals[slot]
+        if slot not in self._screens:
+            self._screens[slot] = StampScreen()
+        screen = self._screens[slot]
         rows = block if isinstance(block, list) else samples.readings_of(block)
-        usable = arrivals.select_usable(rows)
-        if arrivals.clock_jumped:
-            self.restart(f'the {slot} stamps jump by {arrivals.excess_s:+.3g} s')
-            rows = rows[arrivals.jump_row:]
-            arrivals = self._arrivals[slot] = StampScreen()
-            usable = arrivals.select_usable(rows)
-        if arrivals.dropped:
-            self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
-                               f'from their arrival times by {arrivals.excess_s:+.3g} s')
+        usable = screen.select_usable(rows)
+        if screen.clock_jumped:
+            self.restart(f'the {slot} stamps jump by {screen.excess_s:+.3g} s')
+            rows = rows[screen.jump_row:]
+            screen = self._screens[slot] = StampScreen()
+            usable = screen.select_usable(rows)
+        if screen.dropped:
+            self._notes.append(f'{slot}: {screen.dropped} messages dropped: their stamps differ '
+                               f'from their arrival times by {screen.excess_s:+.3g} s')
         if slot == 'imu':
             self.imu.feed(usable)
         else:
@@ -129,9 +129,9 @@ class Odometry:
         if self._path is None:
             self.imu.forget(ODOMETER_SILENCE)
             return []
-        clock_step = max(screen.clock_step_s(STEP_ROWS) for screen in self._arrivals.values())
+        clock_step = max(screen.clock_step_s(STEP_ROWS) for screen in self._screens.values())
         permanent_step = max(screen.clock_step_s(PERMANENT_ROWS)
-                             for screen in self._arrivals.values()) if clock_step else 0.0
+                             for screen in self._screens.values()) if clock_step else 0.0
         poses = self._path.poses(clock_step, permanent_step)
         if self._path.failed:
             self.restart(self._path.failed)

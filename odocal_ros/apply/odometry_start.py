@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start of the odometry: attitude, gyro bias and their uncertainties."""
+"""
+Start of the odometry: attitude, gyro bias and their uncertainties.
+
+In: the first rows of IMU and wheels, or configured values. At rest, gravity gives the tilt and the
+gyro its bias; while driving, the tilt is less certain and the bias is that of the calibration.
+"""
 
 from dataclasses import dataclass
 
@@ -29,12 +34,12 @@ BRAKING_SIGMA = 2.0        # m/s^2; physical: mean acceleration over START_SPAN
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Attitude and gyro bias at an IMU row; earth_n: (3,) rad/s, zero if the bias contains it."""
+    """State from which dead reckoning starts."""
 
-    row: int
-    q_nb: Floats
-    gyro_bias: Floats
-    earth_n: Floats
+    row: int                # of the IMU stream
+    q_nb: Floats            # (4,) x, y, z, w; n is the frame odom
+    gyro_bias: Floats       # (3,) rad/s in b
+    earth_rate_n: Floats    # (3,) rad/s; zeros if the gyro bias contains it
     errors: Errors
 
 
@@ -69,9 +74,11 @@ def _start_from_settings(row: int, vehicle: Vehicle, config: ApplyConfig, grade:
     """Return the start with the configured attitude, gyro bias and latitude."""
     start = config.start
     q = np.asarray(start.attitude)
-    earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))
-    errors = Errors(grade, vehicle, CONFIGURED_TILT_SIGMA, grade.gyro_bias, not earth.any())
-    return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
+    earth_in_bias = bool(np.isnan(start.latitude))
+    errors = Errors(grade, vehicle, CONFIGURED_TILT_SIGMA, grade.gyro_bias,
+                    earth_in_bias=earth_in_bias)
+    earth_rate = np.zeros(3) if earth_in_bias else earth_rate_n(np.deg2rad(start.latitude))
+    return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth_rate, errors)
 
 
 def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting: bool,
@@ -89,7 +96,8 @@ def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting:
     else:
         bias = np.zeros(3) if vehicle.gyro_bias is None else vehicle.gyro_bias
         sigma = grade.gyro_bias
-    errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
+    errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma, earth_in_bias=True)
     if has_gravity:        # correlates the tilt with the accelerometer bias
-        errors.correct_by_gravity(C_nb, np.zeros(3), length, 0.0 if is_resting else BRAKING_SIGMA)
+        errors.correct_by_gravity(C_nb, residual_n=np.zeros(3), T=length,
+                                  sigma=0.0 if is_resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

@@ -73,7 +73,8 @@ class Reckoning:
         self.accel_bias, self.errors = ZERO, start.errors
         self.position = ZERO      # m, of the odometer's point, relative to the start
         # constants
-        self._earth_n, self._forward_b = start.earth_n.tolist(), vehicle.forward_b.tolist()
+        self._earth_rate_n: Vector = start.earth_rate_n.tolist()
+        self._forward_b: Vector = vehicle.forward_b.tolist()
         self._arm_b, self._q_bv = vehicle.arm_b.tolist(), vehicle.q_bv.tolist()
         self._start_arm_n = rotate_vector(self._C_nb, self._arm_b)
         # since the last pose: time and travel there, turn, rad, variance of travel, m^2; interval
@@ -175,8 +176,8 @@ class Reckoning:
     def _rotate(self, phi: Vector, T: float) -> Matrix:
         """Rotate the attitude by phi, rad, in b, and by the Earth over T s; return C_nb."""
         self.q = quaternion_product(self.q, rotation(phi))
-        if any(self._earth_n):
-            self.q = quaternion_product(rotation(add_scaled(ZERO, self._earth_n, -T)), self.q)
+        if any(self._earth_rate_n):
+            self.q = quaternion_product(rotation(add_scaled(ZERO, self._earth_rate_n, -T)), self.q)
         return rotation_matrix(self.q)
 
     def _add_turn_variance(self, implausible: list[Vector], gaps: list[float]) -> None:
@@ -230,7 +231,7 @@ class Reckoning:
                 self.errors.add_turn(np.eye(3) * np.sum(correction[PHI]**2)**2 / 4)
         if self.config.levelling and is_standing:
             rate_variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
-            rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_n
+            rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_rate_n
             self._correct(self.errors.correct_by_rest(rate_b, rate_variance))
         self.errors.changed |= self._delay.take(
             rotate_vector(self._C_nb, self._forward_b),
@@ -265,7 +266,7 @@ class Reckoning:
         T, C_bn = self._t - self._t_pose, tuple(zip(*self._C_nb, strict=True))
         arm_n = rotate_vector(self._C_nb, self._arm_b)
         rate_b = add_scaled(add_scaled(ZERO, self._turn_b, 1 / T),
-                            rotate_vector(C_bn, self._earth_n), -1.0)
+                            rotate_vector(C_bn, self._earth_rate_n), -1.0)
         twist_by_turn, speed = self.vehicle.twist_by_turn(rate_b), (self._s - self._s_pose) / T
         if abs(speed) > FASTEST:
             self._notes.append(f'the speed is {speed:.0f} m/s; the limit is {FASTEST:.0f} m/s. '

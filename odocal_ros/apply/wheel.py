@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 import math
 
-from odocal_ros.apply.arrivals import RowTimes
+from odocal_ros.apply.row_times import RowTimes
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 

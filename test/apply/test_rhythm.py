@@ -9,8 +9,8 @@ from faulty_streams import columns_of, run, started
 import numpy as np
 import pytest
 
-from odocal_ros.apply.arrivals import RowTimes
 from odocal_ros.apply.errors import GRAVITY
+from odocal_ros.apply.row_times import RowTimes
 from odocal_ros.apply.wheels import DelaySearch, LEAST_DELAY_ROWS
 from odocal_ros.data.samples import take
 from odocal_ros.settings.node_configs import ApplyConfig

@@ -7,7 +7,7 @@ from faulty_streams import columns_of, drive_of, run, SIGMAS, started, stream, w
 import numpy as np
 import pytest
 
-from odocal_ros.apply.arrivals import PERMANENT_ROWS, StampScreen, STEP_ROWS
+from odocal_ros.apply.stamp_screen import PERMANENT_ROWS, StampScreen, STEP_ROWS
 from odocal_ros.apply.stream import Row, SpikeScreen
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
