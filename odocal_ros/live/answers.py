@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Texts for the operator, from a view: the hint (next action), and the answers of services."""
+"""Texts for the operator from a ``SessionView``: next action (hint), answers of services."""
 
 from collections.abc import Iterable, Sequence
 

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Console log of a node: missing inputs (repeated), readiness, problems of the leg, losses."""
+"""
+Texts that a node logs: missing inputs (repeated), readiness, problems of the leg, lost messages.
+
+Each text appears when it becomes true, so that an operator can read the console during a drive.
+"""
 
 import re
 from typing import Any

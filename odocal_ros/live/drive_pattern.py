@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node that drives a robot along a pattern (``pattern.py``) by velocity commands."""
+"""
+The node that drives a robot along a calibration pattern (``pattern.py``).
+
+In: poses of the robot, and a bumper. Out: velocity commands.
+"""
 
 from functools import partial
 import math

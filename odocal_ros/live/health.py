@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Health of one topic from stamps and sequence numbers: rate, losses, gaps, jumps of time."""
+"""
+Health of one topic: rate, lost messages, gaps and jumps of time, for status and operator.
+
+In: stamps, sequence numbers and arrival times of the messages. Out: counts, and a mask of messages
+with a plausible stamp.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -21,8 +26,8 @@ class Health:
     """
     Counts and times of the messages of one topic.
 
-    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``received_ns`` the arrival of
-    the last message on the node's steady clock: the age of a topic must not depend on sim time.
+    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``last_arrival_ns`` is on the
+    node's steady clock, since the age of a topic must not depend on simulated time.
     """
 
     def __init__(self) -> None:
@@ -32,8 +37,8 @@ class Health:
         self.lost_before = 0   # ``lost`` at the begin of the leg
         self.gaps = 0          # steps of the stamps beyond the limit
         self.stampless = False    # no stamp in the last messages
-        self.received_ns = 0
-        self.delay_s = 0.0     # send time minus stamp of the newest row
+        self.last_arrival_ns = 0
+        self.delay_s = 0.0     # send time minus stamp of the newest message
         self.fix_status: int | None = None      # NavSatStatus of the newest fix
         self._last_sequence: int | None = None
         self._interval_s = 0.0    # smoothed interval of the stamps
@@ -50,7 +55,7 @@ class Health:
 
     def register_arrival(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count lost messages; sequences: publisher's numbers in order of arrival, or None."""
-        self.received_ns = now_ns
+        self.last_arrival_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
         steps = [after - before for before, after in pairwise(numbers)]
         # numbers of several publishers, or of a restarted one, cannot be used
@@ -59,13 +64,14 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def check_stamps(self, stamps: list[int], sent_ns: Sequence[int] | Ints,
+    def check_stamps(self, stamps: list[int], received_ns: Sequence[int] | Ints,
                      max_gap_s: float | None = None) -> list[bool]:
         """
-        Process the stamps and send times of some rows, ns.
+        Process the stamps of some rows, ns.
 
-        max_gap_s : longer steps are gaps; None: steps above 5 intervals. Returns a mask of rows
-        with a plausible stamp: not zero, not far ahead or behind.
+        received_ns : as in the samples, the send time of live messages.   max_gap_s : longer steps
+        are gaps; None: steps above 5 intervals. Returns a mask of rows with a plausible stamp: not
+        zero, not far ahead or behind.
         """
         self.count += len(stamps)
         self.stampless = bool(stamps) and max(stamps) <= 0
@@ -74,7 +80,7 @@ class Health:
         if rows:
             newest = self.newest_ns
             self._update_times([stamps[row] for row in rows], max_gap_s)
-            self.delay_s = (int(sent_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
+            self.delay_s = (int(received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
             for row in rows:
                 newest = max(newest, stamps[row])
                 plausible[row] = stamps[row] >= newest - TIME_RESTART_NS
@@ -135,7 +141,7 @@ class Health:
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""
-        return (now_ns - self.received_ns) * 1e-9 if self.received_ns else float('inf')
+        return (now_ns - self.last_arrival_ns) * 1e-9 if self.last_arrival_ns else float('inf')
 
     def is_flowing(self, now_ns: int) -> bool:
         limit_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal: each leg is written to disk as a bag while it is driven, to survive a crash."""
+"""
+The journal: a bag of each leg, written while it is driven, so that a crash loses only a second.
+
+In: raw messages of the inputs, and statuses with the marks of legs. The thread of
+``journal_writer`` writes them into the bag of ``journal_leg``.
+"""
 
 from datetime import datetime, UTC
 import time
@@ -12,11 +17,11 @@ from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
 from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_TYPE
-from odocal_ros.live.filing import output_root
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.recording import PREROLL_MARGIN_S
+from odocal_ros.live.result_folders import output_root
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.output.value_text import iso

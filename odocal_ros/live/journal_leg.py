@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal of one leg, a bag written while it is driven; the oldest journals are deleted."""
+"""The journal of one leg: a bag that grows in segments; the oldest journals are deleted."""
 
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The thread of the journal: packs messages into chunks of mcap, keeps pre-roll, writes legs."""
+"""
+The thread of the journal: receives raw messages in a queue, and writes them to the leg's bag.
+
+Between legs it keeps the pre-roll, the messages before a start mark, as packed chunks.
+"""
 
 from collections import deque
 from collections.abc import Callable

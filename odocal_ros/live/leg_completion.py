@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg from its start mark to the answer: record, close, compute, combine with others, save."""
+"""
+The life of a leg in the calibration node, from its start mark to the answer of ``stop_leg``.
+
+In: marks of the operator or of automatic legs. Out: a result, combined with those of earlier legs,
+as a future: computation and saving run in the worker.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,12 +23,12 @@ from odocal_ros.forecast.progress import clock_difference_text
 from odocal_ros.forecast.quantities import find_observable, Observability, quantities_text
 from odocal_ros.live import answers, worker
 from odocal_ros.live.console import Console
-from odocal_ros.live.filing import Filing
 from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.process import CheckedNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
+from odocal_ros.live.result_folders import ResultSaver
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.output.value_text import iso
@@ -59,17 +64,17 @@ class LegCompletion:
         self._distance_m = 0.0                # of the leg that changed last
         self._imu_silent = False              # in the recorded leg
         self._console = Console(self._log)
-        self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
+        self._saver = ResultSaver(self._worker, self._log, self.show_status, self._node_name)
 
     @property
     def is_awaited(self) -> bool:
         """Return True while a leg is computed or files are written."""
-        return self.session.state is State.COMPUTING or self._filing.is_busy
+        return self.session.state is State.COMPUTING or self._saver.is_busy
 
     def tick(self) -> None:
         """Process finished jobs, new messages and timeouts."""
         self._worker.poll()
-        self._filing.poll()
+        self._saver.poll()
         self.decode_new_messages()
         if self._recording.has_time_jumped:
             self._restart_after_jump()
@@ -100,10 +105,10 @@ class LegCompletion:
     def close(self) -> bool:
         """Wait briefly for running jobs and files; return True if all are done."""
         self._running_estimate.end()
-        grace_s = worker.FILES_GRACE_S if self._filing.is_busy else worker.JOB_GRACE_S
+        grace_s = worker.FILES_GRACE_S if self._saver.is_busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
         done = self._worker.close(until - time.monotonic())
-        return self._filing.close(max(0.0, until - time.monotonic())) and done
+        return self._saver.close(max(0.0, until - time.monotonic())) and done
 
     def unstopped_leg_text(self) -> str:
         """Return the folder and replay command of a leg that was not stopped, else empty."""
@@ -153,8 +158,8 @@ class LegCompletion:
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            stage=self._computing.stage, saved=self._filing.saved, lost=self._lost_leg_text(),
-            save_trouble=self._filing.trouble, journal=self._journal.folder,
+            stage=self._computing.stage, saved=self._saver.saved, lost=self._lost_leg_text(),
+            save_trouble=self._saver.trouble, journal=self._journal.folder,
             journal_trouble=self._journal.trouble, has_received=recording.has_received(),
             is_local=recording.is_local, has_imu=not inputs.without_imu)
 
@@ -290,6 +295,6 @@ class LegCompletion:
     def _save(self, calibration: Calibration, by_operator: bool = False) -> Future:
         inputs = self._recording.inputs
         config = replace(self.session.config, output=self._config().output)   # may be new
-        return self._filing.save(calibration, config, inputs.topics,
+        return self._saver.save(calibration, config, inputs.topics,
                                  inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
                                  by_operator)

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration node: services, parameters, and a timer that runs everything."""
+"""
+The calibration node: it builds its parts, connects them, and runs them by one timer.
+
+In: messages of the inputs, and services of the operator. Out: status, diagnostics and results.
+"""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Console scripts that start a node, and ``odocal watch``; both name a missing package."""
+"""Console scripts of the nodes and ``odocal watch``, with an error for a missing package."""
 
 from argparse import ArgumentParser, Namespace
 from functools import partial

@@ -81,7 +81,7 @@ class OdometryNode(CheckedNode):
 
     def _build(self) -> None:
         self.config = params.declare_settings(self, ApplyConfig)
-        calibration = params.declare_results(self, params.APPLIED)
+        calibration = params.declare_results(self, params.ODOMETRY_UNITS)
         if calibration is None or not calibration.valid:
             refusal = 'no calibration is given' if calibration is None else (
                 f'the calibration of {calibration.stamp} was rejected')

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The commands of the operator (services of the node), and automatic legs (leg.automatic)."""
+"""
+Commands of the calibration node: services of the operator, and automatic legs (leg.automatic).
+
+In: a request. Out: its answer, success and text; each refusal states cause and action.
+"""
 
 from functools import partial
 from typing import Any
@@ -12,8 +16,8 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import Samples
 from odocal_ros.forecast.quantities import quantities_text
 from odocal_ros.live import answers, worker
-from odocal_ros.live.filing import LATEST, output_root
 from odocal_ros.live.leg_completion import LegCompletion
+from odocal_ros.live.result_folders import LATEST, output_root
 from odocal_ros.live.session import Refused, State
 from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.output.value_text import counted, iso
@@ -202,7 +206,7 @@ class Operation(AutomaticLegs):
         remaining = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
-        self._filing.withdraw(self.session.start_ns)
+        self._saver.withdraw(self.session.start_ns)
         self.show_status()
         if not remaining:
             self._publishing.set_results(None)
@@ -230,7 +234,7 @@ class Operation(AutomaticLegs):
             self.show_status()
         self._publishing.set_results(None)
         self._publishing.show_paths(worker.leg_paths(None, self._config()))
-        self._filing.withdraw(0)
+        self._saver.withdraw(0)
         self.show_status()
         return True, f'reset: {counted(len(dropped), "leg")} dropped'
 

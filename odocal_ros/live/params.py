@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings as ROS parameters; the result as ``result.*``, which restore it at the next start."""
+"""
+ROS parameters of the nodes: settings, checked, and the result as ``result.*``.
+
+In: the overrides of a node (command line, YAML). Out: its configuration, and the result of an
+earlier session if ``result.*`` are among them: so a saved calibration.yaml restores it.
+"""
 
 from collections.abc import Callable, Iterable
 import difflib
@@ -23,12 +28,14 @@ from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, SETTINGS, settings_of, with_settings
 from odocal_ros.settings.setting import Setting
 
-SCALE = 'm/pulse, m/rad or 1'
-# estimates among the results of the calibrator, and their units
-ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
-             'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
-APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {      # those that dead reckoning uses
+SCALE_UNIT = 'm/pulse, m/rad or 1'      # by the kind of odometer
+# estimates in ``result.*`` of the calibrator, and their units
+ESTIMATE_UNITS = {
+    'scale_factor': SCALE_UNIT, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+    'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE_UNIT,
+    'scale_factor_right': SCALE_UNIT, 'heading_error': 'rad', 'track_width': 'm'}
+# those in ``result.*`` of the odometry node, which restores more of a calibration
+ODOMETRY_UNITS = ESTIMATE_UNITS | {'scale_factor_as_sent': SCALE_UNIT} | {
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'
@@ -40,14 +47,14 @@ UNKNOWN_DATE = 'an unknown date'
 FILE_REMEDY = 'use the file that ~/save wrote'
 
 
-def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
+def _result_defaults(names: Iterable[str]) -> dict[str, Any]:
     numbers: dict[str, Any] = {
-        PREFIX + name + end: math.nan for name in estimates for end in ('', '_sigma')}
+        PREFIX + name + end: math.nan for name in names for end in ('', '_sigma')}
     return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': '',
                       PREFIX + 'vehicle': ''}
 
 
-RESULTS = _result_defaults(ESTIMATES)
+RESULTS = _result_defaults(ESTIMATE_UNITS)
 
 
 def descriptor(setting: Setting) -> msg.ParameterDescriptor:
@@ -165,10 +172,14 @@ def refuse_after_start(kind: type) -> Callable[[list[Parameter]], msg.SetParamet
     return refuse
 
 
-def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restored | None:
-    """Declare ``result.*``; return the saved result given by overrides, if any."""
-    for name, default in _result_defaults(estimates).items():
-        unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
+def declare_results(node: Node, units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
+    """
+    Declare ``result.*``; return the saved result given by overrides, if any.
+
+    units : names of the estimates, and their units.
+    """
+    for name, default in _result_defaults(units).items():
+        unit = units.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
         about = msg.ParameterDescriptor(dynamic_typing=True, description=(
             'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
         value = node.declare_parameter(name, default, about).value
@@ -179,7 +190,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
         if is_whole:
             node.set_parameters([Parameter(name, value=float(value))])
     kept = restored_from({name: node.get_parameter(name).value
-                          for name in _result_defaults(estimates)}, estimates)
+                          for name in _result_defaults(units)}, units)
     vehicle = node.get_parameter('vehicle').value
     if kept is not None and kept.vehicle and vehicle and kept.vehicle != vehicle:
         raise BadConfig(f"the result belongs to vehicle '{one_line(kept.vehicle)}', but this "
@@ -193,7 +204,7 @@ def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[st
     values = RESULTS | {
         PREFIX + 'legs': len(calibration.legs), PREFIX + 'stamp': stamp,
         PREFIX + 'valid': calibration.verdict is not Verdict.REJECTED, PREFIX + 'vehicle': vehicle}
-    for name in ESTIMATES:
+    for name in ESTIMATE_UNITS:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')
         for key, number in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
             values[PREFIX + key] = math.nan if number is None else float(number)
@@ -201,7 +212,7 @@ def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[st
 
 
 def restored_from(results: dict[str, Any],
-                  estimates: dict[str, str] = ESTIMATES) -> Restored | None:
+                  units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
     """
     Return the result in the parameters ``result.*``, None without one.
 
@@ -213,14 +224,14 @@ def restored_from(results: dict[str, Any],
     if one_line(stamp) != stamp:
         raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {FILE_REMEDY}")
     found = {}
-    for name, unit in estimates.items():
+    for name, unit in units.items():
         value, sigma = (None if math.isnan(x) else x for x in (
             results[PREFIX + name], results[PREFIX + name + '_sigma']))
         try:
             check_estimate(name, value, sigma)
         except ValueError as error:
             raise BadConfig(f'{error}; {FILE_REMEDY}') from None
-        found[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
+        found[name] = Estimate(value, sigma, '1' if unit == SCALE_UNIT else unit)
     if all(e.value is None for e in found.values()):
         return None
     return Restored(found, legs, results[PREFIX + 'valid'], stamp or UNKNOWN_DATE,

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node as a process: command line, start, end, and one line of error if it cannot start."""
+"""
+Main function of all nodes: command line, start, spin, signals, end.
+
+A node that cannot start prints one line with cause and action in place of a traceback.
+"""
 
 from collections.abc import Callable
 import os

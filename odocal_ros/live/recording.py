@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reception of messages: the topics of the node, decoded to samples for recorder and journal."""
+"""
+Reception of all input topics of the calibration node.
+
+In: raw messages. Out: samples in the recorder of the leg, raw messages in the journal, and the
+reasons why inputs are missing.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -70,7 +75,7 @@ class Inputs:
     def without_imu(self) -> bool:
         """Return True if a leg needs no IMU, and none is published."""
         imu = self.by_slot['imu']
-        return not (self._needs_imu or imu.publishers or imu.health.received_ns)
+        return not (self._needs_imu or imu.publishers or imu.health.last_arrival_ns)
 
     @property
     def leading(self) -> Input:
@@ -260,13 +265,13 @@ class Recording:
                 for slot, source in self.inputs.by_slot.items()}
 
     def has_received(self) -> bool:
-        return any(source.health.received_ns for source in self.inputs.by_slot.values())
+        return any(source.health.last_arrival_ns for source in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
         """Return the time from the last IMU message to the newest of all, s; 0 without an IMU."""
-        received_ns = {slot: source.health.received_ns
+        arrivals_ns = {slot: source.health.last_arrival_ns
                        for slot, source in self.inputs.by_slot.items()}
-        silent_ns = max(received_ns.values()) - received_ns['imu']
+        silent_ns = max(arrivals_ns.values()) - arrivals_ns['imu']
         return 0.0 if self.inputs.without_imu else max(0, silent_ns) * 1e-9
 
     def close(self) -> None:

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimate of values and problems of the leg that is recorded, updated every few seconds."""
+"""
+Running estimate: values, sigmas and problems of the leg while it is driven.
+
+In: the samples so far, every few seconds. Out: a ``Forecast`` (estimates, their sigmas, and the
+distance that is still needed) for status and operator. The worker computes it.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial

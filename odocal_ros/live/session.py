@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""State of the calibration node: open leg, kept legs, combined result; a snapshot for texts."""
+"""
+State of the calibration node: the open leg, earlier legs, and the combined result.
+
+It needs neither ROS nor files. A ``SessionView`` is a snapshot of it, the input of all texts.
+"""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum

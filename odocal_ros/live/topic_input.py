@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One input topic: search for publishers, subscription, decoding as of bags, health."""
+"""
+One input topic of a node, from the search for its publishers to samples.
+
+In: raw messages. Out: samples, by the same readers as for bags, the health of the topic, and the
+reason why no usable message arrives.
+"""
 
 from collections.abc import Callable, Sequence
 import difflib
@@ -36,8 +41,8 @@ MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4
 SEARCH_PERIOD_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: queue, one message per publisher of static transforms
-# method of a reader: serialised messages, send times, deserialiser -> (slot, rows) pairs
-Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
+# method of a reader: serialised messages, send times, ns, deserialiser -> (slot, rows) pairs
+ReadMethod = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
@@ -90,7 +95,7 @@ class Input:
         self.publishers: list[TopicEndpointInfo] = []
         self.suggestions: list[str] = []     # suggested topics if this one has no publisher
         self._failed = 0       # messages whose block raised an error
-        self._unreported: list[Reading] = []     # stamps and send times not yet in ``health``
+        self._unreported: list[Reading] = []     # stamps and ``received_ns`` not yet in ``health``
         self._configured_frame = ''     # imu.frame_id at the subscription
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
@@ -197,8 +202,8 @@ class Input:
         """
         Return (slot, block) pairs of messages; unreadable messages are counted.
 
-        sent_ns : send times of the messages, from ``take``.   max_gap_s : longer steps between
-        stamps are counted as gaps; None: steps above five intervals.
+        sent_ns : send times from ``take``, ``received_ns`` of the samples.   max_gap_s : longer
+        steps between stamps are counted as gaps; None: steps above five intervals.
         """
         pairs = self._read(self.reader.rows if self.reader else None, raws, sent_ns)
         for slot, block in pairs:
@@ -222,11 +227,11 @@ class Input:
     def _update_health(self) -> None:
         """Add the readings since the last call to the health."""
         if self._unreported:
-            stamps, sent_ns = zip(*self._unreported, strict=True)
-            self.health.check_stamps(list(stamps), sent_ns)
+            stamps, received_ns = zip(*self._unreported, strict=True)
+            self.health.check_stamps(list(stamps), received_ns)
             self._unreported = []
 
-    def _read(self, read: Read | None, raws: list[bytes],
+    def _read(self, read: ReadMethod | None, raws: list[bytes],
               sent_ns: list[int]) -> list[tuple[str, Any]]:
         """Return (slot, rows) pairs of messages by a function of the reader."""
         reader, deserialize = self.reader, self._deserialize
@@ -266,7 +271,8 @@ class Input:
             names = ' or '.join(self.suggestions)
             suggestions = f' (did you mean {names}?)' if names else ''
             return f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found' + (
-                f', silent for {silent:.0f} s; restart the driver' if self.health.received_ns else
+                f', silent for {silent:.0f} s; restart the driver'
+                if self.health.last_arrival_ns else
                 f'; start the driver or remap {self.name}{suggestions}')
         types = {p.topic_type for p in self.publishers}
         if self.msgtype and self.msgtype not in types:
@@ -276,7 +282,7 @@ class Input:
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
         publishers_text = counted(len(self.publishers), 'publisher')
-        if not self.health.received_ns:
+        if not self.health.last_arrival_ns:
             return (f'{self.topic}: {publishers_text} found ({offers}) but no message yet; check '
                     'the driver')
         return (f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: '

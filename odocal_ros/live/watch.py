@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal watch: subscribes to the status of a node (untrusted), and shows it in the terminal."""
+"""
+odocal watch: shows the status of a calibration node in the terminal.
+
+The status comes from another process: its keys and values are untrusted.
+"""
 
 from collections.abc import Iterator
 import math

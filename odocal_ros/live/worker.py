@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The computations of the node, the thread that runs them one at a time, and waiting callers."""
+"""
+Worker thread of the calibration node: runs computations one at a time, outside the executor.
+
+In: functions. Out: their results, as callbacks that run in the thread of the executor.
+"""
 
 from collections.abc import Callable
 import ctypes

@@ -103,7 +103,7 @@ def test_turns_are_long_unless_somebody_waits(embedded):
     node, client = embedded
     wait_for(lambda: node._timer.timer_period_ns == round(TICK_S * 1e9), 'long turns')
     gate = threading.Event()
-    report_worker = node.operation._filing._report_worker
+    report_worker = node.operation._saver._report_worker
     report_worker.submit(gate.wait, lambda *_: None)      # a report to be drawn
     wait_for(lambda: node._timer.timer_period_ns == round(AWAITED_TICK_S * 1e9), 'short turns')
     gate.set()

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result folders of a node: written by its worker; the link ``latest``; removal of old ones."""
+"""
+Result folders of the calibration node: one for each result, written in its worker thread.
+
+The link ``latest`` points to the best known result of the vehicle. It is moved back if a leg is
+undone, and outdated results of automatic legs are removed.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,37 +39,39 @@ RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # 
 
 @dataclass(frozen=True)
 class WrittenResult:
+    """A result folder of this session to which ``latest`` was moved."""
+
     folder: Path
-    last_ns: int     # start of its last leg
-    before: str      # earlier target of ``latest``, empty without one
+    last_leg_ns: int        # stamp of the start mark of its last leg
+    previous_target: str    # name of the folder to which ``latest`` pointed before, or empty
 
 
 class ResultFolders:
     """
-    Keeps ``latest`` at the best known result of this session and earlier ones.
+    Keeps the link ``latest`` at the best known result of this session and earlier ones.
 
     The link does not move from a good calibration to a worse one unless forced. It moves back
-    when a leg of its target is undone. Only results of ``leg.automatic`` are ever removed.
+    when a leg of its target is dropped. Only results of ``leg.automatic`` are ever removed.
     """
 
     def __init__(self) -> None:
         self._written: list[WrittenResult] = []
 
-    def point_latest(self, folder: Path, last_ns: int, force: bool) -> str:
+    def point_latest(self, folder: Path, last_leg_ns: int, force: bool) -> str:
         """
         Point ``latest`` at a new folder; return the reason if it stays unchanged, else empty.
 
-        last_ns : start of the last leg in it.
+        last_leg_ns : stamp of the start mark of the last leg in it.   force : also at a worse one.
         """
         link = folder.parent / LATEST
         with locked(folder.parent):         # another node may write there, too
             _remove_remains(folder.parent)
-            before = _link_target(link)
+            previous_target = _link_target(link)
             reason = '' if force else objection_to_folder(stored_in(link), folder)
             if reason:
                 return reason
             _set_link(link, folder.name)
-        self._written.append(WrittenResult(folder, last_ns, before))
+        self._written.append(WrittenResult(folder, last_leg_ns, previous_target))
         return ''
 
     def prune(self, newest: Path, kept: int) -> None:
@@ -83,7 +90,7 @@ class ResultFolders:
             outdated = names[:-kept] if kept else []
             linked = _link_target(root / LATEST)
             kept_names = {newest.name, linked, *(
-                entry.before for entry in self._written if entry.folder.name == linked)}
+                one.previous_target for one in self._written if one.folder.name == linked)}
             for name in reversed(names if outdated else []):
                 found = stored_in(root / name)
                 if found and found.usable:
@@ -96,19 +103,20 @@ class ResultFolders:
 
     def withdraw(self, since_ns: int) -> Path | None:
         """
-        Withdraw the folders with legs that started at ``since_ns`` or later: they are dropped.
+        Move ``latest`` away from folders with legs that started at ``since_ns`` or later.
 
-        Returns the newest folder of this session that is not withdrawn, None without one.
+        These legs were dropped. Returns the newest folder of this session that is not withdrawn,
+        None without one.
         """
-        dropped = [entry for entry in self._written if entry.last_ns >= since_ns]
-        self._written = [entry for entry in self._written if entry.last_ns < since_ns]
-        for entry in reversed(dropped):
-            root = entry.folder.parent
+        dropped = [result for result in self._written if result.last_leg_ns >= since_ns]
+        self._written = [result for result in self._written if result.last_leg_ns < since_ns]
+        for result in reversed(dropped):
+            root = result.folder.parent
             link = root / LATEST
-            if _link_target(link) != entry.folder.name:
+            if _link_target(link) != result.folder.name:
                 continue       # another process has moved it
-            if entry.before and (root / entry.before).is_dir():
-                _set_link(link, entry.before)
+            if result.previous_target and (root / result.previous_target).is_dir():
+                _set_link(link, result.previous_target)
             else:
                 link.unlink(missing_ok=True)
         return self._written[-1].folder if self._written else None
@@ -133,9 +141,9 @@ def _link_target(link: Path) -> str:
 
 def _set_link(link: Path, name: str) -> None:
     """Move the link in one step: readers find the old or the new folder."""
-    other = link.with_name(f'.{LATEST}-{uuid.uuid4().hex}')
-    other.symlink_to(name)
-    other.replace(link)
+    temporary = link.with_name(f'.{LATEST}-{uuid.uuid4().hex}')
+    temporary.symlink_to(name)
+    temporary.replace(link)
 
 
 def output_root(config: Config, node: str) -> Path:
@@ -144,9 +152,9 @@ def output_root(config: Config, node: str) -> Path:
     return Path(config.output.directory or default).expanduser()
 
 
-class Filing:
+class ResultSaver:
     """
-    Saves and withdraws results.
+    Writes results into new folders by the worker, and answers with the folder or the error.
 
     show : called when ``saved`` (the newest folder that is not withdrawn) or ``trouble`` (error of
     the newest save) has changed.   node : full name, for the default folder.
@@ -160,14 +168,15 @@ class Filing:
         # result of a requested save that left ``latest`` unchanged
         self._not_latest: Calibration | None = None
         self._saves_running = 0
-        self._report_worker = Worker()        # separate: no leg waits for a report
+        self._report_worker = Worker()        # separate, so that no leg waits until it is drawn
 
     def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
              imu_frame: str, now_ns: int, by_operator: bool) -> Future:
         """
         Write the result files in the worker; the future has (success, text).
 
-        by_operator : requested by ~/save: the second request moves ``latest`` to a worse result.
+        topics : slot -> name.   now_ns : time of the node's clock, for the folder's name.
+        by_operator : requested by ~/save; a second request moves ``latest`` to a worse result.
         """
         future = Future()
         self._saves_running += 1
@@ -217,8 +226,8 @@ class Filing:
                 with suppress(OSError):
                     folder.rmdir()      # empty: its name was only reserved
                 raise
-            last_ns = max((leg.start_ns for leg in calibration.legs), default=0)
-            unchanged_reason = self._folders.point_latest(folder, last_ns, force)
+            last_leg_ns = max((leg.start_ns for leg in calibration.legs), default=0)
+            unchanged_reason = self._folders.point_latest(folder, last_leg_ns, force)
             if config.leg.automatic:
                 self._folders.prune(folder, config.output.automatic_kept)
         except OSError as error:

@@ -13,8 +13,8 @@ from bench import wait_for
 import pytest
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.live import filing as module
-from odocal_ros.live.filing import Filing, output_root, ResultFolders
+from odocal_ros.live import result_folders as module
+from odocal_ros.live.result_folders import output_root, ResultFolders, ResultSaver
 from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
@@ -27,42 +27,42 @@ BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
 
 
 @pytest.fixture
-def filing():
-    """Return worker, filing, the warnings of both, and a function that saves and answers."""
+def saving():
+    """Return worker, result saver, the warnings of both, and a function that saves and answers."""
     worker, messages = Worker(), []
-    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=messages.append),
+    saver = ResultSaver(worker, SimpleNamespace(info=lambda text: None, warning=messages.append),
                     lambda: None, '/calibrator')
 
     def run(calibration, folder, by_operator=True):
         config = with_settings(Config(), {'output.directory': str(folder)})
-        future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, by_operator)
+        future = saver.save(calibration, config, {}, 'imu_link', NOW_NS, by_operator)
         wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
         return future.result()
-    yield SimpleNamespace(worker=worker, filing=filing, messages=messages, save=run)
+    yield SimpleNamespace(worker=worker, saver=saver, messages=messages, save=run)
     worker.close()
 
 
 @pytest.fixture
-def save(filing, tmp_path):
+def save(saving, tmp_path):
     """Return a function that saves a calibration and returns the answer and where latest is."""
     def run(calibration, by_operator=True):
-        success, text = filing.save(calibration, tmp_path, by_operator)
+        success, text = saving.save(calibration, tmp_path, by_operator)
         assert success
-        saved = filing.filing.saved
+        saved = saving.saver.saved
         assert saved in text
         return text, (tmp_path / 'latest').resolve().name == saved.rpartition('/')[2]
     return run
 
 
-def test_what_cannot_be_saved_is_a_warning_until_it_is(filing, tmp_path):
+def test_what_cannot_be_saved_is_a_warning_until_it_is(saving, tmp_path):
     (tmp_path / 'file').touch()
-    success, text = filing.save(GOOD, tmp_path / 'file')
+    success, text = saving.save(GOOD, tmp_path / 'file')
     assert not success
-    assert filing.messages == [text]
-    assert filing.filing.trouble in text
-    assert 'output.directory' in filing.filing.trouble
-    assert filing.save(GOOD, tmp_path)[0]
-    assert filing.filing.trouble == ''
+    assert saving.messages == [text]
+    assert saving.saver.trouble in text
+    assert 'output.directory' in saving.saver.trouble
+    assert saving.save(GOOD, tmp_path)[0]
+    assert saving.saver.trouble == ''
 
 
 def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
@@ -79,20 +79,20 @@ def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
     assert not list(tmp_path.glob('.latest*'))
 
 
-def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_path, monkeypatch):
-    gate, worker, done = threading.Event(), filing.worker, []
+def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(saving, tmp_path, monkeypatch):
+    gate, worker, done = threading.Event(), saving.worker, []
     monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: (
         gate.wait(20), ('<html></html>', ''))[1])
-    filing.save(GOOD, tmp_path)
+    saving.save(GOOD, tmp_path)
     assert (tmp_path / 'latest' / 'calibration.json').exists()
     assert not (tmp_path / 'latest' / 'report.html').exists()
     worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
     wait_for(lambda: worker.poll() or done, 'the leg')
-    assert filing.filing.is_busy
-    assert not filing.filing.close(0.05)
+    assert saving.saver.is_busy
+    assert not saving.saver.close(0.05)
     gate.set()
     wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
-    assert done + filing.messages == ['a leg']
+    assert done + saving.messages == ['a leg']
 
 
 def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path):
