@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Base class of the files of a bag (mcap, sqlite3, rosbag1): topics, and messages as CDR."""
+"""
+Base class of the files of a bag: one interface for mcap, sqlite3 and rosbag1.
+
+Out: the topics of a file with counts and times, and its messages as CDR, one by one in order of
+time or many at a time.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Encoding of samples as ROS 2 messages (CDR), in numpy: those of a topic have one length."""
+"""
+Samples as serialised messages (CDR), for bags of simulated drives.
+
+In: samples as arrays. Out: a ``Topic``: all its messages have one length, so that numpy writes
+the fields of all of them at once.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

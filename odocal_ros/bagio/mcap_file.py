@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An mcap file, read by its index, or record by record if that is missing or invalid."""
+"""
+Read an mcap file: topics, counts and messages.
+
+With a valid index only the chunks with the wanted topics are read. Without one, or in a damaged
+file, records are read from the begin of the file on, as far as they are valid.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 import heapq

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of mcap files (mcap.dev/spec): kinds and content; chunks are unpacked and checked."""
+"""
+Parts of an mcap file (mcap.dev/spec): records, chunks, index and statistics as Python values.
+
+In: bytes of an untrusted file. Out: their content; ``Damaged`` is raised for invalid bytes.
+"""
 
 from collections.abc import Iterator, Sequence
 from operator import attrgetter

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write mcap files chunk by chunk (mcap.dev/spec), without rosbags, synced to the disk."""
+"""
+Write mcap files (mcap.dev/spec) chunk by chunk, for the journal of the node.
+
+It needs no rosbags. A file is complete and on the disk when ``write_file`` returns.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

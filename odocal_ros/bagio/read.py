@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read bags: rosbag1, rosbag2 (sqlite3, mcap); split, compressed, without metadata, damaged."""
+"""
+Read a bag, in one pass, whatever its format: rosbag1, rosbag2 with sqlite3 or mcap.
+
+In: a path. Out: its topics, and messages handed to readers in order of time. Split and compressed
+bags, and damaged ones or those without metadata are read as far as possible, with notes.
+"""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, ExitStack

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Message types defined in a bag, and rosbag1 files: read by rosbags, within limits."""
+"""
+What is read by the library rosbags: message types defined in a bag, and rosbag1 files.
+
+Definitions and files are untrusted: time, size and number of elements are limited.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

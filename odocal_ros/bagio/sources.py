@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Finds the files of a bag from a path that the user names, and decompresses them if needed."""
+"""
+The files of a bag, found from the path that a user names, and decompressed if needed.
+
+In: a folder, a metadata.yaml, or a file of a bag. Out: the files in the order of recording, each
+plain and with its format.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write a bag of several topics in order of time, completely or not at all, with rosbags."""
+"""
+Write a bag of several topics in order of time, completely or not at all, by rosbags.
+
+In: topics with serialised messages. Out: a folder, which has its name only once it is complete.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

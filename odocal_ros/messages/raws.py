@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialised messages in one buffer; as tables of equal layout, a message in each row."""
+"""
+Serialised messages of a topic in one buffer, grouped by equal layout.
+
+Messages of one layout form a table with a message in each row, so that numpy reads a field of all
+of them at once. ``FrameFilter`` separates the IMUs that share a topic.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 import struct

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""TF as position reference: positions of a robot from the transforms on /tf and /tf_static."""
+"""
+TF as position reference: positions of a robot from the transforms on /tf and /tf_static.
+
+In: transforms between any frames. Out: positions of the configured frame in its reference frame,
+as fixes, each once all transforms between the two are known.
+"""
 
 from collections.abc import Callable, Container, Mapping, Sequence
 import struct

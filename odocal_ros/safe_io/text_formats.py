@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Text in the formats of other programs: untrusted names made safe, YAML written and read.
+Text in the formats of other programs: terminal, shell, launch file, XML, table, YAML.
 
-Writers of an untrusted name (frame, topic, type, joint, file) use the function of their format. A
-frame is accepted only if ROS accepts it, since programs act on files that contain it. YAML values
-have the same type for every reader; untrusted YAML is read with limits.
+Names in a bag (frame, topic, type, joint, file) are untrusted: each writer passes them through the
+function of its format. A frame is accepted only if ROS accepts it, since programs act on files
+that contain it. YAML values have the same type for every reader; YAML is read with limits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,19 +20,19 @@ from typing import Any
 from odocal_ros.errors import BadConfig
 from odocal_ros.safe_io.limits import check
 
-# escaped in every line: control characters, half surrogate pairs, changes of writing direction
-UNSEEN = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\u2060-\u206f'
+# escaped in every line: control characters, lone surrogates, changes of writing direction
+INVISIBLE = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\u2060-\u206f'
                     '\ufeff\ufff9-\ufffb\ud800-\udfff]')
-# our own colours on a terminal: of these words only, not of input text
+# the only escape sequences that may reach a terminal: colours of these words
 VERDICT_STYLE = re.compile('(\x1b\\[1;3[123]m(?:ACCEPTED|CAUTION|REJECTED)\x1b\\[0m)')
 LONGEST_LINE = 2000       # judgement: characters of one line of a log, a panel or an error
 FRAME = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_./-]{0,199}')
-NODES = 30_000            # judgement: mappings, lists and values of a YAML text: some seconds
+MOST_YAML_NODES = 30_000      # judgement: mappings, lists and values; reading takes seconds
 
 
 def one_line(text: object) -> str:
     """Return text as one line, invisible characters as escape sequences."""
-    return UNSEEN.sub(lambda match: match[0].encode('unicode_escape').decode(), str(text))
+    return INVISIBLE.sub(lambda match: match[0].encode('unicode_escape').decode(), str(text))
 
 
 def indented_list(names: Sequence[str]) -> str:
@@ -91,7 +91,7 @@ def for_shell(words: list[str]) -> str:
 
 
 def yaml_value(value: object) -> str:
-    """Return a value as YAML in full; text in quotes, so that a joint may be named 0 or on."""
+    """Return a value as YAML with all digits; text in quotes, since a joint may be named 0."""
     if value is None or isinstance(value, float):
         return yaml_number(value)
     if isinstance(value, (tuple, list)):
@@ -105,12 +105,12 @@ def yaml_value(value: object) -> str:
 
 
 def yaml_number(value: float | None) -> str:
-    """Return a double as YAML that is a double for every reader: 1e-05 is text in YAML 1.1."""
+    """Return a double as YAML, nan for None, with a point: 1e-05 is text in YAML 1.1."""
     if value is None or not math.isfinite(value):
         return '.nan'
     text = repr(float(value))
-    mantissa, e, exponent = text.partition('e')
-    return text if not e or '.' in mantissa else f'{mantissa}.0e{exponent}'
+    mantissa, separator, exponent = text.partition('e')
+    return text if not separator or '.' in mantissa else f'{mantissa}.0e{exponent}'
 
 
 def date_text(iso: str) -> str:
@@ -123,7 +123,7 @@ def date_text(iso: str) -> str:
 
 
 def parameter_block(values: Mapping[str, Any], key: str = '/**') -> str:
-    """Return the block of a parameter file; dicts among the values are groups."""
+    """Return ROS parameters as YAML; key: node name pattern; dicts among the values: groups."""
     return f'{key}:\n  ros__parameters:\n{_lines(values, 4)}'
 
 
@@ -153,7 +153,7 @@ def safe_loader(aliases: bool = False) -> Any:
                 raise yaml.composer.ComposerError(
                     None, None, f'nested deeper than {deepest} levels', mark)
             self.nodes += 1
-            check(self.nodes, NODES, 'the YAML text', 'values')
+            check(self.nodes, MOST_YAML_NODES, 'the YAML text', 'values')
             self.depth += 1
             try:
                 node = super().compose_node(parent, index)
@@ -170,7 +170,7 @@ def safe_loader(aliases: bool = False) -> Any:
 
 
 def compose_yaml(text: str, where: str) -> Any:
-    """Return the root node of a text (None: it is empty), or raise BadConfig with the place."""
+    """Return the root node of a YAML text, None if empty; raise BadConfig with file and line."""
     import yaml
     try:
         return yaml.compose(text, Loader=safe_loader())
