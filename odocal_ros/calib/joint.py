@@ -24,7 +24,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 NORMAL_95, DISPUTED_DEVIATES = 1.6449, 2.7
 # judgement: grid of ln (sigma between legs / usual sigma), for means over it
 SCATTER_GRID = np.linspace(-2.5, 5.0, SCATTER_POINTS)
-# 1 sigma of a permanent change of ln K, by any tyre, gear or counter: physical
+# physical: sigma of ln K after a change of tyre, gear or counter, so large that K is free
 FREE_STEP = 1.0
 
 
@@ -36,15 +36,15 @@ class JointEstimate:
     value: Floats                     # (m,), of the last leg for the one that drifts
     covariance: Floats                # (m, m)
     prior_sigma: Floats               # (m,)
-    relaxed_sigma: Floats             # (m,) the same, widened by legs that contradict the priors
+    relaxed_sigma: Floats             # (m,) prior sigma, widened if the legs contradict the prior
     chi2: float                       # of the legs, before ``factor``
     freedom: float                    # its degrees of freedom
     deviation: Floats                 # (J, m) sigmas, of each leg from the others, (S37)
     information: MarginalInformation  # of all legs, for later ones
-    # sigma of the differences between legs, by constant; empty for a single leg
+    # name of a constant -> sigma of its differences between legs; empty for a single leg
     scatter: dict[str, float] = field(default_factory=dict)
     disputed: tuple[str, ...] = ()    # constants in which legs differ significantly
-    factor: float = 1.0               # on all sigmas, included in ``covariance``
+    factor: float = 1.0               # of all sigmas, included in ``covariance``
     # (J,) rad or relative, additional error of each leg by its linearisation
     linearisation_error: Floats = field(default_factory=lambda: np.zeros(0))
 
@@ -72,7 +72,7 @@ def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float]
     # a single leg has no scatter
     is_single = len(drives.marginals) == 1 and not marginals[0].scatter_likelihood
     scatter = {} if is_single else estimated.sigmas
-    # chi-square of the drives with scatter, plus that between the sections of each
+    # chi-square of the drives with scatter, plus that of their sections about each drive
     residual_chi2, residual_freedom = (
         with_scatter + of_legs - of_drives for with_scatter, of_legs, of_drives in zip(
             drives.disagreement(scatter), (chi2, freedom), drives.disagreement(), strict=True))
@@ -163,11 +163,11 @@ def _find_disputed(legs: LinkedLegs, scatter: dict[str, float],
 
 def _add_linearisation_errors(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
     """Add an error to each leg by its distance from the linearisation point; return it: (J,)."""
-    linearised, at = legs.marginals, [legs.names.index(n) for n in curved]
+    linearised, indices = legs.marginals, [legs.names.index(n) for n in curved]
     error = np.zeros(len(linearised))
     for _ in range(3 if curved else 0):     # with reduced weights the estimate changes
         x, _ = legs.solve()
-        distance = np.array([x[legs.indices(j)][at] - b.point[at]
+        distance = np.array([x[legs.indices(j)][indices] - b.point[indices]
                              for j, b in enumerate(linearised)])
         error = (distance**2).sum(axis=1) / 2
         legs.replace_marginals([b.with_leg_errors(dict.fromkeys(curved, size))

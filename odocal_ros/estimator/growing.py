@@ -13,6 +13,7 @@ the earlier states only a little, so few passes are enough.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,13 @@ class RunningEstimate:
     speed: float          # m/s, median while driving
 
 
+class WindowEnd(NamedTuple):
+    """Estimate of a leg up to the end of a window."""
+
+    estimate: RunningEstimate
+    t: float    # s, end of the window
+
+
 class GrowingFit:
     """
     The fit of one leg while it grows.
@@ -69,54 +77,55 @@ class GrowingFit:
     def __init__(self, cpu_s: Callable[[], float]) -> None:
         self._cpu_s = cpu_s
         self.cold_start_cpu_s = 0.0
-        self._last: WarmStart | None = None
+        self._last: WarmStart | None = None     # summary of the last fit, start of the next one
         self._rows_per_independent: dict[str, float] = {}
         self._cold_start_length = 0.0      # s, length of the window at its last cold start
-        # estimate and end, s: of the finished windows, and of these with the long one in progress
-        self._past: tuple[RunningEstimate, float] | None = None
-        self._next: tuple[RunningEstimate, float] | None = None
+        # estimate of all finished windows; that with the window in progress, once this is long
+        # enough: it replaces the first when NEXT_WINDOW more has been driven
+        self._finished: WindowEnd | None = None
+        self._candidate: WindowEnd | None = None
 
     def forget(self) -> None:
         """Make the next fit a cold start."""
         self._last, self.cold_start_cpu_s = None, 0.0
 
-    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> RunningEstimate:
+    def fit(self, leg: SmootherLeg, config: Config, trace: Trace) -> RunningEstimate:
         """
         Return the running estimate.
 
-        view : the leg so far, in the same frame as before.   trace : called between passes; its
-        exceptions are passed on.   Raises BadData if the fit fails and no window is finished; the
-        next fit is then a cold start.
+        leg : samples so far, in the same frame as before.   trace : called between passes, may
+        raise an exception to stop the fit.
+
+        Raises BadData: the fit fails and no window is finished; the next fit is a cold start.
         """
         self.cold_start_cpu_s = 0.0
-        if self._next is not None and view.t_stop - self._next[1] > NEXT_WINDOW:
-            self._past, self._next, self._last = self._next, None, None
-        if self._past is not None:
-            view = replace(view, t_begin=self._past[1])
+        if self._candidate is not None and leg.t_stop - self._candidate.t > NEXT_WINDOW:
+            self._finished, self._candidate, self._last = self._candidate, None, None
+        window = leg if self._finished is None else replace(leg, t_begin=self._finished.t)
         last, self._last = self._last, None
         try:
-            now = self._window(last, view, config, trace)
+            estimate = self._fit_window(last, window, config, trace)
         except BadData:
-            if self._past is None:
+            if self._finished is None:
                 raise
-            return self._past[0]
-        if self._past is not None:
-            now = _join_windows(self._past[0], now, config)
-        if (self._next is None and view.t_stop - view.t_begin > LONG_WINDOW
-                and now.method.verdict is not Verdict.REJECTED):
-            self._next = now, view.t_stop
-        return now
+            return self._finished.estimate
+        if self._finished is not None:
+            estimate = _join_windows(self._finished.estimate, estimate, config)
+        if (self._candidate is None and window.t_stop - window.t_begin > LONG_WINDOW
+                and estimate.method.verdict is not Verdict.REJECTED):
+            self._candidate = WindowEnd(estimate, window.t_stop)
+        return estimate
 
-    def _window(self, last: WarmStart | None, view: SmootherLeg, config: Config,
-                trace: Trace) -> RunningEstimate:
+    def _fit_window(self, last: WarmStart | None, window: SmootherLeg, config: Config,
+                    trace: Trace) -> RunningEstimate:
         """Return the estimate of the window in progress; raises BadData."""
         try:
             with raise_on_overflow():
-                problem = make_problem(view, config, make_imu_steps(view, SPACING))
+                problem = make_problem(window, config, make_imu_steps(window, SPACING))
                 best = self._fit(last, problem, config, trace)
                 if not best.converged:
                     raise BadData('the smoother has not converged on the data so far')
-                method = make_result(view, problem, best, config)
+                method = make_result(window, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = best.summary()
@@ -134,7 +143,7 @@ class GrowingFit:
             best = best_fit(problem, config, trace)
             self.cold_start_cpu_s = self._cpu_s() - cpu_s if last is not None else 0.0
             return best
-        # the levels are kept until the state of the new section is estimated as well
+        # first pass with fixed noise levels: the new keyframes are not estimated yet
         first = fit(problem, start.state, start.levels, 1, frozen=True, warm_start=start,
                     trace=trace).summary()
         best = fit(problem, first.state, first.levels, UPDATE_PASSES, warm_start=first,
@@ -145,31 +154,33 @@ class GrowingFit:
         return best
 
 
-def _join_windows(past: RunningEstimate, now: RunningEstimate, config: Config) -> RunningEstimate:
+def _join_windows(finished: RunningEstimate, current: RunningEstimate,
+                  config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
-    # tyres warm up from the begin of a leg: each window has its own rate
+    # the rate of the scale differs between windows, as tyres warm up from the begin of a leg
     legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
                 {CONSTANTS[SCALE_BY_TIME]: np.inf}))
-            for one in (past, now)]
+            for one in (finished, current)]
     joint = combine_legs(legs, [0] * len(legs), config)
     sigmas = _parameter_sigmas(joint)
     # the largest sources are those of the window in progress
-    smaller = np.where(np.isfinite(now.sigmas), sigmas / now.sigmas, 1.0)[:, None]
-    reasons = {(r.code, r.text): r for r in (*now.method.reasons, *joint.reasons)}
+    sigma_ratio = np.where(np.isfinite(current.sigmas), sigmas / current.sigmas, 1.0)[:, None]
+    reasons = {(r.code, r.text): r for r in (*current.method.reasons, *joint.reasons)}
     method = replace(
-        now.method, estimates=now.method.estimates | joint.estimates, marginal=joint.marginal,
+        current.method, estimates=current.method.estimates | joint.estimates,
+        marginal=joint.marginal,
         reasons=tuple(reasons.values()),
-        sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
-    return RunningEstimate(method, sigmas, past.distance + now.distance,
-                           past.agility + now.agility, now.speed)
+        sources=tuple(replace(s, effects=s.effects * sigma_ratio) for s in current.method.sources))
+    return RunningEstimate(method, sigmas, finished.distance + current.distance,
+                           finished.agility + current.agility, current.speed)
 
 
 def _parameter_sigmas(method: MethodResult) -> Floats:
     """Return the sigmas of ln scale, yaw and pitch, also of undetermined ones: (3,)."""
     information = _information(method)
     legs = LinkedLegs([information], CONSTANTS[LN_K], np.empty(0))
-    at = legs.indices(0)[:PARAMETER_COUNT]
-    sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[at]), MODEL_FLOOR)
+    indices = legs.indices(0)[:PARAMETER_COUNT]
+    sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[indices]), MODEL_FLOOR)
     sigmas[information.prior_sigma[:PARAMETER_COUNT] <= NO_ERROR] = np.inf
     for i, name in enumerate(PARAMETERS):
         e = method.estimates[name]
@@ -192,13 +203,13 @@ def _motion_summary(state: State) -> tuple[float, float, float]:
             float(np.median((steps / T)[moving])) if moving.any() else 0.0)
 
 
-def make_imu_steps(view: SmootherLeg, spacing: float) -> ImuSteps:
+def make_imu_steps(leg: SmootherLeg, spacing: float) -> ImuSteps:
     """Return IMU steps with keyframes at multiples of spacing, s, and at both ends of a leg."""
-    first, t = imu_rows(view)
+    first, t = imu_rows(leg)
     k = nearest_samples(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
     key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
-    return ImuSteps.between(view, key + first)
+    return ImuSteps.between(leg, key + first)
 
 
 def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
@@ -207,19 +218,19 @@ def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
 
     None if earlier keyframes differ, or the number of used constants: a sensor started to publish.
     """
-    t, old = problem.imu.t[problem.imu.key], last.state.t
+    t, last_t = problem.imu.t[problem.imu.key], last.state.t
     rounding = 1e-6     # s
-    at = np.clip(np.searchsorted(old, t - rounding), 0, len(old) - 1)
-    same = np.abs(old[at] - t) < rounding
+    nearest = np.clip(np.searchsorted(last_t, t - rounding), 0, len(last_t) - 1)
+    same = np.abs(last_t[nearest] - t) < rounding
     n = len(t) if same.all() else int(np.argmin(same))      # keyframes that the last fit has
     # samples of the last 3 s may have arrived late
-    if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
+    if n < 2 or t[n - 1] < last_t[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
         return None
-    at = at[:n]
+    kept = nearest[:n]
     state = replace(last.state, **{
-        name: value[at] for name, value in last.state.keyframe_arrays().items()})
+        name: value[kept] for name, value in last.state.keyframe_arrays().items()})
     earlier = [last.variance_factors[first:end].mean(axis=0)
-               for first, end in zip(at[:-1], at[1:], strict=True)]
+               for first, end in zip(kept[:-1], kept[1:], strict=True)]
     variance_factors = np.concatenate([earlier, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
     levels = problem.initial_levels.replaced(**last.levels.values)
     return WarmStart(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
@@ -231,8 +242,8 @@ def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     imu, leg, n = problem.imu, problem.leg, len(state.t)
     key = imu.key[n - 1:]
     rows = replace(imu, key=key)
-    K, c = len(key) - 1, state.constants
-    out = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
+    new_count, c = len(key) - 1, state.constants
+    out = {name: np.concatenate([value, np.repeat(value[-1:], new_count, axis=0)])
            for name, value in state.keyframe_arrays().items()}
     t = out['t'] = imu.t[imu.key]
     out['travel_error'][n:] = 0.0
@@ -241,7 +252,7 @@ def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     sums, _ = preintegrate(rows, out['gyro_bias'][n:], out['accel_bias'][n:], travel, f,
                            np.empty(0), c)
     C = out['C_nb']
-    for k in range(K):
+    for k in range(new_count):
         C[n + k] = C[n + k - 1] @ sums.R[k]
     arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
     steps = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
@@ -249,7 +260,7 @@ def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     out['v_n'][n:] = (C[n:] @ f) * odometer_speed(travel, t[n:])[:, None]
     change = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
         out['p_n'][n:], leg.origin)
-    # after the last odometer reading by the IMU
+    # velocities after the last odometer reading are predicted by the IMU
     for i in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
         out['v_n'][n + i] = out['v_n'][n + i - 1] + change[i]
     return State(**out, constants=c)

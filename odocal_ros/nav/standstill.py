@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Detection of standstills from odometer and gyro."""
+"""
+Detection of standstills, from which alignment, gyro bias and legs start.
+
+In: turn rates and the travel of the odometer. Out: intervals in which neither shows motion.
+"""
 
 from functools import reduce
 
@@ -24,8 +28,8 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     Return begin and end of the standstills in order: (k, 2) s.
 
     t_imu, w_b : (n,), (n, 3) s, and turn rates with bias, rad/s.   metres_per_unit : approximate
-    scale, above 0.   shortest : least duration, s.   The edges are inside the true standstill by
-    up to the window; a start that is too slow for the window is included.
+    scale, above 0.   shortest : least duration, s.   The edges are up to REST_WINDOW inside the
+    true standstill; if the vehicle starts very slowly, that motion is included.
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
         return np.empty((0, 2))
@@ -45,7 +49,7 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
 
 
 def _travel_limit(travel: Travel, metres_per_unit: float) -> float:
-    """Return the largest travel at rest, m: REST_TRAVEL, or the jitter of counts."""
+    """Return the largest travel in a window at rest, m: REST_TRAVEL, or jitter of a count."""
     count = travel.quantum * metres_per_unit
     coarse_count = 0.5    # m, larger counts are coarse
     # one count of a coarse counter (few per turn of the wheel) is motion, not jitter
@@ -59,12 +63,12 @@ def _spans(at_rest: Bools, edges: Floats, shortest: float) -> Floats:
 
 
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
-    """Return a mask of cells, by their middles, with little travel around them: (m,)."""
+    """Return a mask of cells with little travel around their middles: (m,)."""
     # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     distance = np.max(probes, axis=0) - np.min(probes, axis=0)
-    still: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
-    return still
+    is_still: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
+    return is_still
 
 
 def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:

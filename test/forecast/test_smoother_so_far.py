@@ -72,7 +72,7 @@ def test_a_long_leg_is_looked_at_in_windows(town_drive, exact, updates, monkeypa
     thinned, so_far = updates[-1].leg, SmootherSoFar()
     for seen in updates:
         windowed = so_far.update(seen.leg, exact)
-    past, t_end = so_far._growing._past
+    past, t_end = so_far._growing._finished
     assert t_end == pytest.approx(60.0, abs=0.2)
     assert so_far._growing._last.state.t[0] == pytest.approx(t_end, abs=0.11)      # of a cell
     whole = updates[-1].running

@@ -6,7 +6,8 @@ Linear least squares for a chain of nodes with constants common to all of them.
 
 Each residual depends on the s states of a node, those of the next node, and m constants. The
 normal equations of the states are block tridiagonal and solved by a banded Cholesky; the constants
-are solved for first, by the Schur complement.
+are solved for first, by the Schur complement. Residuals are grouped by noise level, an unknown
+variance factor: ``Equations`` are those of one level with factor 1, ``Solution`` weights them.
 """
 
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ class Rows:
     by_state: Floats      # (n, q, s) derivatives
     by_next: Floats       # (n, q, s)
     by_constants: Floats  # (n, q, m)
-    weight: Floats        # (n, q) one over the variance at level 1
+    weight: Floats        # (n, q) one over the variance if the level is 1
 
     @property
     def count(self) -> int:
@@ -44,10 +45,11 @@ class Rows:
 
 class Equations:
     """
-    Normal equations of the rows of one noise level, at level 1, of N nodes.
+    Normal equations of the rows of one noise level, as if it were 1, for N nodes.
 
-    Of the states: blocks ``diagonal`` and ``off_diagonal``, (N, s, s), gradient, (N, s), and the
-    product with the constants, ``cross``, (N, s, m). Of the constants: (m, m), gradient (m,).
+    Of the states: blocks ``diagonal`` and ``off_diagonal``, (N, s, s), ``gradient``, (N, s), and
+    the product with the constants, ``cross``, (N, s, m). Of the constants:
+    ``constants_information``, (m, m), and ``constants_gradient``, (m,).
     """
 
     def __init__(self, rows: Rows, nodes: int) -> None:
@@ -57,18 +59,18 @@ class Equations:
         def product(X: Floats, Y: Floats) -> Floats:
             return np.swapaxes(X * w[:, :, None], 1, 2) @ Y
         r = rows.value[:, :, None]
-        # rows of the last node have zeros by_next, for an extra node, removed below
+        # ``by_next`` of the last node is zero; it goes to an extra node that is removed below
         self.diagonal, self.off_diagonal = np.zeros((2, nodes + 1, s, s))
         self.cross, self.gradient = np.zeros((nodes + 1, s, m)), np.zeros((nodes + 1, s))
-        # the rows of a level have different nodes, so no sum is lost by +=
-        for at, X in ((k, A), (k + 1, B)):
-            self.diagonal[at] += product(X, X)
-            self.cross[at] += product(X, C)
-            self.gradient[at] += product(X, r)[:, :, 0]
+        # += adds once for equal indices, but the rows of a level have different nodes
+        for node, X in ((k, A), (k + 1, B)):
+            self.diagonal[node] += product(X, X)
+            self.cross[node] += product(X, C)
+            self.gradient[node] += product(X, r)[:, :, 0]
         self.off_diagonal[k] += product(A, B)
         self.diagonal, self.off_diagonal, self.cross, self.gradient = (
             x[:nodes] for x in (self.diagonal, self.off_diagonal, self.cross, self.gradient))
-        self.of_constants = product(C, C).sum(0)
+        self.constants_information = product(C, C).sum(0)
         self.constants_gradient = product(C, r).sum((0, 2))
 
 
@@ -77,21 +79,22 @@ class Solution:
 
     def __init__(self, equations: list[Equations], weight: Floats, prior: Floats,
                  prior_gradient: Floats) -> None:
-        """Take 1 / level of each of the equations, and information (m, m) of a prior of c."""
-        def total(name: str) -> Floats:
+        """Solve; weight : 1 / level of each of the equations; prior : information, (m, m)."""
+        def weighted_sum(name: str) -> Floats:
             out: Floats = sum(w * getattr(one, name)
                               for w, one in zip(weight, equations, strict=True))
             return out
-        n, s = total('gradient').shape
-        self._band = cholesky_banded(_banded(total('diagonal'), total('off_diagonal')))
-        B, g = total('cross').reshape(n * s, -1), total('gradient').ravel()
+        n, s = weighted_sum('gradient').shape
+        self._band = cholesky_banded(_banded(
+            weighted_sum('diagonal'), weighted_sum('off_diagonal')))
+        B, g = weighted_sum('cross').reshape(n * s, -1), weighted_sum('gradient').ravel()
         X = cho_solve_banded((self._band, False), np.column_stack([B, g]))
         # not by BLAS: its sums depend on the number of threads and on the place in memory
         schur = np.einsum('ki,kj->ij', B, X)
-        self.information = total('of_constants') + prior - schur[:, :-1]
+        self.information = weighted_sum('constants_information') + prior - schur[:, :-1]
         self._root = cho_factor(self.information, lower=True)
         self.constants = cho_solve(
-            self._root, -(total('constants_gradient') + prior_gradient) + schur[:, -1])
+            self._root, -(weighted_sum('constants_gradient') + prior_gradient) + schur[:, -1])
         self.states = (-X[:, -1] - np.einsum('ij,j->i', X[:, :-1], self.constants)).reshape(n, s)
 
     @property
