@@ -16,13 +16,14 @@ from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.settings.config import with_settings
 
 FIRST_SEED = 55_000_000
-DULL = (({'scenario': 'straight', 'imu_grade': 'industrial'}, 'yaw bound of method.md 0.105 deg'),
+DULL = (({'scenario': 'straight', 'imu_grade': 'industrial'},
+         'reference bound of the yaw 0.105 deg'),
         ({'scenario': 'straight', 'imu_grade': 'industrial', 'sway': 0.05},
-         'sideways 0.05 m/s at 10 Hz, as method.md has it'),
+         'sideways 0.05 m/s at 10 Hz, as in the reference bounds'),
         ({'scenario': 'paper', 'imu_grade': 'navigation', 'fix_noise': 'white'},
-         'yaw bound of method.md 0.008 deg'))
+         'reference bound of the yaw 0.008 deg'))
 DULL_DRIVES, STARTS_DRIVES = 20, 3      # unless --drives says otherwise
-ROAD = 0.05**2 / 10      # m^2/s: 0.05 m/s at 10 Hz, as the bounds of method.md have it
+ROAD = 0.05**2 / 10      # m^2/s: 0.05 m/s at 10 Hz, as in the reference bounds
 IN_MOTION = 5.0          # m/s at the start mark moved into the drive
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
@@ -37,8 +38,9 @@ def special(simulated, true_levels, drives, parts):
 
 def _print_dull(simulated, true_levels, drives):
     print('Sigma of the yaw against bounds at the truth, deg. bound: levels of the simulation,\n'
-          'none below the lower limit on such a drive. sliding: as method.md has it, 0.05 m/s\n'
-          'sideways at 10 Hz, but not at rest (with that too, 0.101 and 0.0070 deg)')
+          'none below the lower limit on such a drive. sliding: as in the reference bounds\n'
+          '(docs/decisions/0005), 0.05 m/s sideways at 10 Hz, but not at rest '
+          '(with that too, 0.101 and 0.0070 deg)')
     for number, (options, promise) in enumerate(DULL):
         first = FIRST_SEED + 1000 * number
         _dull(simulated, true_levels, range(first, first + drives), options, promise)

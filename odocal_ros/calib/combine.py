@@ -25,11 +25,13 @@ DIFFERING_SOURCES = {'initial_level'}
 def combine_method(name: str, results: Sequence[MethodResult],
                    walked: Floats | None = None) -> MethodResult:
     """
-    Return means with the least variance of one method on several legs, the scale at the last one.
+    Return the minimum variance means of the values of one method on J legs.
 
-    name : the method.   results : one a leg, at least one.   walked : (J,) variance of the random
-    walk of ln K from each leg to the last; None: constant. The sigma includes shared errors once.
-    Scatter beyond the sigmas widens them (LEGS_DISAGREE).
+    The scale is that of the last leg. The sigma includes shared errors once. Scatter beyond the
+    sigmas widens them (LEGS_DISAGREE).
+
+    name : the method.   results : one for each leg, at least one.   walked : (J,) variance of the
+    random walk of ln K from each leg to the last; None: constant.
     """
     if len(results) == 1:
         return results[0]
@@ -44,37 +46,38 @@ def combine_method(name: str, results: Sequence[MethodResult],
         if not determined:
             estimates[parameter] = Estimate(None, None, unit)
             continue
-        value, variance, shared, found = _combine(parameter, i, [results[k] for k in determined],
-                                                  walked[determined])
-        reasons += found
+        value, variance, shared, scatter_reasons = _combine(
+            parameter, i, [results[k] for k in determined], walked[determined])
+        reasons += scatter_reasons
         scale = value if parameter.startswith('scale_factor') else 1.0     # of ln K to K
         sigma = abs(scale) * float(np.sqrt(variance + sum(v @ v for v in shared.values())))
         estimates[parameter] = Estimate(value, sigma, unit)
-        of_legs = np.sqrt(variance) * np.eye(len(parameters))[i]
-        for source, effect in (shared | {'legs': of_legs}).items():
+        unshared = np.sqrt(variance) * np.eye(len(parameters))[i]
+        for source, effect in (shared | {'legs': unshared}).items():
             sources.setdefault(source, []).append((i, effect))
-    estimates |= _ratio(results, estimates) | newest(results, estimates)
+    estimates |= _scale_ratio(results, estimates) | newest_leg_values(results, estimates)
     stacked = _stacked(sources, len(parameters))
     details = known_budget(stacked, parameters, estimates) if sources else {}
     return MethodResult(name, reasons, estimates, parameters, stacked,
                         {'legs_used': len(results)} | details)
 
 
-def newest(results: Sequence[MethodResult],
-           estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def newest_leg_values(results: Sequence[MethodResult],
+                      estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """
-    Return the values of a single leg (gyro bias) from the last leg that has them.
+    Return values that apply to single legs, such as gyro biases, of the last leg that has them.
 
-    The heading error in older results applies to the start of a leg: a combination has none.
+    estimates : combined values, which are left out. The heading error in older results applies to
+    the start of a leg: a combination has none.
     """
-    found: dict[str, Estimate] = {}
+    newest: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):
         if name == 'heading_error':
             e = Estimate(None, None, e.unit)
         if name not in estimates and name != 'scale_ratio' and (
-                name not in found or e.value is not None):
-            found[name] = e
-    return found
+                name not in newest or e.value is not None):
+            newest[name] = e
+    return newest
 
 
 def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Floats,
@@ -84,7 +87,7 @@ def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Fl
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x
     is_angle = results[0].estimates[parameter].unit == 'rad'
-    if is_angle:       # of an IMU that faces backwards they are near +-pi
+    if is_angle:       # within half a turn of the first: angles of a reversed IMU are near +-pi
         y = x - ((x - x[0]) - wrap(x - x[0]))
     variances = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
                           for r in results])
@@ -133,15 +136,15 @@ def _weights(covariance: Floats) -> Floats:
     return out
 
 
-def _ratio(results: Sequence[MethodResult],
-           estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return the combined scale_ratio, from the first leg's K0."""
+def _scale_ratio(results: Sequence[MethodResult],
+                 estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the ratio of the combined scale to the nominal one of the first leg."""
     first, scale = results[0].estimates, estimates['scale_factor']
     ratio = first['scale_ratio'].value
-    one = first['scale_factor'].value
-    if ratio is None or one is None or scale.value is None or scale.sigma is None:
+    first_scale = first['scale_factor'].value
+    if ratio is None or first_scale is None or scale.value is None or scale.sigma is None:
         return {'scale_ratio': Estimate(None, None, '1')}
-    nominal = one / ratio
+    nominal = first_scale / ratio
     return {'scale_ratio': Estimate(scale.value / nominal, scale.sigma / nominal, '1')}
 
 

@@ -71,9 +71,9 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
                    ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return coefficients, (k,), of (n, k) regressors by cells of a second, and covariance."""
     at = np.arange(0, len(pair.t), MEAN_STEPS)
-    A, y = np.diff(regressors[at], axis=0), np.diff(pair.right[at])
+    design, y = np.diff(regressors[at], axis=0), np.diff(pair.right[at])
     keep = np.logical_and.reduceat(pair.known, at[:-1])[:len(y)]
-    keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * pair.quantum
+    keep &= np.abs(design[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < 20:
         return None, None
     width_sigma = TRACK_WIDTH.first_sigma / metres_per_unit
@@ -84,7 +84,7 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
                       delay_sigma * usual_width / metres_per_unit, load_sigma])
     prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
     floor = 0.4 * pair.quantum + 1e-3 / metres_per_unit
-    x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
+    x, covariance, _ = robust_fit(design[keep], y[keep], floor, prior)
     return x, covariance
 
 

@@ -105,21 +105,25 @@ def chunks(n: int) -> Iterator[slice]:
 
 
 def by_row(function: Callable[..., Array], *columns: Array) -> Array:
-    """Return the result of a function for each row of arrays, (n, ...) to (n,)."""
+    """Return the result of a function for each row of arrays, in pieces: (n, ...) to (n,)."""
     return by_step(function, *columns, steps=0)
 
 
 def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
-    """Return the results of a function of adjacent rows, (m, ...) to (m - steps,)."""
+    """
+    Return the results of a function of adjacent rows, in pieces: (m, ...) to (m - steps,).
+
+    steps : rows that the function needs after a row, 1: each result is of a row and the next.
+    """
     n = len(columns[0]) - steps
     if n <= PIECE_ROWS:
         return function(*columns)
     for rows in chunks(n):
         part = function(*(x[rows.start:rows.stop + steps] for x in columns))
         if not rows.start:
-            found = work_array(n, *part.shape[1:], dtype=part.dtype)
-        found[rows] = part
-    return found
+            out = work_array(n, *part.shape[1:], dtype=part.dtype)
+        out[rows] = part
+    return out
 
 
 def thinned(x: Array, rows: int) -> Array:
@@ -206,11 +210,15 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
 
 
 def enclosing_slices(times: Array, t: Array) -> Iterator[tuple[slice, slice]]:
-    """Yield slices of rising times and of the rows of t that enclose them; all of each."""
-    done = 0
+    """
+    Yield pairs of slices: of rising times, and of the rows of t between which they are.
+
+    All of both are included; a piece of t shares its last row with the next one.
+    """
+    begin = 0
     for rows in chunks(len(t) - 1):
         rows = slice(rows.start, rows.stop + 1)
-        last = rows.stop == len(t)
-        end = len(times) if last else np.searchsorted(times, t[rows.stop - 1])
-        yield slice(done, max(end, done)), rows
-        done = max(end, done)
+        is_last = rows.stop == len(t)
+        end = len(times) if is_last else max(np.searchsorted(times, t[rows.stop - 1]), begin)
+        yield slice(begin, end), rows
+        begin = end

@@ -83,7 +83,7 @@ class Equations:
 
 
 class Weighted:
-    """The factors at given levels; ``apply_step`` changes cost and components to the new state."""
+    """The factors at given levels: equations of a step, and cost and components at the state."""
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
@@ -114,7 +114,7 @@ class Weighted:
                               f'{self.state.t[error.block]:.1f} s') from None
 
     def apply_step(self, solved: Solved) -> 'Weighted':
-        """Apply the step to the residuals, to first order; return self."""
+        """Move residuals, cost and components to the state after the step, to first order."""
         step, constants = solved.step, solved.step_constants
         new_state = self.state.updated(step, constants)
         for factor in self.factors.values():
@@ -122,8 +122,12 @@ class Weighted:
         return self
 
     def information(self, solved: Solved) -> LevelInformation:
-        """Return the information on the levels, sizes last; call before ``solved.marginals``."""
-        names = sorted(self.levels.values, key=SIZES.__contains__)
+        """
+        Return the information on the levels, (S27b); call before ``solved.marginals``.
+
+        The sizes of imperfections come last: their errors are those independent of the noises.
+        """
+        names = sorted(self.levels.values, key=lambda name: name in SIZES)
         sides = LevelRightHandSides(len(self.state.t), self.n, self.m, names)
         for factor in self.factors.values():
             factor.add_levels(sides)
@@ -151,8 +155,8 @@ class Weighted:
 
 
 STEP_PLACES = 15        # judgement: places where steps are tested, at equal distances on the path
-STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested, the scale first
-GRADUAL = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
+TESTED_CONSTANTS = LN_K, YAW, PITCH      # definition: for steps; the scale first
+WARMING_CHANGE = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
 
 
 @dataclass(frozen=True)
@@ -175,15 +179,16 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
     rows = weighted[MotionRows]
     path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
-    g, g_constants, square, score = rows.step_sides(at, STEPPING)
-    remaining = 1 / solved.step_fraction - 1     # step to the minimum, if it was shortened
+    g, g_constants, square, score = rows.step_sides(at, TESTED_CONSTANTS)
+    # ``solved`` may have shortened its step: the scores are those at the minimum of the equations
+    remaining = 1 / solved.step_fraction - 1
     score -= remaining * (np.einsum('kil,ki->l', g, solved.step)
                           + g_constants.T @ solved.step_constants[:len(g_constants)])
     information = square - solved.products(g, g_constants)[0]
     diagonal = np.diag(information).copy()
     scale = slice(STEP_PLACES)
     score[scale], diagonal[scale] = _with_gradual_change(score[scale], information[scale, scale])
-    shape = len(STEPPING), STEP_PLACES
+    shape = len(TESTED_CONSTANTS), STEP_PLACES
     # no information: at rest before or after the place, or a constant that no row depends on
     known = diagonal > 1e-9 * np.diag(square)
     sigma = (1 / np.sqrt(np.where(known, diagonal, np.inf))).reshape(shape)
@@ -191,14 +196,16 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
     largest = np.argmax(np.abs(score) * sigma, axis=1)
     return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
                               float(sigma[i, k]))
-                 for i, (constant, k) in enumerate(zip(STEPPING, largest, strict=True))
+                 for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
                  if sigma[i].any())
 
 
 def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Floats]:
     """Return score and information of each step of the scale if it also changes gradually."""
-    # a change that is quadratic in the path is a sum of steps at all places; it has a prior
-    shares = GRADUAL / STEP_PLACES * np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
+    # equal steps at all places are a linear change over the path, steps that grow linearly a
+    # quadratic one; both have a prior sigma and are eliminated
+    linear_and_constant = np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
+    shares = WARMING_CHANGE / STEP_PLACES * linear_and_constant
     cross = information @ shares
     solution = np.linalg.solve(np.eye(2) + shares.T @ cross,
                                np.column_stack([cross.T, shares.T @ score]))

@@ -116,7 +116,7 @@ class OdometerProgress:
 
     def feed(self, block: OdometerSamples, scale: float) -> None:
         """Take a block; scale: m per unit, 0 unknown."""
-        steps, stamps, seconds = self._rows.of(block)
+        steps, stamps, seconds = self._rows.read(block)
         if not len(steps):
             return
         if scale > 0:

@@ -33,9 +33,10 @@ GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 LEAST_NUMBER = 1e-300      # format: floats below it are integers of a wrong type; 1 / x overflows
 # judgement: minimum share of moving rows that repeat the one before
 HELD_SHARE = 0.3
-# statistical: changes needed to estimate a step. If changes have any size, the smallest of 50 is a
-# fifth of their tenth percentile; if speeds are held, both are one step plus the change in one row
-FEWEST_CHANGES, LEAST_OVER_TENTH = 50, 0.6
+# statistical: changes needed to estimate a step; least ratio of the smallest one to their tenth
+# percentile. If changes have any size, the smallest of 50 is a fifth of it; if speeds are held,
+# both are one step plus the change in one row
+FEWEST_CHANGES, LEAST_SMALLEST_CHANGE = 50, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +98,8 @@ class CoarseSpeed:
         total = np.interp(t, np.append(begin, self.t[-1]), running_sum(power * duration))
         # before and after a motion the speed is within a step of zero, for an unknown time
         moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
-        unseen = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
-        return np.diff(total) + unseen**2 / 3
+        at_rest = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
+        return np.diff(total) + at_rest**2 / 3      # uniform within this travel to each side
 
     @cached_property
     def instants(self) -> SpeedInstants:
@@ -126,8 +127,9 @@ class CoarseSpeed:
             single &= h <= MISSING_INTERVALS * usual
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= least_cell)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
-        golden = 0.618034    # steps through a range evenly
-        # rows at varying places: at an extremum of the speed, the middle one would be the fastest
+        # one row of each run, at varying places: the middle one of a run at an extremum of the
+        # speed would be the fastest. Multiples of the golden ratio are evenly distributed
+        golden = 0.618034
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
         width = np.r_[speed_change[single], np.full(len(row), q)]
@@ -272,7 +274,7 @@ def find_held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
     if len(changes) < FEWEST_CHANGES or len(changes) > (1 - HELD_SHARE) * len(size):
         return None
     step = float(changes.min())
-    if step < LEAST_OVER_TENTH * np.percentile(changes, 10):
+    if step < LEAST_SMALLEST_CHANGE * np.percentile(changes, 10):
         return None
     last = np.maximum.accumulate(np.where(change != 0, np.arange(1, len(value)), 0))
     side = np.append(0.0, np.sign(change)[np.maximum(last - 1, 0)])

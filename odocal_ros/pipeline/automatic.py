@@ -79,7 +79,7 @@ class LegSearch:
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or StepReader(form)
             self._still = self._steps.still
-            steps, stamps, _ = self._steps.of(block)
+            steps, stamps, _ = self._steps.read(block)
             travel = self._travel + np.cumsum(steps)
             if len(travel):
                 self._waiting.extend(zip(stamps.tolist(), travel.tolist(), strict=True))

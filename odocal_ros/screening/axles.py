@@ -123,14 +123,14 @@ def _squared_distance(axle: Travel, other: Travel, imu: Imu, between: tuple[floa
         return 0.0, 0.0
     edges = np.arange(0, len(pair.t), CELL_STEPS)
     steering = steering_path(pair.t, pair.turn, pair.right)
-    A = np.diff(np.stack([pair.right, steering, pair.turn], -1)[edges], axis=0)
+    design = np.diff(np.stack([pair.right, steering, pair.turn], -1)[edges], axis=0)
     y = np.diff(pair.left[edges])
     keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)] & (
         np.abs(y) > 2 * pair.quantum)
-    if keep.sum() < CELL_STEPS or not A[keep, 1].any():
+    if keep.sum() < CELL_STEPS or not design[keep, 1].any():
         return 0.0, 0.0
-    x, covariance, _ = robust_fit(A[keep], y[keep], pair.least_sigma(y[keep]))
-    additional, total = abs(x[1]) * np.abs(A[keep, 1]).sum(), np.abs(y[keep]).sum()
+    x, covariance, _ = robust_fit(design[keep], y[keep], pair.least_sigma(y[keep]))
+    additional, total = abs(x[1]) * np.abs(design[keep, 1]).sum(), np.abs(y[keep]).sum()
     if additional <= LEAST_STEERED_SHARE * total:
         return 0.0, 0.0
     return float(x[1]), float(np.sqrt(covariance[1, 1]))

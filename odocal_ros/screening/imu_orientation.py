@@ -117,15 +117,15 @@ def orientation_of(found: Accelerations) -> ImuOrientation | None:
     direction. With its own gain, the sign of the gyro has no effect.
     """
     force = found.force
-    A = np.stack([found.onward, 1j * found.inward], -1)
-    normal = A.conj().T @ A
-    if len(A) < ORIENTATION_BINS or np.linalg.cond(normal) > 1e9:
+    design = np.stack([found.onward, 1j * found.inward], -1)
+    normal = design.conj().T @ design
+    if len(design) < ORIENTATION_BINS or np.linalg.cond(normal) > 1e9:
         return None
     inverse = np.linalg.inv(normal)
-    gain = inverse @ (A.conj().T @ force)
-    residual = force - A @ gain
+    gain = inverse @ (design.conj().T @ force)
+    residual = force - design @ gain
     # half of the residual is across, and every other change is independent (they share bins)
-    variances = np.vdot(residual, residual).real / len(A) * np.diag(inverse).real
+    variances = np.vdot(residual, residual).real / len(design) * np.diag(inverse).real
     sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
     largest_sigma = np.deg2rad(10.0)    # of the direction
     least_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1

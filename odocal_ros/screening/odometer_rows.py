@@ -28,7 +28,11 @@ STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
                        found: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
-    """Return rows and times, s, without false or held counts; false increments interpolated."""
+    """
+    Return rows and times, s, without false or repeated counts; false increments are interpolated.
+
+    name : of the odometer, for the reasons, which are added to ``found``.
+    """
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
@@ -56,7 +60,12 @@ def counter_steps(value: Values, modulus: int) -> Floats:
 
 
 def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
-    """Return a mask of false counter rows (n,): frozen before a jump, or a jump and back."""
+    """
+    Return a mask of false counter rows, (n,).
+
+    A counter that is frozen continues with a jump, as if it had counted; an isolated false value
+    is a jump and a jump back.
+    """
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
     if len(step) < FEWEST_STEPS or not step.any():
@@ -69,21 +78,22 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     most_jumps = 200    # with more the counter is not corrected; the check decides
     if len(jumps) > most_jumps:
         return false
-    done = -1
+    last_false = -1
     longest_excursion = 30.0    # s between a jump and the jump back
     for j in jumps:
-        if j <= done:
+        if j <= last_false:
             continue
         stall = _stall_begin(step, j)
         returns = [k for k in jumps if k > j and t[k + 1] - t[j] <= longest_excursion]
         # candidates, first and last step: frozen before the jump, or the jump and back
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in returns]:
-            net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
+            travel = counter_steps(value[[a, b + 1]], modulus)[0]  # exact, unlike a sum of steps
             possible = 1.2 * top * (t[b + 1] - t[a]) + 3      # travel in this time
-            if _continues(t, net, rate, a, b) or a == j and (
-                    abs(net) <= possible and min(abs(step[a]), abs(step[b])) > 2 * possible):
+            is_excursion = a == j and abs(travel) <= possible and (
+                min(abs(step[a]), abs(step[b])) > 2 * possible)
+            if is_excursion or _continues(t, travel, rate, a, b):
                 false[a + 1:b + 1] = True
-                done = b
+                last_false = b
                 break
     return false
 
@@ -114,13 +124,13 @@ def held_counts(value: Values, modulus: int) -> Bools:
     return held
 
 
-def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
-    """Return True if net, the travel from step a to after step b, agrees with adjacent speeds."""
+def _continues(t: Floats, travel: float, rate: Floats, a: int, b: int) -> bool:
+    """Return True if the travel from step a to after step b agrees with adjacent speeds."""
     duration = t[b + 1] - t[a]
     expected = [_median_or_zero(x) * duration for x in _adjacent(rate, a, b)]
     largest_share = 0.5    # judgement: largest difference, of the expected travel
-    tolerance = largest_share * max(abs(travel) for travel in expected) + 3
-    return bool(min(expected) - tolerance <= net <= max(expected) + tolerance)
+    tolerance = largest_share * max(abs(x) for x in expected) + 3      # counts
+    return bool(min(expected) - tolerance <= travel <= max(expected) + tolerance)
 
 
 def _adjacent(rate: Floats, a: int, b: int) -> tuple[Floats, Floats]:
@@ -130,7 +140,11 @@ def _adjacent(rate: Floats, a: int, b: int) -> tuple[Floats, Floats]:
 
 def with_gap_uncertainty(travel: Travel, value: Values,
                          form: OdometerForm) -> tuple[Travel, Floats, Floats]:
-    """Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel."""
+    """
+    Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel.
+
+    A counter has travel across gaps, but not across resets, which ``travel`` has corrected.
+    """
     none = np.empty(0)
     if len(travel.t) < FEWEST_STEPS:
         return travel, none, none
@@ -138,16 +152,7 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     usual = np.median(dt)
     rate = step / np.maximum(dt, usual)
     if form.quantity == 'cumulative':
-        counts = counter_steps(value, form.modulus)
-        resets = np.flatnonzero(
-            np.abs(np.abs(step) - np.abs(counts)) > 1e-6 * np.abs(counts) + 1e-9)
-        # only the adjacent speeds bound the travel since the last count before a reset
-        largest = []
-        for k in resets.tolist():
-            a = _stall_begin(step, k)
-            speed = max(abs(_median_or_zero(x)) for x in _adjacent(rate, a, k))
-            largest.append(speed * (travel.t[k + 1] - travel.t[a]))
-        return travel, travel.t[resets], np.array(largest) / np.sqrt(3)
+        return travel, *_reset_uncertainty(travel, step, rate, counter_steps(value, form.modulus))
     gaps = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
     before, after = np.array([[_median_or_zero(x) for x in _adjacent(rate, k, k)]
                               for k in gaps.tolist()]).reshape(-1, 2).T
@@ -156,7 +161,8 @@ def with_gap_uncertainty(travel: Travel, value: Values,
         step = step.copy()
         step[gaps] += (before + after) / 2 * missing
         travel = Travel(travel.t, running_sum(step), travel.quantum)
-    # speeds within a gap: uniform between adjacent ones, plus a part that grows with its length
+    # speed within a gap: uniform between the adjacent ones, and uniform within 2 % of these for
+    # each second of the gap, at most 30 %
     speed_sigma = np.abs(after - before) / np.sqrt(12) + np.minimum(
         missing / 50, 0.3) * np.maximum(np.abs(before), np.abs(after)) / np.sqrt(3)
     times, sigma = travel.t[gaps], speed_sigma * missing
@@ -166,6 +172,19 @@ def with_gap_uncertainty(travel: Travel, value: Values,
         travel = replace(travel, s=travel.s + running_sum(hidden))
         times, sigma = np.r_[times, travel.t[rows]], np.r_[sigma, np.abs(hidden[rows]) / 2]
     return travel, times, sigma
+
+
+def _reset_uncertainty(travel: Travel, step: Floats, rate: Floats,
+                       counts: Floats) -> tuple[Floats, Floats]:
+    """Return times, s, of resets of a counter and sigmas of the travel that is lost there."""
+    resets = np.flatnonzero(np.abs(np.abs(step) - np.abs(counts)) > 1e-6 * np.abs(counts) + 1e-9)
+    # only the adjacent speeds bound the travel since the last count: uniform up to this limit
+    limits = []
+    for k in resets.tolist():
+        a = _stall_begin(step, k)
+        speed = max(abs(_median_or_zero(x)) for x in _adjacent(rate, a, k))
+        limits.append(speed * (travel.t[k + 1] - travel.t[a]))
+    return travel.t[resets], np.array(limits) / np.sqrt(3)
 
 
 def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
@@ -214,7 +233,7 @@ class StepReader:
         """Return the largest apparent travel at rest."""
         return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
-    def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
+    def read(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """Return step, stamp, ns, and duration, s, of each possible row since the one before."""
         good = ~is_impossible('value', block.value)
         stamps, values = block.stamp_ns[good], block.value[good]

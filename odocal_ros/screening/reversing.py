@@ -152,9 +152,9 @@ def _ratio(t: Floats, acceleration: Floats, force: _Forces, a: int, b: int) -> t
     turn = force.angle[low:high] - force.angle[low]
     tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
     y, times = force.along[low:high] - G * tilt, t[low:high]
-    A = np.stack([acceleration[low:high], np.ones(len(times)), times - times.mean()], -1)
-    x, *_ = np.linalg.lstsq(A, y, rcond=None)
-    cofactor = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
-    residual = float(np.sqrt(np.mean((y - A @ x)**2)))
+    design = np.stack([acceleration[low:high], np.ones(len(times)), times - times.mean()], -1)
+    x, *_ = np.linalg.lstsq(design, y, rcond=None)
+    cofactor = np.linalg.inv(design.T @ design + 1e-12 * np.eye(3))[0, 0]
+    residual = float(np.sqrt(np.mean((y - design @ x)**2)))
     rows_per_sample = 2 * ACCELERATION_TIME / REVERSING_STEP    # adjacent rows share IMU samples
     return float(x[0]), residual * float(np.sqrt(rows_per_sample * cofactor)) + 1e-12

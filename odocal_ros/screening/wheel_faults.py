@@ -146,33 +146,33 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
     keep = pair.known & ~any_stalled & _rolling(steps, pair.quantum).any(axis=0)
     if keep.sum() < 10:
         return _dead_reasons(pair, steps, stalled)
-    A = np.stack([steps[0], turn, np.full(len(turn), FAULT_CELL)], -1)
-    x, covariance = _fit_right_wheel(A[keep], steps[1][keep], pair.least_sigma(steps))
-    stalled = [_without_pivots(stalled[k], steps, A, x, k) for k in (0, 1)]
+    design = np.stack([steps[0], turn, np.full(len(turn), FAULT_CELL)], -1)
+    x, covariance = _fit_right_wheel(design[keep], steps[1][keep], pair.least_sigma(steps))
+    stalled = [_without_pivots(stalled[k], steps, design, x, k) for k in (0, 1)]
     return _dead_reasons(pair, steps, stalled) + _reversed_reasons(
-        pair, steps, A @ x, x[0], covariance[0, 0], imu)
+        pair, steps, design @ x, x[0], covariance[0, 0], imu)
 
 
-def _fit_right_wheel(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
+def _fit_right_wheel(design: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     Return the coefficients of left wheel, turn and time in the right wheel, and their covariance.
 
-    A : (n, 3) travel of the left wheel, turn, rad, duration, s, of each cell.   y : (n,) travel of
-    the right wheel.   floor : least sigma of y. Of two robust fits, one from a drive without
-    turns, the one with fewer outliers is used.
+    design : (n, 3) travel of the left wheel, turn, rad, duration, s, of each cell.   y : (n,)
+    travel of the right wheel.   floor : least sigma of y. Of two robust fits, one that starts
+    without turns, the one with fewer outliers is used.
     """
-    rolling = A[:, 0] != 0
-    usual = float(np.median(y[rolling] / A[rolling, 0])) if rolling.any() else 1.0
+    rolling = design[:, 0] != 0
+    usual = float(np.median(y[rolling] / design[rolling, 0])) if rolling.any() else 1.0
     # share of the top speed: gyro bias times track width, 1 sigma
     bias_of_top = 0.02
     drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_CELL
-    fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
+    fits = [robust_fit(design, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
     least = min(sigma for _, _, sigma in fits)
     # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
     # straights to a fit with turns than to one without
     gyro_noise = 2e-4
-    losses = [np.minimum(1.0, ((y - A @ x) / (
+    losses = [np.minimum(1.0, ((y - design @ x) / (
         TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(losses))][:2]
 
@@ -196,14 +196,14 @@ def _stalled_cells(pair: WheelPair, steps: Floats, k: int) -> Bools:
     return still
 
 
-def _without_pivots(stalled: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> Bools:
+def _without_pivots(stalled: Bools, steps: Floats, design: Floats, x: Floats, k: int) -> Bools:
     """Return the cells of ``stalled`` in which wheel k is not the centre of a turn, by the fit."""
     stalled = stalled.copy()
-    ratio, turn_part = x[0], A[:, 1:] @ x[1:]
+    ratio, turn_part = x[0], design[:, 1:] @ x[1:]
     for a, b in runs(stalled):
         # travel of wheel k that the other wheel and the gyro predict, and without the turn
         if k == 1:
-            predicted, straight = (A[a:b] @ x).sum(), ratio * steps[0][a:b].sum()
+            predicted, straight = (design[a:b] @ x).sum(), ratio * steps[0][a:b].sum()
         else:
             straight = steps[1][a:b].sum()
             predicted = straight - turn_part[a:b].sum()

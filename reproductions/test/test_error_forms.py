@@ -47,7 +47,7 @@ def test_plane_error_is_the_derivative_of_the_projection(latitude_deg, off_deg):
                     for a, b in ((h, 0), (0, h)))
     L = plane_error(latitude, longitude, np.deg2rad(meridian), 1.0, 0.0)
     lam = plane_error(latitude, longitude, np.deg2rad(meridian), 0.0, 1.0)
-    # method.md 1.3: against the derivative of (4)(5), within 3 deg, at 20 to 50 deg
+    # (13), (14) against the derivative of (4), (5), within 3 deg, at 20 to 50 deg
     assert L[0] == pytest.approx(by_L[0], rel=1.25e-5)
     assert L[1] == pytest.approx(by_L[1], rel=0.0095)
     assert lam[0] == pytest.approx(by_lam[0], rel=0.0035)
@@ -112,10 +112,10 @@ def test_profile_of_constant_speed_gives_the_papers_forms():
     assert dK == pytest.approx(closed.dK, rel=1e-9)      # a difference of squares 2e3 times larger
 
 
-def test_papers_profile_gives_the_figures_of_the_method():
+def test_papers_profile_gives_the_independently_computed_errors():
     profile, _ = papers_profile()
-    # method.md 1.6: eps_z +8.33e-4 deg and 3e-11 K (symmetric profile: mean time 300 s), phi_U0
-    # -0.0600 deg and nothing; three figures and one
+    # computed independently: eps_z +8.33e-4 deg and 3e-11 K (symmetric profile: mean time 300 s),
+    # phi_U0 -0.0600 deg and 0; three digits and one
     dalpha, dK = profile.heading_and_drift(0.0, DRIFT)
     assert np.rad2deg(dalpha) == pytest.approx(8.33e-4, abs=0.005e-4)
     assert dK == pytest.approx(3e-11, abs=0.5e-11)

@@ -147,7 +147,7 @@ def test_without_drift_only_the_earth_turns_the_error_in_fixed_axes(town):
 
 def test_the_sphere_gives_the_papers_coefficients():
     F = coefficients(np.deg2rad(40.0), 0.0, [14.0, 14.0, 0.0], PAPER_RADIUS)
-    # method.md 1.4, four figures, rounded or cut: a unit of the last one
+    # by (15)-(23), corrected, computed independently: value, unit of the last digit
     figures = {('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
                ('dlam', 'dL'): (2.404e-6, 1e-9), ('phi_E', 'phi_N'): (4.871e-5, 1e-8),
                ('phi_E', 'phi_U'): (-5.586e-5, 1e-8), ('phi_N', 'dL'): (-4.687e-5, 1e-8),

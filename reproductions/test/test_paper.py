@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal paper: each table against the method page, and the command's two outputs and picture."""
+"""
+odocal paper: each table against an independent computation; the outputs and pictures.
+
+The expected values were computed before and without this program, to the digits stated here. The
+equation numbers are those of Shi et al. 2015.
+"""
 
 import json
 
@@ -16,7 +21,7 @@ from odocal_ros.settings.config import with_settings
 
 pytestmark = pytest.mark.slow
 
-# method.md 1.4: table 1 by the corrected equations, rounded or cut
+# table 1 by the corrected equations (15)-(23): value, unit of the last digit
 FIGURES_1 = {
     ('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
     ('dlam', 'dL'): (2.404e-6, 1e-9), ('phi_E', 'phi_N'): (4.871e-5, 1e-8),
@@ -25,7 +30,8 @@ FIGURES_1 = {
     ('phi_U', 'phi_E'): (5.805e-5, 1e-8), ('phi_U', 'phi_N'): (2.195e-6, 1e-9),
     ('phi_U', 'phi_U'): (1.842e-6, 1e-9), ('phi_E', 'eps_E'): (-1.0, 0),
     ('phi_N', 'eps_N'): (-1.0, 0), ('phi_U', 'eps_U'): (-1.0, 0)}
-# method.md 1.6, re-computed in the plane whose meridian goes through the start: deg, last digit
+# yaw error of table 3 in the plane whose meridian goes through the start: deg, unit of the last
+# digit. Row none is the error of the plane itself
 RECOMPUTED = {'none': (0.70e-5, 0.01e-5), 'eps_x': (1.34e-5, 0.01e-5), 'eps_y': (1.38e-5, 0.01e-5),
               'eps_z': (8.40e-4, 0.01e-4), 'phi_E0': (-1.379e-4, 0.001e-4),
               'phi_N0': (0.06e-5, 0.01e-5), 'phi_U0': (-0.05998, 0.00001),
@@ -42,19 +48,20 @@ def cells(table):
     return {(row, column): cell for row, line in table.items() for column, cell in line.items()}
 
 
-def test_table_1_is_that_of_the_method(tables):
-    own = cells(tables.table_1)
-    assert own.keys() == FIGURES_1.keys()
+def test_table_1_agrees_with_an_independent_computation(tables):
+    computed = cells(tables.table_1)
+    assert computed.keys() == FIGURES_1.keys()
     for place, (figure, unit) in FIGURES_1.items():
-        assert own[place].sign * own[place].value == pytest.approx(figure, rel=1e-12, abs=unit)
+        value = computed[place].sign * computed[place].value
+        assert value == pytest.approx(figure, rel=1e-12, abs=unit)
 
 
-def test_table_1_is_printed_to_its_rounding_but_for_two_entries(tables):
-    # two digits, rounded or cut: within a unit of the second
-    off = {place for place, cell in cells(tables.table_1).items()
+def test_table_1_is_as_printed_except_for_two_entries(tables):
+    # two digits, rounded or truncated: within a unit of the second
+    different = {place for place, cell in cells(tables.table_1).items()
            if abs(cell.value - cell.printed) > 10**(np.floor(np.log10(cell.printed)) - 1)}
-    assert off == {('phi_E', 'phi_N'), ('phi_U', 'phi_U')}
-    for place in off:
+    assert different == {('phi_E', 'phi_N'), ('phi_U', 'phi_U')}
+    for place in different:
         assert 'tan L' in cells(tables.table_1)[place].remark
 
 
@@ -71,11 +78,11 @@ def test_table_2_is_table_1_times_the_errors(tables):
     assert second['phi_N', 'dL'].value == pytest.approx(7.35e-11, abs=0.005e-11)
 
 
-def test_table_2_as_printed_follows_from_rounded_inputs_but_for_the_decade(tables):
+def test_table_2_as_printed_follows_from_rounded_inputs_and_one_wrong_decade(tables):
     # 1.57e-6, 1.454e-4, 1.047e-3, 4.848e-8, as the printed products show them
     rounded = {'dL': 1.6e-6, 'phi_E': 1.5e-4, 'phi_N': 1.5e-4, 'phi_U': 1.1e-3, 'eps_E': 4.8e-8,
                'eps_N': 4.8e-8, 'eps_U': 4.8e-8}
-    # here the one above it in the table, and phi_U rounded down
+    # in these entries phi_N, phi_E is that of the entry above it, and phi_U is rounded down
     other = {('phi_N', 'phi_E'): 5.0e-5 * 1.5e-4, ('phi_U', 'phi_U'): 2.2e-6 * 1.0e-3}
     first = cells(tables.table_1)
     for (row, column), cell in cells(tables.table_2).items():
@@ -83,71 +90,71 @@ def test_table_2_as_printed_follows_from_rounded_inputs_but_for_the_decade(table
         decade = 10 if (row, column) == ('phi_N', 'dL') else 1
         half_unit = 10**(np.floor(np.log10(expected)) - 1) * 0.51     # of the second digit
         assert cell.printed / decade == pytest.approx(expected, rel=0, abs=half_unit)
-        # method.md 1.4: 1 to 6 %, 14 % where the tan L of table 1 is carried
-        off = abs(cell.printed / decade / cell.value - 1)
-        assert off < (0.145 if (row, column) == ('phi_U', 'phi_U') else 0.062)
-        if off > 0.02 or decade > 1:
+        # printed values differ by 1 to 6 %, and by 14 % where table 1 lacks tan L
+        difference = abs(cell.printed / decade / cell.value - 1)
+        assert difference < (0.145 if (row, column) == ('phi_U', 'phi_U') else 0.062)
+        if difference > 0.02 or decade > 1:
             assert cell.remark
 
 
 @pytest.mark.parametrize('source', SOURCES)
-def test_table_3_is_the_recomputed_column_less_its_row_none(tables, source):
+def test_table_3_is_the_recomputed_column_minus_its_row_none(tables, source):
     figure, unit = RECOMPUTED[source]
-    # half a unit of either figure; and the method page solves in the plane, the pipeline in space:
-    # tilts along and across the track differ between the two by their product, phi^2 / 2
+    # half a unit of the last digits. The column was solved in the plane, the pipeline solves in
+    # space: tilts along and across the track differ between the two by their product, phi^2 / 2
     second_order = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2) if source in TILTED else 0
     expected = figure - RECOMPUTED['none'][0]
     if source == 'none':
-        # what the pulses' resolution leaves: 1e-6 m over 11 200 m
+        # by the resolution of the pulses: 1e-6 m over 11 200 m
         expected, unit, second_order = 0.0, 0.0, np.rad2deg(1e-6 / 11_200)
     assert tables.table_3[source].yaw_deg.value == pytest.approx(
         expected, abs=unit / 2 + 0.005e-5 + second_order)
 
 
 @pytest.mark.parametrize('source', ['phi_U0', 'eps_z', 'all'])
-def test_table_3_is_the_printed_one_within_5_percent_with_the_sign_turned(tables, source):
+def test_table_3_is_the_printed_one_within_5_percent_with_the_opposite_sign(tables, source):
     cell = tables.table_3[source].yaw_deg
     assert -cell.value == pytest.approx(cell.printed, rel=0.05)
     assert cell.ratio == pytest.approx(1, abs=0.05)
 
 
 def test_table_3_differs_from_the_printed_one_by_the_papers_gyro_noise(tables):
-    assert tables.noise_deg == pytest.approx(2.4e-4, abs=0.05e-4)     # method.md, two digits
+    assert tables.noise_deg == pytest.approx(2.4e-4, abs=0.05e-4)     # two digits
     sigmas = [r.noise_sigmas for r in tables.table_3.values() if r.noise_sigmas is not None]
     assert len(sigmas) == 7
     assert np.abs(sigmas).max() < 1.7
     rms_deg = np.sqrt(np.mean(np.square(sigmas))) * tables.noise_deg
-    assert rms_deg == pytest.approx(2.3e-4, abs=0.1e-4)      # method.md, two digits; none's plane
+    assert rms_deg == pytest.approx(2.3e-4, abs=0.1e-4)      # two digits; less the row none
 
 
 @pytest.mark.parametrize('source', SOURCES)
 def test_scale_errors_are_of_second_order(tables, source):
-    # the level turns by S / R = 1.8e-3 under the track, a tilt wanders by 6e-5 at most: spread
-    # over the distance, 1 / sqrt(12) each, their product is 9e-9
+    # the level rotates by S / R = 1.8e-3 over the track, a tilt by 6e-5 at most: uniform over the
+    # distance, 1 / sqrt(12) each, their product is 9e-9
     assert abs(tables.table_3[source].scale.value) < 1e-8
 
 
 @pytest.mark.parametrize('source', SOURCES)
-def test_the_error_model_foretells_what_the_pipeline_finds(tables, source):
+def test_the_error_model_predicts_the_result_of_the_pipeline(tables, source):
     row = tables.table_3[source]
-    # eq. (14) has C in the place of N: up to 0.3 %; second order as above
+    # eq. (14) has C in place of N: up to 0.3 %; second order as above
     assert row.model_deg == pytest.approx(
         row.yaw_deg.value, rel=3e-3,
         abs=1e-9 + (6.1e-7 if source in TILTED else 0))
 
 
-def test_table_4_has_the_simulation_beside_the_closed_forms(tables):
+def test_table_4_has_simulation_and_closed_forms(tables):
     for source in ('eps_z', 'phi_U0'):
         simulated = tables.table_4[source]['simulated']
         assert simulated['yaw_deg'].value == tables.table_3[source].yaw_deg.value
         assert simulated['scale'].value == tables.table_3[source].scale.value
     drift, heading = (tables.table_4[source]['formula'] for source in ('eps_z', 'phi_U0'))
-    # method.md 1.6, as many digits as it has
+    # closed forms (32), (33), corrected
     assert drift['yaw_deg'].value == pytest.approx(8.33e-4, abs=0.005e-4)
     assert drift['scale'].value == pytest.approx(3e-11, abs=0.5e-11)
     assert heading['yaw_deg'].value == pytest.approx(-0.06, abs=1e-9)
     assert heading['scale'].value == 0
-    # formula and pipeline: what (24)-(33) leave out, w cos L phi_E in phi_U: 2e-4 of it
+    # (24)-(33) omit w cos L phi_E in phi_U: 2e-4 of it
     for source in ('eps_z', 'phi_U0'):
         lines = tables.table_4[source]
         assert lines['simulated']['yaw_deg'].value == pytest.approx(
@@ -156,7 +163,7 @@ def test_table_4_has_the_simulation_beside_the_closed_forms(tables):
 
 @pytest.fixture(scope='module')
 def drive_in_a_plane():
-    """Return the drive, its chord check in the plane whose meridian goes through the start."""
+    """Return the drive with the check of its chord in the plane of the start's meridian."""
     drive = PaperDrive()
     drive.config = with_settings(drive.config, {'projection.kind': 'gauss_krueger',
                                                 'projection.central_meridian': 116.0})
@@ -164,7 +171,7 @@ def drive_in_a_plane():
 
 
 @pytest.mark.parametrize('source', SOURCES)
-def test_the_plane_of_the_paper_gives_the_recomputed_column_itself(drive_in_a_plane, source):
+def test_the_plane_of_the_paper_gives_the_recomputed_column(drive_in_a_plane, source):
     drive = drive_in_a_plane
     check = drive.outcome(source).result.methods['two_point'].details['cross_check']['plane']
     figure, unit = RECOMPUTED[source]
@@ -173,7 +180,7 @@ def test_the_plane_of_the_paper_gives_the_recomputed_column_itself(drive_in_a_pl
         figure, abs=unit / 2 + second_order)
 
 
-def test_errors_go_in_as_the_method_says():
+def test_errors_of_the_alignment_have_the_stated_signs():
     drive = PaperDrive()
     for source in SOURCES:
         phi_n, eps_b = errors_of(source)
@@ -192,7 +199,7 @@ def test_errors_go_in_as_the_method_says():
     assert_allclose(np.rad2deg(errors_of('all')[0]) * 60, [0.5, 0.5, 3.6])
 
 
-def test_json_is_all_there_is_on_stdout_and_goes_with_a_picture(capsys, tables, tmp_path):
+def test_stdout_contains_only_json_and_a_picture_is_written(capsys, tables, tmp_path):
     assert main(['paper', '--json', '--plot', str(tmp_path / 'p.png')]) == 0
     assert (tmp_path / 'p.png').stat().st_size > 10_000
     out = json.loads(capsys.readouterr().out)
@@ -204,14 +211,14 @@ def test_json_is_all_there_is_on_stdout_and_goes_with_a_picture(capsys, tables, 
     assert third['phi_U0']['scale']['printed'] == 4.016e-8
     assert third['none']['yaw_deg']['printed'] is None
     assert third['eps_z']['yaw_deg']['printed'] == -7.968e-4
-    assert third == json.loads(json.dumps(tables.as_dict()['tables']['3']))    # the same each time
+    assert third == json.loads(json.dumps(tables.as_dict()['tables']['3']))    # repeatable
     assert out['tables']['4']['phi_U0']['formula']['scale']['printed'] == 3.416e-6
     assert out['tables']['1']['dL']['phi_U'] == pytest.approx(
         {'printed': 2.2e-6, 'value': 2.195e-6, 'ratio': 0.9977, 'sign': -1}, rel=1e-4)
     assert 'factor of 10' in out['tables']['2']['phi_N']['dL']['remark']
 
 
-def test_page_says_all_and_fits_a_terminal(capsys, monkeypatch, tables):
+def test_printed_page_is_complete_and_fits_a_terminal(capsys, monkeypatch, tables):
     monkeypatch.setattr('odocal_reproductions.paper.tables.compute', lambda: tables)
     assert main(['paper']) == 0
     out = capsys.readouterr().out
@@ -233,7 +240,7 @@ def test_plot_writes_a_picture(tables, tmp_path, name, begin):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_plots_that_cannot_be_are_refused_in_one_line(capsys, tmp_path):
+def test_invalid_plot_files_are_refused_in_one_line(capsys, tmp_path):
     (tmp_path / 'folder.png').mkdir()
     for plot, words in ((tmp_path / 'a.gif', '.png, .svg, .pdf'), (tmp_path / 'bare', '.png'),
                         (tmp_path / 'no' / 'a.png', 'no folder'),
@@ -245,7 +252,7 @@ def test_plots_that_cannot_be_are_refused_in_one_line(capsys, tmp_path):
         assert printed.err.count('\n') == 1
 
 
-def test_a_picture_that_cannot_be_written_is_one_line_too(tables, tmp_path):
+def test_a_picture_that_cannot_be_written_is_bad_usage(tables, tmp_path):
     from odocal_reproductions.paper.plot import draw
     from odocal_ros.errors import BadUsage
     with pytest.raises(BadUsage, match='cannot be written'):

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother's predicted sigmas: against simulated drives, the table of method.md, itself."""
+"""The smoother's predicted sigmas against simulated drives, reference bounds and itself."""
 
 from dataclasses import replace
 import math
@@ -78,7 +78,7 @@ def test_the_sigma_predicted_is_the_one_that_the_smoother_states():
 
 
 def stop_and_go():
-    """Return the town drive of method.md, section 3: ten minutes."""
+    """Return the town drive of the reference bounds: ten minutes."""
     t = np.arange(0.0, 600.05, 0.1)
     minute = (t // 60).astype(int)
     turning = (t % 60 >= 22.0) & (t % 60 < 30.0)
@@ -102,10 +102,10 @@ def paper():
     (stop_and_go, 'consumer', 128, 93), (stop_and_go, 'industrial', 110, 70),
     (stop_and_go, 'tactical', 85, 21), (straight, 'industrial', 57, 11),
     (paper, 'navigation', 35, 5.7)])
-def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white, pulses):
-    # an independent program made the table: lever arms and delays known, fixes white, no slip of
-    # the pulses, a perfect vehicle; its filter knows no rests but by the odometer, hence not to
-    # the last digit
+def test_scale_sigmas_agree_with_the_reference_bounds(monkeypatch, drive, grade, white, pulses):
+    # by an independent program (docs/decisions/0005): lever arms and delays known, fixes white, no
+    # slip of the pulses, a perfect vehicle; it knows standstills by the odometer only, so the last
+    # digits differ
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
         'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})

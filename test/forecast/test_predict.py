@@ -72,7 +72,7 @@ def test_a_bias_about_the_vertical_turns_by_the_mean_time_of_the_way():
     # the trapezoid of speed is symmetric: its way lies 300 s after the start on the mean
     sigma = result.alignment.gyro_bias_sigma[2]
     assert row(result, 'gyro_bias_z')[YAW] == pytest.approx(sigma * 300.0, rel=1e-6)
-    # method.md 1.6: 0.01 deg/h make 8.33e-4 deg
+    # 0.01 deg/h times 300 s: 8.33e-4 deg
     assert math.radians(0.01) / 3600 / sigma * row(result, 'gyro_bias_z')[YAW] * DEG == \
         pytest.approx(8.33e-4, abs=0.005e-4)
     assert row(result, 'gyro_bias_x')[YAW] < 1e-9 * sigma * 300.0
