@@ -113,7 +113,7 @@ class Odometry:
         """Return the time from the newest odometer row to the next pose, s; inf without a path."""
         if self._path is None:
             return math.inf
-        return self._path.next_pose_time() - self.wheels.newest()
+        return self._path.next_pose_time() - self.wheels.end_time()
 
     def wait_s(self) -> float:
         """Return the time until the samples of the next pose arrive, s, if without delay."""

@@ -46,13 +46,13 @@ class Start:
 def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
                grade: Grade) -> Start | None:
     """Return the start, None while there are too few samples."""
-    if not wheels.ready() or not imu.rows:
+    if not wheels.are_complete() or not imu.rows:
         return None
-    row = imu.from_time(wheels.oldest())
+    row = imu.from_time(wheels.begin_time())
     if config.start.attitude:
         return _start_from_settings(row, vehicle, config, grade) if len(imu.rows) > row else None
     end = imu.from_time(imu.rows[row].t + START_SPAN) if row < len(imu.rows) else row
-    if end >= len(imu.rows) or wheels.newest() < imu.rows[end].t:
+    if end >= len(imu.rows) or wheels.end_time() < imu.rows[end].t:
         return None
     rows = imu.rows[row:end + 1]
     t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
@@ -60,7 +60,7 @@ def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyCo
     if len(gaps):
         imu.drop(row + int(gaps[-1]) + 1)      # start from the rows after the gap
         return None
-    is_resting = wheels.still(t[0], t[-1]) and bool(
+    is_resting = wheels.are_still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
     w_mean, up = w.mean(axis=0), f.mean(axis=0) / np.linalg.norm(f.mean(axis=0))
     tilt_rate_b = w_mean - up * (w_mean @ up)      # NaN without force: not tested

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses and twists of the odometry, with their covariances."""
+"""
+Poses and twists of the odometry, with their covariances, as the floats of nav_msgs/Odometry.
+
+They are packed as in a message, since setting the fields of a message object takes longer.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +23,7 @@ from odocal_ros.settings.levels import SWAY
 # format: floats of nav_msgs/Odometry; those of pose and twist before their covariances
 NUMBERS, POSE_MEAN, TWIST_MEAN = struct.Struct('<85d'), struct.Struct('<7d'), struct.Struct('<6d')
 TWIST = 43 * 8         # format: byte of the twist
-NONE = (0.0,) * 6      # definition
+ZEROS = (0.0,) * 6      # definition
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +95,9 @@ def covariances(from_errors: Floats, by_delay: Sequence[float], along_n: Sequenc
     sigma of the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
     """
     x, y, z = map(math.sqrt, variances)
-    effects = np.array([[by_delay, (*along_n, *NONE[3:]), NONE, NONE],
-                        [twist_by_turn, (x, *NONE[1:]), (0.0, y, *NONE[2:]),
-                         (0.0, 0.0, z, *NONE[3:])]])
+    effects = np.array([[by_delay, (*along_n, *ZEROS[3:]), ZEROS, ZEROS],
+                        [twist_by_turn, (x, *ZEROS[1:]), (0.0, y, *ZEROS[2:]),
+                         (0.0, 0.0, z, *ZEROS[3:])]])
     return [cov.tobytes() for cov in from_errors + effects.swapaxes(1, 2) @ effects]
 
 

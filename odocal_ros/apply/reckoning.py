@@ -50,7 +50,7 @@ MOST_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
 ROWS_BEHIND = 200         # judgement: IMU rows, older ones are dropped
 # judgement: relative change of the interval of poses: their covariances are computed again
 PERIOD_CHANGE = 0.1
-PLAUSIBLE = np.zeros(3)   # rad: no implausible turn
+PLAUSIBLE = np.zeros(3)   # rad: value of ``_implausible_turn`` if there is none
 GRAVITY_N = np.array([0.0, 0.0, GRAVITY])
 TILT_LOST = 0.5           # rad; judgement: larger sigmas are beyond a linearised correction
 
@@ -65,8 +65,8 @@ class Reckoning:
         self._delay = DelaySearch(SPEED_SPAN, delay_sigma, notes)
         # state at the time _t of an IMU row
         self.imu.drop(start.row)
-        self._t = self.imu.rows[self.imu.at].t
-        self._s = self.wheels.at(self._t)                   # m, travel
+        self._t = self.imu.rows[self.imu.path_row].t
+        self._s = self.wheels.travel_at(self._t)                   # m, travel
         self.q: Quaternion = tuple(start.q_nb.tolist())     # attitude of b in n
         self._C_nb = rotation_matrix(self.q)
         self.bias: Vector = tuple(start.gyro_bias.tolist())
@@ -106,12 +106,12 @@ class Reckoning:
         clock_step = max(self._permanent_step, clock_step)
         self.errors.changed |= clock_step != self._clock_step
         self._clock_step = clock_step
-        while not self.failed and (last := self._next()) is not None:
-            received = self.imu.rows[last].t <= self.wheels.newest()
+        while not self.failed and (last := self._next_pose_row()) is not None:
+            has_travel = self.imu.rows[last].t <= self.wheels.end_time()
             self._advance(last)
             if self.failed:
                 break
-            if received:
+            if has_travel:
                 poses.append(self._pose())
                 if not poses[-1].is_valid():
                     self.failed = 'a value of the pose is not finite'
@@ -126,28 +126,29 @@ class Reckoning:
         """Return the earliest time of the next pose, s."""
         return self._t_pose + 1 / self.config.publish.rate - 1e-6
 
-    def _next(self) -> int | None:
+    def _next_pose_row(self) -> int | None:
         """Return the IMU row of the next pose, None until all its samples have arrived."""
-        rows, last = self.imu.rows, self.imu.from_time(self.next_pose_time(), self.imu.at + 1)
+        imu, rows = self.imu, self.imu.rows
+        last = imu.from_time(self.next_pose_time(), imu.path_row + 1)
         return last if last < len(rows) - 1 and (      # a cubic needs the next sample
-            rows[last].t <= self.wheels.newest()
+            rows[last].t <= self.wheels.end_time()
             or rows[-1].t - rows[last].t >= ODOMETER_SILENCE) else None
 
     def _advance(self, last: int) -> None:
         """Integrate attitude and travel up to a row of the IMU."""
-        imu, at = self.imu, self.imu.at
-        low = max(at - 1, 0)      # a cubic needs the samples before and after
+        imu, first = self.imu, self.imu.path_row
+        low = max(first - 1, 0)      # a cubic needs the samples before and after
         rows = imu.rows[low:last + 2]
-        path_rows = rows[at - low:-1]
+        path_rows = rows[first - low:-1]
         t, w = [row.t for row in rows], [add_scaled(row.w_b, self.bias, -1.0) for row in rows]
         f = [add_scaled(row.f_b, self.accel_bias, -1.0) for row in path_rows]
-        s = [self.wheels.at(row.t) for row in path_rows]
+        s = [self.wheels.travel_at(row.t) for row in path_rows]
         gaps = [b.t - a.t for a, b in pairwise(path_rows)]
         dropped_travel, self._s = abs(s[0] - self._s), s[-1]
         C_nb, turn_b, travel_n, dv_n = self._C_nb, ZERO, ZERO, ZERO
         forward_n, f_n = rotate_vector(C_nb, self._forward_b), rotate_vector(C_nb, f[0])
         for k, T in enumerate(gaps):
-            phi = rotation_increment(t, w, at - low + k)
+            phi = rotation_increment(t, w, first - low + k)
             C_nb = self._rotate(phi, T)
             forward_before, forward_n = forward_n, rotate_vector(C_nb, self._forward_b)
             f_before, f_n = f_n, rotate_vector(C_nb, f[k + 1])
@@ -171,7 +172,7 @@ class Reckoning:
         self._force_is_usable &= is_plausible and math.isfinite(sum(dv_n))
         self._turn_b = add_scaled(self._turn_b, turn_b)
         self._rates += [row.w_b for row in path_rows[1:]]
-        self._t, imu.at = t[-2], last
+        self._t, imu.path_row = t[-2], last
 
     def _rotate(self, phi: Vector, T: float) -> Matrix:
         """Rotate the attitude by phi, rad, in b, and by the Earth over T s; return C_nb."""
@@ -198,9 +199,9 @@ class Reckoning:
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the IMU by odometer and turn rate, (3,) m/s."""
         vehicle, C_nb = self.vehicle, np.array(self._C_nb)
-        travel = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
+        travel = self.wheels.travel_at(t) - self.wheels.travel_at(t - SPEED_SPAN)
         arm_b = vehicle.C_vb.T @ self.config.imu.lever_arm + vehicle.arm_b
-        rate = add_scaled(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
+        rate = add_scaled(self.imu.rows[self.imu.path_row].w_b, self.bias, -1.0)
         return C_nb @ (vehicle.forward_b * travel / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _correct_periodically(self) -> None:
@@ -208,14 +209,14 @@ class Reckoning:
         T = self._t - self._t_corrected
         if T < CORRECTION_PERIOD - 1e-6:
             return
-        velocity, received = self._velocity_n(self._t), self._t <= self.wheels.newest()
+        velocity, has_travel = self._velocity_n(self._t), self._t <= self.wheels.end_time()
         w = np.array(self._rates)
-        is_resting = received and self.wheels.still(self._t_corrected, self._t) and bool(
+        is_resting = has_travel and self.wheels.are_still(self._t_corrected, self._t) and bool(
             (w.std(axis=0) < REST_TURN).all()
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
         # the first period of a standstill may contain the end of braking
         is_standing = is_resting and self._was_resting
-        if self.config.levelling and received and self._force_is_usable:
+        if self.config.levelling and has_travel and self._force_is_usable:
             residual_n = (np.array(self._dv_n) - velocity + self._v_corrected) / T - GRAVITY_N
             variance = self.wheels.variance_between(self._t_corrected, self._t)
             noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(variance) / T**2)
@@ -233,9 +234,9 @@ class Reckoning:
             rate_variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_rate_n
             self._correct(self.errors.correct_by_rest(rate_b, rate_variance))
-        self.errors.changed |= self._delay.take(
+        self.errors.changed |= self._delay.add(
             rotate_vector(self._C_nb, self._forward_b),
-            velocity - self._v_corrected if received and self._force_is_usable else None,
+            velocity - self._v_corrected if has_travel and self._force_is_usable else None,
             self._dv_n, T)
         self._was_resting = is_resting
         self._t_corrected, self._v_corrected = self._t, self._velocity_n(self._t)
@@ -276,7 +277,7 @@ class Reckoning:
             self._covariances = self._uncertainty(T, speed, arm_n, rate_b, twist_by_turn)
         self._t_pose, self._s_pose = self._t, self._s
         self._turn_b, self._travel_variance = ZERO, 0.0
-        return Pose(self.imu.rows[self.imu.at].stamp_ns, pack_pose(
+        return Pose(self.imu.rows[self.imu.path_row].stamp_ns, pack_pose(
             add_scaled(add_scaled(self.position, arm_n), self._start_arm_n, -1.0),
             quaternion_product(self.q, self._q_bv),
             (twist_by_turn[0] + speed, *twist_by_turn[1:]), self._covariances))
@@ -287,9 +288,9 @@ class Reckoning:
         forward_n = rotate_vector(self._C_nb, self._forward_b)
         # a delay changes the position by delay times the change of velocity by accelerations along
         # the path; a clock step also changes the time of the pose
-        delay = math.hypot(self._delay.sigma_s, self._clock_step, self.wheels.delay_s)
+        delay_sigma = math.hypot(self._delay.sigma_s, self._clock_step, self.wheels.delay_s)
         by_delay = (*add_scaled(ZERO, add_scaled(self._turned_velocity_n, forward_n, -speed),
-                                delay),
+                                delay_sigma),
                     *add_scaled(ZERO, rotate_vector(self._C_nb, rate_b), self._clock_step))
         travel_variance, increment_variance = self.wheels.variances(self._t, T)
         return covariances(

@@ -74,13 +74,13 @@ class SpikeScreen:
     """
 
     def __init__(self) -> None:
-        self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
+        self._mean_steps = 0.0, 0.0         # mean steps from row to row, in units of ``_step``
         self._equal_since = 0.0             # s, begin of equal rows
         self._kept: deque[Row] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
         self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none
-        self._before = ZERO                 # rad/s, rate before the step
-        self._until = 0.0                   # s, end of the implausible rates
+        self._rate_before = ZERO            # rad/s, rate before the step
+        self._implausible_until = 0.0       # s, end of the implausible rates
 
     def screen(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
@@ -89,7 +89,7 @@ class SpikeScreen:
             row, last = rows[k], self._kept[-1] if self._kept else rows[k]
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
             spike_rows = None      # after this one, until the values are back
-            if any(self._exceeds_usual(step)) and not self._is_over(row):
+            if any(self._exceeds_usual(step)) and not self._step_is_over(row):
                 within = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=time_of)
                 spike_rows = self._rows_until_return(last, rows[k + 1:within], step)
                 if spike_rows is None and within == len(rows):
@@ -120,37 +120,37 @@ class SpikeScreen:
         return tuple(size > max(least, glitches.SINGLE_TIMES * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
-    def _is_over(self, row: Row) -> bool:
+    def _step_is_over(self, row: Row) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
-        return self._step_size is not ZERO and (row.t > self._until or all(
+        return self._step_size is not ZERO and (row.t > self._implausible_until or all(
             abs(w - before) <= glitches.RETURN_SHARE * size for w, before, size in zip(
-                row.w_b, self._before, self._step_size, strict=True) if size))
+                row.w_b, self._rate_before, self._step_size, strict=True) if size))
 
     def _implausible_part(self, last: Row, row: Row, isolated: Sequence[bool]) -> Vector:
         """Return the implausible part of a rate, rad/s: the size of the step at its start."""
-        if self._is_over(row):
+        if self._step_is_over(row):
             self._step_size = ZERO
         elif self._step_size is ZERO:
             limit = max(TURN_CHANGE * (row.t - last.t),
-                        glitches.USUAL_STEPS * glitches.TURN_STEP * self._usual[0])
+                        glitches.USUAL_STEPS * glitches.TURN_STEP * self._mean_steps[0])
             if any(isolated) or _largest(last.w_b, row.w_b) > limit:
                 steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
                 x, y, z = (size if is_isolated or size > limit else 0.0
                            for size, is_isolated in zip(steps, isolated or ZERO, strict=True))
-                self._step_size, self._before = (x, y, z), last.w_b
-                self._until = row.t + IMPLAUSIBLE_TIME
+                self._step_size, self._rate_before = (x, y, z), last.w_b
+                self._implausible_until = row.t + IMPLAUSIBLE_TIME
         return self._step_size
 
     def _exceeds_usual(self, step: Pair) -> tuple[bool, bool]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
-        (turn, force), (usual_turn, usual_force) = step, self._usual
+        (turn, force), (usual_turn, usual_force) = step, self._mean_steps
         return (turn > max(1.0, glitches.USUAL_STEPS * usual_turn),
                 force > max(1.0, glitches.USUAL_STEPS * usual_force))
 
     def _update_usual_step(self, step: Pair) -> None:
         """Update the mean step; a single spike has little effect."""
-        (turn, force), (usual_turn, usual_force) = step, self._usual
-        self._usual = (
+        (turn, force), (usual_turn, usual_force) = step, self._mean_steps
+        self._mean_steps = (
             usual_turn + (min(turn, 4 * usual_turn + 1 / glitches.USUAL_STEPS) - usual_turn)
             / USUAL_ROWS,
             usual_force + (min(force, 4 * usual_force + 1 / glitches.USUAL_STEPS) - usual_force)
@@ -206,8 +206,8 @@ class ImuStream:
     """
     Usable rows of the IMU in order of time.
 
-    at : current row of the path.   zero_ns : stamp of t = 0.   median_interval : s.
-    notes : list for texts on dropped rows.
+    path_row : number of the row that the path has reached.   zero_ns : stamp of t = 0.
+    median_interval : s.   notes : list for texts on dropped rows.
     """
 
     def __init__(self, config: ApplyConfig, notes: list[str]) -> None:
@@ -220,7 +220,7 @@ class ImuStream:
         self._held: list[Row] = []      # rows that may be spikes
         self.rows: list[Row] = []
         self.zero_ns = 0
-        self.at = 0
+        self.path_row = 0
         self.median_interval = 0.0
         self._new_rows = 0        # since ``median_interval`` was computed
 
@@ -241,12 +241,12 @@ class ImuStream:
                            'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
-            if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
+            if len(self.rows) - 2 > self.path_row and is_single(self.rows[-SINGLE_ROWS:]):
                 self._note_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
         self._new_rows += len(kept)
-        few = len(self.rows) < INTERVAL_ROWS
-        if len(self.rows) > 1 and (few or self._new_rows > INTERVAL_ROWS // 4):
+        has_few = len(self.rows) < INTERVAL_ROWS
+        if len(self.rows) > 1 and (has_few or self._new_rows > INTERVAL_ROWS // 4):
             steps = sorted(b.t - a.t for a, b in pairwise(self.rows[-INTERVAL_ROWS:]))
             self.median_interval, self._new_rows = steps[len(steps) // 2], 0
 
@@ -266,4 +266,4 @@ class ImuStream:
     def drop(self, row: int) -> None:
         """Drop the rows before a row; the current row must not be one of them."""
         del self.rows[:row]
-        self.at = max(self.at - row, 0)
+        self.path_row = max(self.path_row - row, 0)

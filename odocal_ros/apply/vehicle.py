@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrated values of a vehicle for dead reckoning."""
+"""
+Calibrated values of a vehicle for dead reckoning.
+
+In: the estimates of a calibration, and settings. Out: scale, axes and lever arm, with sigmas;
+values that are not calibrated are assumed, and stated.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +31,7 @@ SIDES = ('scale_factor_left', 'scale_factor_right')
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """A calibrated vehicle."""
+    """A calibrated vehicle; v are its axes (forward, left, up), b those of the IMU."""
 
     scale: float            # m per unit of the odometer; of two wheels: of their mean
     scale_sigma: float      # relative
@@ -77,10 +82,10 @@ class Vehicle:
 
 def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     """Return the vehicle; BadConfig without a scale factor, or with more than two wheels."""
-    def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
+    def estimate_of(name: str, default: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)
         if e is None or e.value is None:
-            return otherwise, sigma
+            return default, sigma
         return e.value, sigma if e.sigma is None else e.sigma
 
     if len(config.odometer.wheels) > len(SIDES):
@@ -104,6 +109,6 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     return Vehicle(
         scale, sigma / scale, None if math.isnan(left + right) else (left, right),
         yaw[0], pitch[0], yaw[1], pitch[1],
-        np.array([estimate_of(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
+        np.array([estimate_of(f'odometer_lever_arm_{axis}', value)[0] for axis, value in zip(
             'xyz', config.odometer.lever_arm, strict=True)]),
         None if np.isnan(bias).any() else bias, assumptions)

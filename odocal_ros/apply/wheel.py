@@ -28,7 +28,8 @@ STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
 # judgement: largest part of one row in the mean jitter, in mean jitters plus s: lost counts are
 # no jitter
 LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
-# judgement: of a counter that stops abruptly; one that holds its values has 3
+# judgement: least deviation of a counter that stops abruptly, in mean jitters; the rows of one
+# that holds its values have 3
 HUNG_JITTERS = 2.0
 # judgement: rows before the first test; number of consecutive rows that are refused, and their
 # least duration, s, before one is accepted
@@ -73,7 +74,7 @@ class Wheel:
         for row in zip(t, value, strict=True):
             if math.isfinite(row[1]) and row[0] > self._arrival:
                 self._arrival = row[0]
-                self._take(*row)
+                self._add_row(*row)
         if self.t:
             self.forget(self.t[-1] - KEPT_TIME)
 
@@ -85,7 +86,7 @@ class Wheel:
         self.speed *= factor
         self.s = deque(s * factor for s in self.s)
 
-    def at(self, t: float) -> float:
+    def travel_at(self, t: float) -> float:
         """Return the travel at a time, linear between rows, constant outside."""
         after = bisect_left(self.t, t)
         if not 0 < after < len(self.t):
@@ -101,7 +102,7 @@ class Wheel:
         """Return the variance by arrival jitter of the travel in the T s before t, m^2."""
         if self.form.quantity == 'rate':
             return 0.0
-        travel = self.at(t) - self.at(t - T)
+        travel = self.travel_at(t) - self.travel_at(t - T)
         deviation = self._row_times.error_s * travel / T
         share = min(1.0, T / self.mean_interval) if self.mean_interval else 1.0
         return 2.0 * deviation**2 * share**2 + (self._row_times.rate_error * travel)**2
@@ -127,27 +128,27 @@ class Wheel:
         while self.uncertain and self.uncertain[0][0] < t:
             self.uncertain.popleft()
 
-    def _take(self, t: float, value: float) -> None:
+    def _add_row(self, t: float, value: float) -> None:
         """Add a row: correct its time, test it, and update travel, speed and variance."""
         if self._value is None:
             self._value = value
             is_count = isinstance(value, int) and self.form.quantity != 'rate'
             self.quantum = abs(self.scale) if is_count else 0.0
-            self._add(t, 0.0)
+            self._append(t, 0.0)
             return
         before = self._value
         if self.form.quantity == 'rate':      # speeds do not show lost rows
             self._row_times.next_time(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
         else:
             limit = FASTEST * STAMP_BURST + self.quantum
-            step = min(max(self._step(value, before, 0.0) * self.scale, -limit), limit)
+            step = min(max(self._raw_travel(value, before, 0.0) * self.scale, -limit), limit)
             t = self._row_times.next_time(t, self.s[-1] + step, self.speed, self.quantum)
         dt = t - self.t[-1]
         self._rows += 1
-        step = self._step(value, before, dt) * self.scale
+        step = self._raw_travel(value, before, dt) * self.scale
         least_gap = max(MISSING_TIME, GAP_FACTOR * self.mean_interval)
-        gap = dt > least_gap and self._rows > TESTED_FROM_ROWS
-        if gap:
+        has_gap = dt > least_gap and self._rows > TESTED_FROM_ROWS
+        if has_gap:
             step += self._travel_in_gap(dt, step)
         row_speed = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         deviation = abs(row_speed - self.speed) * dt
@@ -169,16 +170,16 @@ class Wheel:
         if self._unexplained_speed:      # the speed used for refused rows may be false
             self._add_speed_variance(dt)
         self._value = value
-        if not gap:
+        if not has_gap:
             self.mean_interval += (dt - self.mean_interval) * (0.1 if self.mean_interval else 1.0)
-        self._add(t, self.s[-1] + step)
+        self._append(t, self.s[-1] + step)
 
     def _is_implausible(self, t: float, dt: float, step: float, row_speed: float,
                         deviation: float) -> bool:
         """Return True if a row (step in m, speed in m/s, deviation in m) is not motion."""
         possible = abs(step) <= self._step_limit(dt) and (
             self.form.quantity != 'rate' or abs(row_speed) <= FASTEST)
-        is_usual = deviation <= self._limit(dt) or self._rows <= TESTED_FROM_ROWS
+        is_usual = deviation <= self._deviation_limit(dt) or self._rows <= TESTED_FROM_ROWS
         if possible and is_usual:
             return False
         self._refused += 1
@@ -193,9 +194,10 @@ class Wheel:
     def _stops_abruptly(self, dt: float, step: float) -> bool:
         """Return True if the counter stops faster than by hard braking."""
         return not step and not self._unexplained_speed and self.form.quantity != 'rate' and (
-            abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
+            abs(self.speed) * dt > self._deviation_limit(dt, SPEED_CHANGE, HUNG_JITTERS))
 
-    def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
+    def _deviation_limit(self, dt: float, change: float = WHEEL_CHANGE,
+                         jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
         T = max(dt, self.mean_interval)      # a row of a burst contains the travel of an interval
         return (change * (T + self._speed_time()) * T + 3 * self.quantum
@@ -211,21 +213,21 @@ class Wheel:
         """Update the speed by an accepted row; add variance after a step of the speed."""
         stops = self._stops_abruptly(dt, step)
         self.is_hung = not step and (self.is_hung or stops or (
-            self._refused > 0 and deviation > self._limit(dt)))
+            self._refused > 0 and deviation > self._deviation_limit(dt)))
         if self._refused:
             if not self._unexplained_speed:      # else the speed is still unexplained
                 self._speed_before, self._unexplained_travel = self.speed, 0.0
             change = abs(row_speed - self._speed_before)
-            is_explained = change * dt <= self._limit(dt) and self._unexplained_speed > 0
+            is_explained = change * dt <= self._deviation_limit(dt) and self._unexplained_speed > 0
             self._unexplained_speed = 0.0 if is_explained else change
             self._unexplained_time = 0.0
-            self.speed = row_speed if deviation > self._limit(dt) else self.speed
+            self.speed = row_speed if deviation > self._deviation_limit(dt) else self.speed
         elif stops:
             self.notes.append(f'the counter stops abruptly from {self.speed:.1f} m/s: it hangs, '
                               'or the wheel locks; sigma increased')
             self._unexplained_speed, self._speed_before = abs(self.speed), self.speed
             self._unexplained_travel = self._unexplained_time = 0.0
-        elif deviation > self._limit(dt, SPEED_CHANGE):
+        elif deviation > self._deviation_limit(dt, SPEED_CHANGE):
             self._add_variance(deviation**2)
         self._refused = 0
         if self.form.quantity != 'rate':
@@ -262,11 +264,11 @@ class Wheel:
         """Add a variance, m^2, to the travel after the last row."""
         self.uncertain.append((self.t[-1] + 1e-6, variance))
 
-    def _add(self, t: float, s: float) -> None:
+    def _append(self, t: float, s: float) -> None:
         self.t.append(t)
         self.s.append(s)
 
-    def _step(self, value: float, before: float, dt: float) -> float:
+    def _raw_travel(self, value: float, before: float, dt: float) -> float:
         """Return the travel from a value to the next, in units of the odometer."""
         if self.form.quantity == 'rate':
             return (before + value) / 2 * dt

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Travel of a vehicle by one or two wheels, and the delay of the IMU relative to it."""
+"""
+Travel of a vehicle by one or two wheels in a stream, and the delay of the IMU relative to it.
+
+In: odometer rows of one or two topics. Out: travel between any two times, with its variance. A
+``Wheel`` tests the rows of one topic; ``DelaySearch`` compares the IMU's acceleration with them.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -39,7 +44,7 @@ class Wheels:
         self._vehicle, self._notes = vehicle, notes
         self._reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
-        self._two = config.odometer.own_topics
+        self._has_two_topics = config.odometer.own_topics
         self._waiting: list[Rows] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
         self.zero_ns = 0
@@ -58,7 +63,7 @@ class Wheels:
     def _feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
         if slot not in self._wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
-            self._scale(form)
+            self._set_scales(form)
         wheel = self._wheels[slot]
         since_ns = self._offset_ns - self.zero_ns
         wheel.feed([(stamp + since_ns) * 1e-9 for stamp, *_ in rows],
@@ -67,28 +72,29 @@ class Wheels:
         wheel.notes.clear()
         self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
-    def _scale(self, form: OdometerForm) -> None:
+    def _set_scales(self, form: OdometerForm) -> None:
+        """Set the scales of left and right wheel, if there are two and they are calibrated."""
         scales = self._vehicle.wheel_scales
         if len(self._wheels) == 2 and scales is not None and form.sides:
             for slot, scale in zip(SIDES, scales, strict=True):
                 self._wheels[slot].rescale(scale)
 
-    def ready(self) -> bool:
+    def are_complete(self) -> bool:
         """Return True if all expected wheels have rows."""
         return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
-            not self._two or len(self._wheels) == 2)
+            not self._has_two_topics or len(self._wheels) == 2)
 
-    def newest(self) -> float:
+    def end_time(self) -> float:
         """Return the time up to which all wheels have rows, s."""
         return min(w.t[-1] for w in self._wheels.values())
 
-    def oldest(self) -> float:
+    def begin_time(self) -> float:
         """Return the time from which all wheels have rows, s."""
         return max(w.t[0] for w in self._wheels.values())
 
-    def at(self, t: float) -> float:
+    def travel_at(self, t: float) -> float:
         """Return the travel at a time, m."""
-        return sum(wheel.at(t) for wheel in self._wheels.values()) / len(self._wheels)
+        return sum(wheel.travel_at(t) for wheel in self._wheels.values()) / len(self._wheels)
 
     def variance_between(self, t_from: float, t_to: float) -> float:
         """Return the variance of uncertain travel (faults, gaps) between two times, m^2."""
@@ -108,9 +114,9 @@ class Wheels:
         """Return the sigma of the constant delay of the rows, s."""
         return max(w.delay_s for w in self._wheels.values())
 
-    def still(self, t_from: float, t_to: float) -> bool:
+    def are_still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times and no counter hangs."""
-        return all(not w.is_hung and abs(w.at(t_to) - w.at(t_from))
+        return all(not w.is_hung and abs(w.travel_at(t_to) - w.travel_at(t_from))
                    <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
@@ -132,13 +138,13 @@ class DelaySearch:
 
     def __init__(self, span_s: float, sigma_s: float, notes: list[str]) -> None:
         self.sigma_s, self._notes, self._speed_delay_s = sigma_s, notes, span_s / 2
-        self._found_s = 0.0      # largest delay reported
-        # changes of speed in the last three seconds, m/s, by odometer and by force
-        self._last: deque[tuple[float, float]] = deque(maxlen=3)
+        self._reported_s = 0.0      # magnitude of the largest reported delay, plus 2 sigma
+        # changes of speed in each of the last three seconds, m/s, by odometer and by force
+        self._recent_changes: deque[tuple[float, float]] = deque(maxlen=3)
         # rows of the regression: change of acceleration, difference of the changes of speed
         self._rows: deque[tuple[float, float]] = deque(maxlen=MOST_DELAY_ROWS)
 
-    def take(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
+    def add(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
         """
         Add a second of data; return True if ``sigma_s`` has increased.
 
@@ -146,23 +152,23 @@ class DelaySearch:
         if not usable.   dv_n : m/s, integral of the specific force.   T : s.
         """
         if change_n is None:
-            self._last.clear()
+            self._recent_changes.clear()
             return False
         force_n = dv_n - np.array([0.0, 0.0, GRAVITY * T])
-        self._last.append((float(forward_n @ change_n), float(forward_n @ force_n)))
-        if len(self._last) < 3:
+        self._recent_changes.append((float(forward_n @ change_n), float(forward_n @ force_n)))
+        if len(self._recent_changes) < 3:
             return False
-        (before, _), (by_odometer, by_force), (after, _) = self._last
+        (before, _), (by_odometer, by_force), (after, _) = self._recent_changes
         self._rows.append(((after - before) / 2, by_force - by_odometer))
         delay, sigma = self._delay()
         delay += self._speed_delay_s
-        if abs(delay) < max(LEAST_DELAY, DELAY_SIGMAS * sigma, self._found_s):
+        if abs(delay) < max(LEAST_DELAY, DELAY_SIGMAS * sigma, self._reported_s):
             return False
         self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
                            f'{"late" if delay > 0 else "early"} relative to the odometer: add '
                            f'{-delay:+z.2f} to imu.time_offset; sigma increased')
-        self._found_s = abs(delay) + 2 * sigma
-        self.sigma_s = max(self.sigma_s, self._found_s)
+        self._reported_s = abs(delay) + 2 * sigma
+        self.sigma_s = max(self.sigma_s, self._reported_s)
         return True
 
     def _delay(self) -> tuple[float, float]:
@@ -175,13 +181,14 @@ class DelaySearch:
         if np.linalg.cond(N) > 1e6:      # no acceleration changes
             return 0.0, np.inf
         fit = np.linalg.solve(N, X.T @ y)
-        scores = X * (y - X @ fit)[:, None]
+        residuals = y - X @ fit
+        scores = X * residuals[:, None]
         # residuals are correlated: Newey-West covariance
         middle = scores.T @ scores
         for lag in range(1, LAGS):
             lagged = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
             middle += lagged + lagged.T
         C = np.linalg.inv(N)
-        white = np.sum((y - X @ fit)**2) / (len(y) - 2) * C[0, 0]
-        variance = max(white, (C @ middle @ C)[0, 0])
+        white_variance = np.sum(residuals**2) / (len(y) - 2) * C[0, 0]
+        variance = max(white_variance, (C @ middle @ C)[0, 0])
         return float(-fit[0]) / CHANGE_RATIO, float(np.sqrt(variance)) / CHANGE_RATIO

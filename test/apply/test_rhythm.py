@@ -183,7 +183,7 @@ def searched(late, bias=0.1, seconds=200):
     for t in np.arange(1.0, seconds):
         change = [speed(t) - speed(t - 1), 0.0, 0.0]
         force = speed(t - late) - speed(t - 1 - late) + bias
-        search.take(FORWARD, np.array(change), (force, 0.0, GRAVITY), 1.0)
+        search.add(FORWARD, np.array(change), (force, 0.0, GRAVITY), 1.0)
     return search, notes
 
 
@@ -212,7 +212,7 @@ def test_without_a_delay_nothing_is_reported():
 def test_a_minute_is_needed_and_unusable_seconds_do_not_count():
     assert not searched(0.2, seconds=LEAST_DELAY_ROWS)[1]
     search = DelaySearch(0.0, 0.01, [])
-    assert not any(search.take(FORWARD, None, (0.0, 0.0, GRAVITY), 1.0) for _ in range(500))
+    assert not any(search.add(FORWARD, None, (0.0, 0.0, GRAVITY), 1.0) for _ in range(500))
 
 
 @pytest.mark.parametrize('late', [0.0, 0.15])
