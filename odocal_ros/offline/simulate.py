@@ -169,8 +169,8 @@ def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOpti
     """Return SimOptions of the options, a random vehicle if requested, and sensor parameters."""
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
-    from odocal_ros.sim.real import parsed, Real
-    figures = dict(parsed(text) for text in args.figures)
+    from odocal_ros.sim.real import parse_parameter, Real
+    figures = dict(parse_parameter(text) for text in args.figures)
     if not (args.vehicle or args.effects):
         return SimOptions(**options, real=Real(**figures))
     if 'odometer' in options:

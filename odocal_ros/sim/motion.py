@@ -24,12 +24,12 @@ GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # defin
 
 @dataclass(frozen=True)
 class Start:
-    """Start of the drive: rad, ellipsoidal m, ENU yaw in rad."""
+    """Position and direction at the start of the drive."""
 
-    latitude: float
-    longitude: float
-    height: float
-    yaw: float
+    latitude: float     # rad
+    longitude: float    # rad
+    height: float       # m above the ellipsoid
+    yaw: float          # rad from east, counter-clockwise
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class State:
     acceleration: np.ndarray     # m/s^2, of the speed
     yaw: np.ndarray              # rad, ENU, not wrapped
     yaw_rate: np.ndarray         # rad/s, relative to the local level
-    yaw_acceleration: np.ndarray
+    yaw_acceleration: np.ndarray     # rad/s^2
     slope: np.ndarray            # rad, nose up
-    slope_rate: np.ndarray
-    slope_acceleration: np.ndarray
+    slope_rate: np.ndarray           # rad/s
+    slope_acceleration: np.ndarray   # rad/s^2
     latitude: np.ndarray         # rad
     longitude: np.ndarray        # rad
     height: np.ndarray           # m
@@ -124,15 +124,15 @@ class Motion:
         """Return m east, north, up and rad of rotation relative to the level, from t to t + h."""
         sums = [np.zeros(np.shape(t)) for _ in range(4)]
         for node, weight in GAUSS:
-            at, w = t + (node + 1) / 2 * h, weight / 2
-            yaw, slope = self.start.yaw + self._turn(at), self.hills(self._travel(at))[0]
-            ds, side, rise = (w * h * p(at) for p in (self.speed, *self.sway))
+            t_node, w = t + (node + 1) / 2 * h, weight / 2
+            yaw, slope = self.start.yaw + self._turn(t_node), self.hills(self._travel(t_node))[0]
+            ds, side, rise = (w * h * p(t_node) for p in (self.speed, *self.sway))
             level = ds * np.cos(slope) - rise * np.sin(slope)
             for total, part in zip(sums, (
                     level * np.cos(yaw) - side * np.sin(yaw),
                     level * np.sin(yaw) + side * np.cos(yaw),
                     ds * np.sin(slope) + rise * np.cos(slope),
-                    w * h * self.yaw_rate(at) * np.cos(slope)), strict=True):
+                    w * h * self.yaw_rate(t_node) * np.cos(slope)), strict=True):
                 total += part
         return sums
 

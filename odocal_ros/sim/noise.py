@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sample times, random numbers with a generator for each sensor, noise and drift processes."""
+"""Sample times, a random generator for each sensor, and processes of noise and drift."""
 
 from typing import Any
 import zlib
@@ -12,7 +12,7 @@ from odocal_ros.data.arrays import Floats, Ints
 
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
-REMAINDER = 0.2     # judgement: share of the accumulated drift that a loop closure leaves
+CLOSURE_REMAINDER = 0.2     # judgement: share of the drift that remains after a loop closure
 TRANSPORT_DELAY = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
 
 
@@ -67,7 +67,7 @@ def reference_drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
     sigma = stationary_sigma(options)
     step_sigma = (sigma * np.sqrt(1 - remaining**2) if length
                   else options.reference_drift * np.sqrt(path))
-    remaining = np.where(is_closed, REMAINDER, remaining)
+    remaining = np.where(is_closed, CLOSURE_REMAINDER, remaining)
     errors = np.zeros((len(t), 3))
     steps = step_sigma[:, None] * rng.standard_normal((len(t), 2))
     errors[0, :2] = sigma * rng.standard_normal(2)

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a real vehicle's sensors beyond noise and bias; each default means no error."""
+"""
+Parameters of the errors of real sensors beyond noise and bias, with their checks.
+
+``Real`` has one field for each; its defaults mean no error. ``real_sensors.py``, ``wheels.py`` and
+``body.py`` apply them; ``odocal simulate --real NAME=VALUE`` sets them.
+"""
 
 from dataclasses import dataclass, fields
 import difflib
@@ -18,6 +23,7 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
 NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
 CHOICES = {'speed_rounding': ('floor', 'round'), 'configured_grade': tuple(GRADES)}
+# names of parameters that may be negative; of those that are pairs; of those above 0
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_step',
           'accel_step', 'gyro_slope', 'accel_slope', 'warm_rise', 'rectification', 'speed_law',
           'warming', 'imu_arm_error', 'odometer_arm_error', 'antenna_arm_error',
@@ -133,9 +139,10 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     numbers = _numbers(name, value, default)
     if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
         raise BadUsage(f'--real {name}: required: finite numbers')
-    least = min(numbers, default=1.0)
-    if (name not in SIGNED and least < 0 or name in POSITIVE and least <= 0
-            or name == 'drops' and least >= 1 or name == 'imu_batch' and least != int(least)):
+    smallest = min(numbers, default=1.0)
+    if (name not in SIGNED and smallest < 0 or name in POSITIVE and smallest <= 0
+            or name == 'drops' and smallest >= 1
+            or name == 'imu_batch' and smallest != int(smallest)):
         limit = {'drops': '0 or more, below 1', 'imu_batch': 'a whole number, 1 or more'}.get(
             name, 'above 0' if name in POSITIVE else '0 or more')
         raise BadUsage(f'--real {name}={value}: required: {limit}')
@@ -155,7 +162,7 @@ def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
     return value if count else (value,)
 
 
-def parsed(text: str) -> tuple[str, Any]:
+def parse_parameter(text: str) -> tuple[str, Any]:
     """Return name and value of ``NAME=VALUE``; raise BadUsage for an unknown name."""
     import ast
     name, _, value = text.partition('=')

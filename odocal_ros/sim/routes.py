@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Named routes: speed and turn rate by time, with stops, ramps and turns."""
+"""
+Named routes of simulated drives: speed and turn rate by time, with stops, ramps and turns.
+
+In: a duration, s, and random numbers. Out: a ``Route``. ``speed`` and ``rate`` of a segment are
+the pieces of acceleration and turn rate, of equal duration.
+"""
 
 from dataclasses import dataclass, replace
 import math
@@ -19,6 +24,10 @@ BLEND = 0.4            # s, rise time of an acceleration or a turn rate
 Segment = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
 
 
+def _standstill(seconds: float) -> Segment:
+    return hold(seconds), hold(seconds)
+
+
 def _robot_segments(duration: float, rng: np.random.Generator, cycles: int = 1) -> list[Segment]:
     """
     Return cycles of a move and a turn on the spot, 5 s still before and after.
@@ -26,22 +35,23 @@ def _robot_segments(duration: float, rng: np.random.Generator, cycles: int = 1) 
     A move of 2 to 8 s at 0.2 to 1.2 m/s is alternately straight or an arc of up to 90 deg. Turns
     on the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, alternately to the left and the right.
     """
-    left = _time_left('indoor', duration, 2 * STILL, least=math.ceil(cycles * LONGEST_CYCLE))
-    segments, side, k = [(hold(STILL), hold(STILL))], rng.choice([-1.0, 1.0]), 0
-    while left >= LONGEST_CYCLE:
-        speed, rate, length = _cycle(rng, side, bool(k % 2), left)
+    remaining = _remaining_time('indoor', duration, 2 * STILL,
+                                least=math.ceil(cycles * LONGEST_CYCLE))
+    segments, side, k = [_standstill(STILL)], rng.choice([-1.0, 1.0]), 0
+    while remaining >= LONGEST_CYCLE:
+        speed, rate, length = _cycle(rng, side, bool(k % 2), remaining)
         segments.append((speed, rate))
-        left, side, k = round(left - length, 9), -side, k + 1
-    segments.append((hold(STILL + left), hold(STILL + left)))
+        remaining, side, k = round(remaining - length, 9), -side, k + 1
+    segments.append(_standstill(STILL + remaining))
     return segments
 
 
 def _cycle(rng: np.random.Generator, side: float, arc: bool,
-           left: float) -> tuple[list[Piece], list[Piece], float]:
+           remaining: float) -> tuple[list[Piece], list[Piece], float]:
     """Return accelerations, turn rates and duration of a move and a turn to a side."""
     up, down, wait, pause = (round(float(rng.uniform(*r)), 1) for r in (
         (1.0, 1.5), (1.0, 1.5), (0.5, 2.0), (0.5, 2.0)))
-    top, cruise = rng.uniform(0.2, 1.2), round(min(rng.uniform(2.0, 8.0), left - 15.0), 1)
+    top, cruise = rng.uniform(0.2, 1.2), round(min(rng.uniform(2.0, 8.0), remaining - 15.0), 1)
     arc_angle = arc * rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 90))
     angle = side * math.radians(rng.uniform(45, 200))
     spot = round(abs(angle) / rng.uniform(0.5, 1.2) + BLEND, 1)
@@ -62,14 +72,14 @@ class Route:
 
 def paper(duration: float, rng: np.random.Generator) -> Route:
     """Return the drive of the paper's section 3: 300 s still, 20 m/s for 520 s, 30 s still."""
-    cruise = _time_left('paper', duration, 300 + 40 + 40 + 30)
+    cruise = _remaining_time('paper', duration, 300 + 40 + 40 + 30)
     pieces = (hold(300) + ramp(40, 20, 0.0) + hold(cruise) + ramp(40, -20, 0.0) + hold(30))
     return _route([(pieces, hold(duration))])
 
 
 def straight(duration: float, rng: np.random.Generator) -> Route:
     """Return one straight run: 60 s still, 25 s up to 12 m/s, cruise, 25 s down, 60 s still."""
-    cruise = _time_left('straight', duration, 60 + 25 + 25 + 60)
+    cruise = _remaining_time('straight', duration, 60 + 25 + 25 + 60)
     pieces = hold(60) + ramp(25, 12) + hold(cruise) + ramp(25, -12) + hold(60)
     return _route([(pieces, hold(duration))])
 
@@ -77,7 +87,7 @@ def straight(duration: float, rng: np.random.Generator) -> Route:
 def out_and_back(duration: float, rng: np.random.Generator) -> Route:
     """Return a straight out, a stop of 30 s, a U turn at 4 m/s, the same straight back."""
     around = 5 + 2 + 14 + 2 + 10
-    cruise = _time_left('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
+    cruise = _remaining_time('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
     out = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
     about = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
     back = hold(cruise) + ramp(15, -15) + hold(60)
@@ -95,19 +105,19 @@ def town(duration: float, rng: np.random.Generator) -> Route:
     first, so that the end is well away from the start.
     """
     enough = 135.0    # s, enough for any drawn cycle
-    left = _time_left('town', duration, 20 + 15, enough=enough)
-    segments, off = [(hold(20), hold(20))], 0.0
-    while left >= 90.0 or not segments[1:]:
-        speed, rate, off = _town_cycle(rng, off)
+    remaining = _remaining_time('town', duration, 20 + 15, enough=enough)
+    segments, heading_change = [_standstill(20)], 0.0
+    while remaining >= 90.0 or not segments[1:]:
+        speed, rate, heading_change = _town_cycle(rng, heading_change)
         length = round(sum(d for d, _ in speed), 9)
-        if length > left:
+        if length > remaining:
             break
         segments.append((speed, rate))
-        left -= length
+        remaining -= length
     if not segments[1:]:
         raise BadUsage(f'scenario town: --duration {duration:g} s is too short for a stop-and-go '
                        f'cycle; give {enough:g} s or more')
-    segments.append((hold(15 + left), hold(15 + left)))
+    segments.append(_standstill(15 + remaining))
     return _route(segments)
 
 
@@ -122,19 +132,19 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
     ramp_top, fast = 12.0, rng.uniform(25, 36)
     slip_road = ramp(10, ramp_top) + hold(12)
     bend = turn(10, rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 60)), 2.0)
-    left = _time_left('motorway', duration, 40 + 22 + up + down + 30)
-    segments = [(hold(40), hold(40)),
+    remaining = _remaining_time('motorway', duration, 40 + 22 + up + down + 30)
+    segments = [_standstill(40),
                 (slip_road + ramp(up, fast - ramp_top),
                  hold(11) + bend + hold(1 + up))]
-    while left >= 60:
+    while remaining >= 60:
         length = _tenth(rng.uniform(15, 45))
-        to = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
+        new_speed = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
         angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(0.2, 1.2)) * (length - 6)
         change = _tenth(rng.uniform(8, 14))
-        segments.append((ramp(change, to - fast) + hold(length - change),
+        segments.append((ramp(change, new_speed - fast) + hold(length - change),
                          turn(length, angle, 6.0)))
-        fast, left = to, round(left - length, 9)
-    segments.append((hold(left) + ramp(down, -fast) + hold(30), hold(left + down + 30)))
+        fast, remaining = new_speed, round(remaining - length, 9)
+    segments.append((hold(remaining) + ramp(down, -fast) + hold(30), hold(remaining + down + 30)))
     return _route(segments)
 
 
@@ -142,9 +152,10 @@ def oval(duration: float, rng: np.random.Generator) -> Route:
     """Return laps of an oval, left turns only: half circles and straights at 12 to 20 m/s."""
     fast, straight = rng.uniform(12, 20), _tenth(rng.uniform(6, 12))
     bend = _tenth(math.pi * fast / 4.0 + 3.0)     # at 4 m/s^2 to the side, with flanks of 3 s
-    left = _time_left('oval', duration, 40 + 12 + 12 + 20, least=math.ceil(2 * (straight + bend)))
-    laps = int(left / (straight + bend))
-    rest = round(left - laps * (straight + bend), 9)
+    remaining = _remaining_time('oval', duration, 40 + 12 + 12 + 20,
+                                least=math.ceil(2 * (straight + bend)))
+    laps = int(remaining / (straight + bend))
+    rest = round(remaining - laps * (straight + bend), 9)
     segments = [(hold(40) + ramp(12, fast), hold(52))]
     segments += [(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))] * laps
     segments.append((ramp(12, -fast) + hold(20 + rest), hold(32 + rest)))
@@ -158,9 +169,9 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
     In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
     """
     longest = 40.0    # s, of a move with the stop after it
-    left = _time_left('yard', duration, 20 + 15, least=longest)
-    segments = [(hold(20), hold(20))]
-    while left >= longest:
+    remaining = _remaining_time('yard', duration, 20 + 15, least=longest)
+    segments = [_standstill(20)]
+    while remaining >= longest:
         top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
         up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
             (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4)))
@@ -171,8 +182,8 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
         segments.append((ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
                          hold(up + before) + turn(turning, angle, 0.5)
                          + hold(after + down + stop)))
-        left = round(left - up - cruise - down - stop, 9)
-    segments.append((hold(15 + left), hold(15 + left)))
+        remaining = round(remaining - up - cruise - down - stop, 9)
+    segments.append(_standstill(15 + remaining))
     return _route(segments)
 
 
@@ -187,34 +198,36 @@ def square(duration: float, rng: np.random.Generator) -> Route:
 
     10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
     """
-    rest = _time_left('square', duration, 10 + 8 * 17, least=5.0)
+    rest = _remaining_time('square', duration, 10 + 8 * 17, least=5.0)
     # 4 m: a ramp of 1 s is as long as half a second at full speed
     speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND) + hold(8.0)
     sides = [(speed, hold(12.0) + turn(2.0, side * math.pi / 2, BLEND) + hold(3.0))
              for side in [1.0] * 4 + [-1.0] * 4]
-    return _route([(hold(10.0), hold(10.0)), *sides, (hold(rest), hold(rest))])
+    return _route([_standstill(10.0), *sides, _standstill(rest)])
 
 
 def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
     parts = _robot_segments(duration, rng, cycles=3)
     still = [hold(sum(d for d, _ in speed)) for speed, _ in parts]
-    aside = [k % 3 == 2 for k in range(len(parts))]
-    route = _route([(rest if there else speed, rate) for (speed, rate), rest, there in zip(
-        parts, still, aside, strict=True)])
-    side = chain([piece for (speed, _), rest, there in zip(parts, still, aside, strict=True)
-                  for piece in (speed if there else rest)])
+    is_sideways = [k % 3 == 2 for k in range(len(parts))]
+    route = _route([(rest if sideways else speed, rate) for (speed, rate), rest, sideways in zip(
+        parts, still, is_sideways, strict=True)])
+    side = chain([piece for (speed, _), rest, sideways in zip(
+        parts, still, is_sideways, strict=True) for piece in (speed if sideways else rest)])
     return replace(route, side=_without_rounding(side.integral()))
 
 
-def _town_cycle(rng: np.random.Generator, off: float) -> tuple[list[Piece], list[Piece], float]:
+def _town_cycle(rng: np.random.Generator,
+                heading_change: float) -> tuple[list[Piece], list[Piece], float]:
+    """Return accelerations and turn rates of a cycle, and the heading change after it, rad."""
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
     before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
     weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))
     angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(60, 110))
     side_limit, blend = 3.0, 1.5    # m/s^2 to the side; s, rise time of a turn rate
     turning = max(turning, _tenth(abs(angle) * top / side_limit + blend))
-    if abs(off + angle) > math.radians(110.0):    # so that the drive leads away
+    if abs(heading_change + angle) > math.radians(110.0):    # so that the drive leads away
         angle = -angle
     side = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(4, 10))
     cruise = before + turning + between + 2 * weave + after
@@ -222,7 +235,7 @@ def _town_cycle(rng: np.random.Generator, off: float) -> tuple[list[Piece], list
     rate = (hold(up + before) + turn(turning, angle, blend) + hold(between)
             + turn(weave, side, blend) + turn(weave, -side, blend)
             + hold(after + down + stop))
-    return speed, rate, off + angle
+    return speed, rate, heading_change + angle
 
 
 def _tenth(seconds: float) -> float:
@@ -230,16 +243,20 @@ def _tenth(seconds: float) -> float:
     return round(float(seconds), 1)
 
 
-def _time_left(name: str, duration: float, fixed: float, least: float = 10.0,
-               enough: float | None = None) -> float:
-    """Return the time left besides the fixed parts, s; raise an error if it is too short."""
+def _remaining_time(name: str, duration: float, fixed: float, least: float = 10.0,
+                    enough: float | None = None) -> float:
+    """
+    Return the time that remains besides the fixed parts, s.
+
+    Raises BadUsage: it is below ``least``; the error suggests ``enough`` s, if given.
+    """
     if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
                        f'give {enough or fixed + least:g} s or more')
     return duration - fixed
 
 
-def _route(segments: list[tuple[list[Piece], list[Piece]]]) -> Route:
+def _route(segments: list[Segment]) -> Route:
     acceleration = chain([p for speed, _ in segments for p in speed])
     yaw_rate = chain([p for _, rate in segments for p in rate])
     return Route(_without_rounding(acceleration.integral()), yaw_rate)

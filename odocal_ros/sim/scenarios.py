@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulate a drive: a named route, its sensors, and the truth."""
+"""
+Simulate a drive: a named route, its sensors, and the truth.
+
+In: SimOptions. Out: a ``Drive``, with the samples as a bag would give them.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -66,9 +70,9 @@ class Drive:
     options: SimOptions
     motion: Motion
     truth: Truth
-    form: samples.OdometerForm
+    form: samples.OdometerForm      # meaning of the odometer's values
     imu: samples.ImuSamples
-    wheels: tuple[samples.OdometerSamples, ...]
+    wheels: tuple[samples.OdometerSamples, ...]     # in the order of ``wheels_of``
     fix: samples.FixSamples
     heading: samples.HeadingSamples
     velocity: samples.VelocitySamples

@@ -153,7 +153,7 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
              lean: Floats | float) -> Floats | Ints:
     arm, scale = wheel.arm, wheel.scale
     real, slipped = options.real, slip(state, options, wheel.stream)
-    grown = 1 + wheels.growth(state, real)
+    grown = 1 + wheels.tyre_growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * make_rng(options.seed, 'speed').standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it

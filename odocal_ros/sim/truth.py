@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Truth of a simulated drive as in truth.yaml, and the settings of its operator."""
+"""
+Truth of a simulated drive as in truth.yaml, and the settings that its operator would configure.
+
+The settings have the nominal scale and measured lever arms, with their errors, not the true ones.
+"""
 
 from dataclasses import asdict
 import math

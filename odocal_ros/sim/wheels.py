@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels of a simulated vehicle: positions, rolled paths, growth, slip, published speeds."""
+"""
+Wheels of a simulated vehicle: their positions and scales, and the paths that they roll.
+
+In: the true motion. Out: paths with growth and slip of the tyres, and speeds as a vehicle bus
+publishes them.
+"""
 
 from dataclasses import dataclass
 
@@ -28,7 +33,7 @@ AIR_DRAG = 1e-5              # judgement: air drag over load, per (m/s)^2
 
 @dataclass(frozen=True, eq=False)
 class SimWheel:
-    """A wheel."""
+    """A wheel with an odometer."""
 
     name: str         # joint
     stream: str       # name of its random numbers
@@ -120,7 +125,7 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     return state.travel + side * by_turn
 
 
-def growth(state: State, real: Real) -> Floats | float:
+def tyre_growth(state: State, real: Real) -> Floats | float:
     """Return the relative growth of the rolling radius from a cold, slow tyre: (n,), or 0.0."""
     grown: Floats | float = 0.0
     if real.speed_law:
@@ -154,7 +159,7 @@ def leg_factor(state: State, real: Real, slipped: Floats) -> float:
         return 1.0
     path_length = np.diff(state.travel)
     slipped = np.diff(slipped + tyre_slip(state, real) if real.tyre_slip else slipped)
-    grown = growth(state, real) + np.zeros_like(state.t)
+    grown = tyre_growth(state, real) + np.zeros_like(state.t)
     counted = (path_length + slipped) / (1 + (grown[1:] + grown[:-1]) / 2)
     return float(np.abs(path_length).sum() / np.abs(counted).sum())
 

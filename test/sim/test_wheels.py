@@ -151,7 +151,7 @@ def test_a_tyre_grows_with_the_square_of_the_speed_and_as_it_warms():
     cruise = state.t == 250.0                        # 12 m/s since 85 s, rolling since 60 s
     want = 0.003 / 9 + 0.002 * (1 - np.exp(-190 / 100))
     # one step of 0.02 s more or less of warming
-    assert wheels.growth(state, real)[cruise] == pytest.approx(want, abs=0.002 * 3e-4)
+    assert wheels.tyre_growth(state, real)[cruise] == pytest.approx(want, abs=0.002 * 3e-4)
 
 
 def test_tyres_slip_by_the_force_over_the_load():
