@@ -55,7 +55,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     Returns a Calibration; its reasons name the cause if the drive cannot be calibrated. Raises
     BadUsage, BadBag, BadData, BadConfig: a bag cannot be read or used, or an argument is invalid.
     """
-    from odocal_ros.output.program_files import framed
+    from odocal_ros.output.program_files import with_imu_frame
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
     notes = Notes(listener or Listener())
@@ -77,7 +77,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     results, inputs = unique_names([bag.path for bag in bags], [bag.legs for bag in bags],
                                    [bag.entry for bag in bags])
     frame = next((bag.imu_frame for bag in bags if bag.imu_frame), '')
-    result, settings = framed(combine(results, settings, imu=imu), settings, frame)
+    result, settings = with_imu_frame(combine(results, settings, imu=imu), settings, frame)
     return Calibration(result, settings, tuple(inputs), tuple(notes.texts))
 
 

@@ -21,7 +21,7 @@ from odocal_ros.forecast.planned_methods import keyframe_spacing, Plan, plan_met
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.arguments import config_of, Settings
-from odocal_ros.output.value_text import length, time_span
+from odocal_ros.output.value_text import duration_text, length_text
 from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
 
@@ -59,11 +59,12 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
                   before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield (text, drive, sigmas) of drives that are longer or have more manoeuvres."""
-    yield (f'{length(drive.distance)} more, straight ahead', drive.lengthen(drive.distance),
+    yield (f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance),
            sigmas)
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
-    yield (f'standing {time_span(rest)} longer at both marks', drive.lengthen_rests(rest), sigmas)
+    yield (f'standing {duration_text(rest)} longer at both marks',
+           drive.lengthen_rests(rest), sigmas)
     yield 'one more stop and start', planned_drive.add_stop_and_start(drive), sigmas
     yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(
         drive), sigmas
@@ -72,7 +73,8 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
            planned_drive.add_town_driving(drive, town_minutes), sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
-        yield (f'end mark at the farthest point ({length(farthest.distance)})', farthest, sigmas)
+        yield (f'end mark at the farthest point ({length_text(farthest.distance)})',
+               farthest, sigmas)
 
 
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,

@@ -214,8 +214,8 @@ class ResultSaver:
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
         """Write files into a folder named by the time; return it, and why ``latest`` stays."""
         from odocal_ros.output.files import Results
-        from odocal_ros.output.program_files import framed
-        calibration, config = framed(calibration, config, imu_frame)
+        from odocal_ros.output.program_files import with_imu_frame
+        calibration, config = with_imu_frame(calibration, config, imu_frame)
         root = output_root(config, self._node)
         try:
             folder = new_folder(root, iso(now_ns).replace(':', '-'))

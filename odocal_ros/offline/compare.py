@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
     from odocal_ros.output.stored import estimate_text as value_text
-    from odocal_ros.output.value_text import columns, counted
+    from odocal_ros.output.value_text import counted, table_lines
     stored = found.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '
@@ -50,7 +50,7 @@ def _screen(found: 'Comparison') -> list[str]:
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         if len(stored) == 2:       # both are the same
             rows = [row[:3] for row in rows]
-        lines += ['', label(change.parameter), *columns(rows, ' ')]
+        lines += ['', label(change.parameter), *table_lines(rows, ' ')]
     return [*lines, '', *(f'note: {note}' for note in found.notes), *found.sentences,
             *hints(found.changes, stored)]
 

@@ -12,11 +12,11 @@ from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.output.tables import budget_lines
 from odocal_ros.output.value_text import (
-    length,
+    duration_text,
+    length_text,
     MAIN_VALUES,
-    share,
+    relative_text,
     table_row,
-    time_span,
     wrapped,
 )
 
@@ -61,10 +61,11 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
 def _head(plan: Planned) -> list[str]:
     sigmas, two_point = plan.sigmas, plan.two_point
     alignment, tau = two_point.alignment, sigmas.correlation_time
-    stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
+    stands = [f'standing {duration_text(s)}' if s else 'in motion' for s in two_point.standing]
     noise = f'correlation time {tau:g} s' if tau else 'white'
-    lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
-             f'the start mark, {stands[1]} at the end mark; marks {length(two_point.chord)} apart',
+    lines = [f'{length_text(two_point.distance)} in {duration_text(two_point.duration)}, '
+             f'{stands[0]} at the start mark, {stands[1]} at the end mark; '
+             f'marks {length_text(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {alignment.heading_source} '
              f'(sigma {math.degrees(alignment.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m '
              f'at {sigmas.fix_rate:.3g} Hz, {noise}']
@@ -97,7 +98,8 @@ def _result(plan: Plan) -> str:
 def _shown(parameter: str, sigma: float | None) -> str:
     if sigma is None:
         return 'unknown'
-    return share(sigma) if parameter == SCALE else f'{significant(math.degrees(sigma))} deg'
+    return (relative_text(sigma) if parameter == SCALE
+            else f'{significant(math.degrees(sigma))} deg')
 
 
 def _budgets(plan: Plan) -> list[str]:
@@ -128,5 +130,5 @@ def _improvements(plan: Planned) -> list[str]:
 def _reasons(plan: Plan) -> list[str]:
     lines = []
     for reason in plan.reasons:
-        lines += wrapped(f'{reason}. {reason.remedy}', more='   ', width=96)
+        lines += wrapped(f'{reason}. {reason.remedy}', hanging='   ', width=96)
     return ['', *lines] if lines else []

@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.summary import sentence
-from odocal_ros.output.value_text import counted, inverse, known, with_sigma
+from odocal_ros.output.value_text import counted, finite_estimate, inverse_text, with_sigma
 from odocal_ros.safe_io.text_formats import for_comment, one_line, parameter_block
 from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SIDES, SKID
 from odocal_ros.settings.levels import INFORMED_SHARE
@@ -79,7 +79,7 @@ def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any
     """Return controller -> parameters, for controllers that fit the drive."""
     radius = wheel_radius(calibration, config)
     if config.odometer.drive in HOLONOMIC:
-        lever = known(calibration.estimates, 'rotation_lever').value
+        lever = finite_estimate(calibration.estimates, 'rotation_lever').value
         keys = HOLONOMIC_KEYS[config.odometer.drive]
         values = {key: value for key, value in zip(keys, (radius, lever), strict=True)
                   if value is not None}
@@ -100,15 +100,15 @@ def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any
 def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
     """Return the multipliers of diff_drive_controller, by wheel if these are estimated."""
     estimates = calibration.estimates
-    common = known(estimates, 'scale_ratio').value
-    left, right = (known(estimates, f'scale_factor_{side}') for side in SIDES)
-    nominal = nominal_scale(config, left.unit or known(estimates, 'scale_factor').unit)
+    common = finite_estimate(estimates, 'scale_ratio').value
+    left, right = (finite_estimate(estimates, f'scale_factor_{side}') for side in SIDES)
+    nominal = nominal_scale(config, left.unit or finite_estimate(estimates, 'scale_factor').unit)
     ratios = [common, common]
     if nominal and left.value is not None and right.value is not None:
         ratios = [left.value / nominal, right.value / nominal]
     multipliers = {f'{side}_wheel_radius_multiplier': ratio
                    for side, ratio in zip(SIDES, ratios, strict=True) if ratio is not None}
-    width = known(estimates, 'track_width')
+    width = finite_estimate(estimates, 'track_width')
     if width.value is not None and width.sigma and config.odometer.track_width:
         multipliers['wheel_separation_multiplier'] = width.value / config.odometer.track_width
     elif width.value is not None and config.odometer.drive == SKID:
@@ -118,7 +118,7 @@ def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
 
 def wheel_radius(calibration: Calibration, config: Config) -> float | None:
     """Return the effective radius of the wheel, m; None if its pulses per turn are unknown."""
-    scale = known(calibration.estimates, 'scale_factor')
+    scale = finite_estimate(calibration.estimates, 'scale_factor')
     wheels = config.wheels
     if scale.value is None:
         return None
@@ -133,11 +133,11 @@ def wheel_radius(calibration: Calibration, config: Config) -> float | None:
 
 def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty without a scale factor in metres per pulse."""
-    scale = known(calibration.estimates, 'scale_factor')
+    scale = finite_estimate(calibration.estimates, 'scale_factor')
     if scale.value is None or scale.unit != 'm/pulse':
         return {}
     micrometres = with_sigma(scale.value, scale.sigma, MICRO)
-    lines = [f'# one pulse: {micrometres} um; {inverse(scale)}']
+    lines = [f'# one pulse: {micrometres} um; {inverse_text(scale)}']
     for description, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
         lines += ['', *textwrap.wrap(description, 98, initial_indent='# ',
                                      subsequent_indent='# ')]

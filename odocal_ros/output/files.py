@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result files: calibration.json (schema 1) and files for other programs."""
+"""
+Result files in one folder: calibration.json (schema 1), report, files for other programs.
+
+In: a calibration and its settings. The folder is replaced as a whole, so that its files belong
+together; the report is drawn last, since it takes longest.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +23,7 @@ from odocal_ros.calib.result import Calibration, LegResult, MethodResult, TrackC
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import program_files
 from odocal_ros.output.report import NAME as REPORT, report_or_error_page
-from odocal_ros.output.tables import in_pieces, overall
+from odocal_ros.output.tables import pooled_check, pooled_per_distance
 from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.safe_io.atomic_files import ResultFolder
 from odocal_ros.settings.config import Config, flat
@@ -48,7 +53,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     result |= main_method.details.get('beside', {}) if main_method else {}
     result['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
                               'rpy': calibration.imu_rotation_rpy}
-    checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
+    checks = {name: pooled_check([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
     optional: dict[str, Any] = {}
     if (acceptance := accept(calibration, config)) is not None:
@@ -101,7 +106,8 @@ def _leg(leg: LegResult) -> dict[str, Any]:
 
 
 def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[str, Any]]:
-    return [{'length': x.length, 'before': x.before, 'after': x.after} for x in in_pieces(legs)]
+    return [{'length': x.length, 'before': x.before, 'after': x.after}
+            for x in pooled_per_distance(legs)]
 
 
 def plain(value: Any) -> Any:
@@ -137,7 +143,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
 
 class Results:
-    """Result files of a calibration in a folder replaced as a whole; the slow report is last."""
+    """The result files of a calibration: ``write`` all but the report, then ``draw`` it."""
 
     def __init__(self, calibration: Calibration, config: Config, directory: Path,
                  inputs: list[dict[str, Any]], created: str) -> None:

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page report.html, which loads nothing from the network."""
+"""
+The page report.html: figures and tables of a calibration, by a jinja2 template.
+
+It loads nothing from the network. If it cannot be drawn, a page that states the error replaces it.
+"""
 
 from collections import Counter
 from html import escape
@@ -12,9 +16,15 @@ from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, REASON_ESTIMATES
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.plot_style import apply_style, Drawing
-from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
+from odocal_ros.output.summary import driven_text, MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
-from odocal_ros.output.value_text import iso, join_same_reasons, known, length, time_span
+from odocal_ros.output.value_text import (
+    duration_text,
+    finite_estimate,
+    iso,
+    join_same_reasons,
+    length_text,
+)
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
@@ -79,7 +89,7 @@ def _context(calibration: result.Calibration, config: Config,
         'created': date_text(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
-        'driven': driven(legs),
+        'driven': driven_text(legs),
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
         'why': _main_reason(calibration.reasons), 'rotation': rotation_text(calibration),
@@ -151,12 +161,13 @@ def _draw_figures(
 def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
          several: bool) -> dict[str, Any]:
     """Return the section of a leg; several : the page has more legs."""
-    rows, findings = tables.left_out(leg)
+    rows, findings = tables.unused_data(leg)
     methods = _by_number_of_values(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
             'start': date_text(iso(leg.start_ns)), 'stop': date_text(iso(leg.stop_ns)),
             'figures': figures,
-            'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),
+            'facts': (('distance', length_text(leg.distance)),
+                      ('duration', duration_text(leg.duration)),
                       ('IMU samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
@@ -175,5 +186,5 @@ def _smoothed(leg: result.LegResult) -> dict[str, Any]:
 
 def _relative(leg: result.LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
-    scale = known(leg_estimates(leg), 'scale_factor')
+    scale = finite_estimate(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None

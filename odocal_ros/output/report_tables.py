@@ -20,7 +20,7 @@ LABELS = tables.LABELS | {'scale_ratio': 'ratio to nominal',
                           'scale_factor_as_sent': 'scale factor of the speed as sent'}
 UNDETERMINED = 'not determined'
 # reasons about the data of a leg
-OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
+DATA_CODES = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
            Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
            Code.WHEEL_COUNTERS_DIFFER, Code.ODOMETER_CHOSEN, Code.DELAY_SEEN,
@@ -47,8 +47,9 @@ def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
     if unit == 's':
         return f'{texts.with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
     if name.startswith('scale'):
-        relative = texts.share(sigma / abs(value)) if sigma and value else ''
-        other = texts.inverse(estimate) if unit in texts.COUNTS else texts.beyond_one(value, sigma)
+        relative = texts.relative_text(sigma / abs(value)) if sigma and value else ''
+        other = (texts.inverse_text(estimate) if unit in texts.COUNTS
+                 else texts.deviation_text(value, sigma))
         return native, other, relative
     return native, '', ''
 
@@ -57,7 +58,7 @@ def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
     rows, local = [], result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
-        estimate = texts.known(calibration.estimates, name)
+        estimate = texts.finite_estimate(calibration.estimates, name)
         if estimate.value is None:
             continue
         first, other, relative = in_units(name, estimate)
@@ -73,12 +74,13 @@ def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     lines = []
     for name, text in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
                        ('pitch_mounting_angle', 'pitch mounting')):
-        first, other, relative = in_units(name, texts.known(calibration.estimates, name))
+        first, other, relative = in_units(name, texts.finite_estimate(calibration.estimates, name))
         lines.append((text, first, f'± {relative}' if relative else other))
-    for longest in tables.in_pieces(calibration.legs)[-1:]:
-        lines.append((f'track error in {texts.length(longest.length)}',
-                      texts.length(longest.after),
-                      f'{tables.before_label(calibration.legs)}: {texts.length(longest.before)}'))
+    for longest in tables.pooled_per_distance(calibration.legs)[-1:]:
+        lines.append((f'track error in {texts.length_text(longest.length)}',
+                      texts.length_text(longest.after),
+                      f'{tables.before_label(calibration.legs)}: '
+                      f'{texts.length_text(longest.before)}'))
     return lines
 
 
@@ -88,7 +90,8 @@ def undetermined(calibration: result.Calibration) -> list[str]:
     local = result.has_local_positions(calibration.legs)
     for name in calibration.estimates:
         # the ratio requires a nominal scale, not another drive
-        if texts.known(calibration.estimates, name).value is None and name != 'scale_ratio':
+        value = texts.finite_estimate(calibration.estimates, name).value
+        if value is None and name != 'scale_ratio':
             quantity, _, axis = name.rpartition('_')
             has_axis = axis in ('x', 'y', 'z')
             axes.setdefault(label(quantity if has_axis else name, local), []).extend(
@@ -102,12 +105,12 @@ def method_table(methods: dict[str, result.MethodResult],
     if not methods:
         return None
     names = dict.fromkeys(n for m in methods.values() for n in m.estimates if n != 'scale_ratio'
-                          or texts.known(m.estimates, n).value is not None)
+                          or texts.finite_estimate(m.estimates, n).value is not None)
     rows = []
     for name in names:
         cells = []
         for method in methods.values():
-            first, other, _ = in_units(name, texts.known(method.estimates, name))
+            first, other, _ = in_units(name, texts.finite_estimate(method.estimates, name))
             cells.append(('-', '') if name not in method.estimates else (first, other))
         rows.append((label(name, result.has_local_positions(legs)), cells))
     return {'heads': [label(m) for m in methods],
@@ -125,8 +128,8 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
     table = method.details.get('budget') or {}
     table = {s: row for s, row in table.items() if isinstance(row, dict)}
     names = [n for n in dict.fromkeys(k for row in table.values() for k in row if k != 'shared')
-             if texts.known(method.estimates, n).value is not None]
-    heads, factors = zip(*(_column(n, texts.known(method.estimates, n)) for n in names),
+             if texts.finite_estimate(method.estimates, n).value is not None]
+    heads, factors = zip(*(_column(n, texts.finite_estimate(method.estimates, n)) for n in names),
                          strict=True) if names else ((), ())
     variances = [sum(_number(row, n)**2 for row in table.values()) for n in names]
     rows, small = [], []
@@ -161,7 +164,7 @@ def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:
     return f'{label(name)}, {unit}', factor
 
 
-def left_out(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
+def unused_data(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
     """Return the unused fixes, counted by reason, and the findings about the leg's data."""
     rows = []
     if leg.evidence is not None:
@@ -176,7 +179,7 @@ def left_out(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]
                          f'{reason}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
     elif leg.rejected_fixes:
         rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
-    return rows, [r for r in leg.reasons if r.code in OF_DATA]
+    return rows, [r for r in leg.reasons if r.code in DATA_CODES]
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str]]:

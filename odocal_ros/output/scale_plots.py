@@ -14,7 +14,7 @@ from odocal_ros.calib.scale_variation import SpeedScale
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.summary import DEG
-from odocal_ros.output.value_text import ANGLES, known, with_sigma
+from odocal_ros.output.value_text import ANGLES, finite_estimate, with_sigma
 
 STYLES = (('o', style.BLUE), ('s', style.RED), ('^', style.GREEN), ('D', style.PINK),
           ('v', 'black'), ('P', style.GREY))
@@ -97,9 +97,9 @@ def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing
 def _scale_panel(calibration: Calibration,
                  rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
     """Return the panel of scales, rows of (text, method, estimates), relative to the result."""
-    result = known(calibration.estimates, 'scale_factor')
+    result = finite_estimate(calibration.estimates, 'scale_factor')
     points = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
-              for text, method, e in ((text, method, known(estimates, 'scale_factor'))
+              for text, method, e in ((text, method, finite_estimate(estimates, 'scale_factor'))
                                       for text, method, estimates in rows)
               if e.value is not None and result.value]
     factor, unit = relative_unit(max((abs(x) + sigma for _, _, x, sigma in points), default=0.0))
@@ -111,10 +111,10 @@ def _scale_panel(calibration: Calibration,
 def _angle_panel(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]],
                  name: str) -> Panel:
     """Return the panel of a mounting angle, deg."""
-    result = known(calibration.estimates, name)
+    result = finite_estimate(calibration.estimates, name)
     points = []
     for text, method, estimates in rows:
-        e = known(estimates, name)
+        e = finite_estimate(estimates, name)
         if e.value is not None:
             points.append((text, method, e.value * DEG, (e.sigma or 0.0) * DEG))
     band = None if result.value is None else (result.value * DEG, (result.sigma or 0.0) * DEG)

@@ -38,13 +38,13 @@ def screen(calibration: result.Calibration, styled: bool = False, width: int = t
     methods that repeat the values.
     """
     for small, notes, budget in SHORTER[-1:] if brief else SHORTER:
-        parts = [_head(calibration, styled), _values(calibration, width),
+        parts = [_head_lines(calibration, styled), _value_lines(calibration, width),
                  [] if brief and len(calibration.legs) == 1 else _leg_table(calibration.legs,
                                                                             width),
                  [] if brief else tables.method_lines(calibration),
                  tables.search_lines(calibration.legs),
                  tables.track_lines(calibration.legs, width),
-                 _budget(calibration, width, small) if budget else [],
+                 _budget_lines(calibration, width, small) if budget else [],
                  texts.reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
         if rows is None or text.count('\n') < rows:
@@ -61,62 +61,63 @@ def sentence(calibration: result.Calibration) -> str:
 
 def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
-    scale = texts.known(estimates, 'scale_factor')
+    scale = texts.finite_estimate(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
         parts.append('scale factor not determined')
     else:
-        counts = f' ({texts.inverse(scale)})' if scale.unit in texts.COUNTS else ''
+        counts = f' ({texts.inverse_text(scale)})' if scale.unit in texts.COUNTS else ''
         parts.append(f'scale factor {texts.with_unit(scale)}{counts}')
     labels = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
     for name, label in (labels | {'track_width': 'track width'}).items():
-        wheel = texts.known(estimates, name)
+        wheel = texts.finite_estimate(estimates, name)
         if wheel.value is not None:
             parts.append(f'{label} {texts.with_unit(wheel)}')
     for name, label in _angles_of(estimates).items():
-        angle = texts.known(estimates, name)
+        angle = texts.finite_estimate(estimates, name)
         parts.append(f'{label} mounting ' + (
             'not determined' if angle.value is None else
             f'{texts.with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
     return ', '.join(parts)
 
 
-def _head(calibration: result.Calibration, styled: bool) -> list[str]:
+def _head_lines(calibration: result.Calibration, styled: bool) -> list[str]:
     verdict = calibration.verdict.value.upper()
     if styled:
         colours = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
         verdict = f'\x1b[1;{colours[calibration.verdict]}m{verdict}\x1b[0m'
-    return [f'{verdict}: {MEANING[calibration.verdict]}', driven(calibration.legs)]
+    return [f'{verdict}: {MEANING[calibration.verdict]}', driven_text(calibration.legs)]
 
 
-def driven(legs: tuple[result.LegResult, ...]) -> str:
+def driven_text(legs: tuple[result.LegResult, ...]) -> str:
     """Return the number of legs, their length and duration, as text."""
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     number = texts.counted(len(legs), 'leg')
-    return f'{number}, {texts.length(distance)} in {texts.time_span(duration)}'
+    return f'{number}, {texts.length_text(distance)} in {texts.duration_text(duration)}'
 
 
-def _values(calibration: result.Calibration, width: int) -> list[str]:
+def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
     """Return a line for each value."""
     estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
-    scale, ratio = (texts.known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
+    scale, ratio = (texts.finite_estimate(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in texts.COUNTS:
-        lines.append(_line('', texts.inverse(scale)))
+        lines.append(_line('', texts.inverse_text(scale)))
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{texts.with_sigma(ratio.value, ratio.sigma)}   '
-                           f'({texts.beyond_one(ratio.value, ratio.sigma)})'))
-    sent = texts.known(estimates, result.AS_SENT)
-    if sent.value is not None:
-        lines.append(_line('  of speed as sent', _scale_text(sent)))
-    lines.append(_path_ratio(calibration, scale, sent))
+                           f'({texts.deviation_text(ratio.value, ratio.sigma)})'))
+    as_sent = texts.finite_estimate(estimates, result.AS_SENT)
+    if as_sent.value is not None:
+        lines.append(_line('  of speed as sent', _scale_text(as_sent)))
+    lines.append(_path_ratio_line(calibration, scale, as_sent))
     for name, label in _angles_of(estimates).items():
-        lines.append(_line(f'{label} mounting', _angle_text(texts.known(estimates, name), width)))
-    lines += _largest_errors(calibration, width)
-    wheels = _wheels(estimates)
+        angle = texts.finite_estimate(estimates, name)
+        lines.append(_line(f'{label} mounting', _angle_text(angle, width)))
+    lines += _largest_error_lines(calibration, width)
+    wheels = _wheel_lines(estimates)
     lines += wheels.values()
     for name in estimates:
-        estimate = texts.known(estimates, name)
+        estimate = texts.finite_estimate(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
                         *wheels) and name[:-2] not in ARMS and estimate.value is not None:
             text = texts.with_unit(estimate)
@@ -124,10 +125,10 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= texts.WIDTH else '')
             lines.append(_line(tables.source_label(name), text))
-    lines += [_arm(estimates, name, result.name_antenna(label, local), width)
+    lines += [_lever_arm_line(estimates, name, result.name_antenna(label, local), width)
               for name, label in ARMS.items()]
-    lines.append(_gyro_scale(calibration))
-    biases = [texts.known(estimates, name) for name in BIASES]
+    lines.append(_gyro_scale_line(calibration))
+    biases = [texts.finite_estimate(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
                           for bias in biases)
@@ -146,16 +147,17 @@ def rotation_text(calibration: result.Calibration, width: int = texts.WIDTH) -> 
 
 def not_estimated(calibration: result.Calibration) -> str:
     """Return the mounting angles that are not estimated; the roll never is."""
-    pitch = texts.known(calibration.estimates, 'pitch_mounting_angle').value
+    pitch = texts.finite_estimate(calibration.estimates, 'pitch_mounting_angle').value
     return 'roll and pitch' if pitch is None else 'roll'
 
 
 def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return the mounting angles that the method estimates; the planar method estimates none."""
-    return {} if texts.known(estimates, 'scale_factor').method == PLANAR else texts.ANGLES
+    method = texts.finite_estimate(estimates, 'scale_factor').method
+    return {} if method == PLANAR else texts.ANGLES
 
 
-def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
+def _wheel_lines(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return factor -> line of the wheel, and position -> '', for more than two wheels."""
     lines: dict[str, str] = {}
     for name in result.wheel_factors(estimates):
@@ -164,18 +166,19 @@ def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
         if any(position in estimates for position in positions):
             shown = [f'{abs(e.value):.3f} m {sides[e.value < 0]}'
                      for position, sides in positions.items()
-                     if (e := texts.known(estimates, position)).value is not None]
+                     if (e := texts.finite_estimate(estimates, position)).value is not None]
             text = '   '.join((texts.with_unit(estimates[name]), *shown))
             lines |= dict.fromkeys(positions, '') | {name: _line(f'wheel {wheel}', text)}
     return lines
 
 
-def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
-                sent: result.Estimate) -> str:
+def _path_ratio_line(calibration: result.Calibration, scale: result.Estimate,
+                     as_sent: result.Estimate) -> str:
     """Return the line that compares the path ratio of the legs with the scale factor."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     path = sum(distance for _, distance in ratios)
-    factor, label = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
+    factor, label = (
+        (scale, 'scale factor') if as_sent.value is None else (as_sent, 'factor as sent'))
     if not factor.value or not path:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / path
@@ -185,9 +188,10 @@ def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
                  f'{100 * (ratio / factor.value - 1):+z.1f} % from the {label}')
 
 
-def _gyro_scale(calibration: result.Calibration) -> str:
+def _gyro_scale_line(calibration: result.Calibration) -> str:
     """Return the factor for the turn rates of the gyro, '' if it is near 1."""
-    method = calibration.methods.get(texts.known(calibration.estimates, 'scale_factor').method)
+    scale = texts.finite_estimate(calibration.estimates, 'scale_factor')
+    method = calibration.methods.get(scale.method)
     error = method.details.get('gyro_scale_z') if method else None
     least_error = 0.005
     if not error or abs(error['value']) < max(least_error, 3 * error['sigma']):
@@ -195,10 +199,11 @@ def _gyro_scale(calibration: result.Calibration) -> str:
     return _line('gyro scale z', texts.with_sigma(1 - error['value'], error['sigma']))
 
 
-def _arm(estimates: dict[str, result.Estimate], arm: str, label: str, width: int) -> str:
+def _lever_arm_line(estimates: dict[str, result.Estimate], arm: str, label: str,
+                    width: int) -> str:
     """Return the line with the known coordinates of a lever arm, '' without any."""
     known_axes = {axis: e for axis in 'xyz'
-                  if (e := texts.known(estimates, f'{arm}_{axis}')).value is not None}
+                  if (e := texts.finite_estimate(estimates, f'{arm}_{axis}')).value is not None}
     shown = ', '.join(texts.with_sigma(e.value, e.sigma, signed=True) for e in known_axes.values())
     note = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= texts.WIDTH)
     axes = ', '.join(known_axes)
@@ -209,11 +214,11 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, label: str, width: int
     return _line(label, f'{shown} m{note}') if known_axes else ''
 
 
-def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
+def _largest_error_lines(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
     largest = []
     for name, short in texts.MAIN_VALUES.items():
-        estimate = texts.known(calibration.estimates, name)
+        estimate = texts.finite_estimate(calibration.estimates, name)
         source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
@@ -234,7 +239,7 @@ def _scale_text(scale: result.Estimate) -> str:
     if scale.value is None:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
-        f'   ({texts.share(scale.sigma / abs(scale.value))})')
+        f'   ({texts.relative_text(scale.sigma / abs(scale.value))})')
     return texts.with_unit(scale) + relative
 
 
@@ -254,27 +259,28 @@ def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     if width < texts.WIDTH:        # without the date, the duration and the number of fixes
         rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
                 for row in rows]
-    return texts.columns(rows) + texts.lines_of_bags(legs, width) if legs else []
+    return texts.table_lines(rows) + texts.lines_of_bags(legs, width) if legs else []
 
 
 def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
     estimates = leg_estimates(leg)
-    scale, yaw = (texts.known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
+    scale, yaw = (texts.finite_estimate(estimates, n)
+                  for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)
-    return (f'{started:%m-%d %H:%M:%S}', texts.length(leg.distance), f'{minutes}:{seconds:02d}',
-            str(leg.fixes),
+    return (f'{started:%m-%d %H:%M:%S}', texts.length_text(leg.distance),
+            f'{minutes}:{seconds:02d}', str(leg.fixes),
             '-' if scale.value is None else texts.with_sigma(scale.value, scale.sigma),
             '-' if yaw.value is None else texts.with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
-def _budget(calibration: result.Calibration, width: int, small: bool) -> list[str]:
+def _budget_lines(calibration: result.Calibration, width: int, small: bool) -> list[str]:
     estimates = calibration.estimates
-    scale = texts.known(estimates, 'scale_factor')
+    scale = texts.finite_estimate(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
     if method is None or not scale.value:
         return []
-    hidden = {name for name in estimates if texts.known(estimates, name).value is None}
+    hidden = {name for name in estimates if texts.finite_estimate(estimates, name).value is None}
     least_share = 0.01    # of a variance: smaller sources have no line
     return tables.budget_lines(method.details.get('budget'), scale.value, least_share, hidden,
                                width, small, result.has_local_positions(calibration.legs))

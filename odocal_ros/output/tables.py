@@ -79,7 +79,7 @@ def _estimate(leg: result.LegResult, calibration: result.Calibration,
               name: str) -> result.Estimate:
     """Return a leg's value by the method that gives the calibration's value, else by any."""
     method = leg.methods.get(calibration.estimates[name].method)
-    return texts.known(leg_estimates(leg) if method is None else method.estimates, name)
+    return texts.finite_estimate(leg_estimates(leg) if method is None else method.estimates, name)
 
 
 def search_lines(legs: tuple[result.LegResult, ...]) -> list[str]:
@@ -131,7 +131,7 @@ def method_lines(calibration: result.Calibration) -> list[str]:
         return []
     rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
     for name, method in methods.items():
-        scale, *angles = (texts.known(method.estimates, n)
+        scale, *angles = (texts.finite_estimate(method.estimates, n)
                           for n in ('scale_factor', *texts.ANGLES))
         rows.append((name, '-' if scale.value is None
                      else texts.with_sigma(scale.value, scale.sigma),
@@ -139,7 +139,7 @@ def method_lines(calibration: result.Calibration) -> list[str]:
                        texts.with_sigma(a.value, a.sigma, math.degrees(1.0), signed=True)
                        for a in angles),
                      shown_verdict(method, calibration.legs) + _refused(method)))
-    return texts.columns(rows)
+    return texts.table_lines(rows)
 
 
 def _refused(method: result.MethodResult) -> str:
@@ -205,7 +205,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
                                  subsequent_indent='    ')
 
 
-def overall(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackCheck | None:
+def pooled_check(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackCheck | None:
     """Return one check for many legs, each (check, fixes), None without one."""
     # rms and mean are pooled over fixes; max, end and percent are those of the worst leg
     known_checks = [(check, n) for check, n in checks if check is not None and n]
@@ -219,7 +219,7 @@ def overall(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackC
            for name in ('max', 'end', 'percent_of_distance')})
 
 
-def in_pieces(legs: Sequence[result.LegResult]) -> list[result.PerDistance]:
+def pooled_per_distance(legs: Sequence[result.LegResult]) -> list[result.PerDistance]:
     """Return the error per distance driven of all legs, pooled over sections."""
     by_distance: dict[float, list[result.PerDistance]] = {}
     for error in (x for leg in legs for x in leg.per_distance):
@@ -243,15 +243,16 @@ def before_label(legs: Sequence[result.LegResult]) -> str:
 def check_table(
         legs: tuple[result.LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
-    pieces = in_pieces(legs)
+    pieces = pooled_per_distance(legs)
     rows = []
     for label, name in zip((before_label(legs), 'as calibrated'), CHECKS, strict=True):
-        check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
+        check = pooled_check([(getattr(leg, name), leg.fixes) for leg in legs])
         if check is not None:
             share = check.percent_of_distance
             rows.append((label, [
-                *(texts.length(getattr(x, name)) for x in pieces), texts.length(check.rms),
-                texts.length(check.max), texts.length(check.mean), texts.length(check.end),
+                *(texts.length_text(distance) for distance in (
+                    *(getattr(x, name) for x in pieces),
+                    check.rms, check.max, check.mean, check.end)),
                 f'{share:.{3 if share < 100 else 0}f} %']))
     heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
              for x in pieces]
@@ -263,6 +264,7 @@ def track_lines(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     heads, rows = check_table(legs)
     if not rows:
         return []
-    most = (width - LABEL) // CELL
-    return [texts.table_row([label, *cells[:most]], [LABEL - 2, *[CELL] * len(cells[:most])])
+    column_count = (width - LABEL) // CELL
+    return [texts.table_row([label, *cells[:column_count]],
+                            [LABEL - 2, *[CELL] * len(cells[:column_count])])
             for label, cells in (('track against fixes', heads), *rows)]

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, reasons and decisions as text: digits by sigma, most severe first."""
+"""
+Numbers, reasons and decisions as text, by the same rules in terminal, report and answers.
+
+The sigma determines the digits of a value; the most severe reasons come first.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,14 +23,14 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
 WIDTH = 98    # judgement: columns
-NONE = Estimate(None, None, '')
+UNKNOWN = Estimate(None, None, '')
 # short names of the main values, in the order of ``calib.budget.PARAMETERS``
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 MAIN_VALUES = {'scale_factor': 'scale', **ANGLES}
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 # definition: the space between a number and its unit
 BEFORE_UNIT = re.compile(r'(?<=\d) (?=%|(?:deg|ppm|Hz|[ckm]?m|m?s|m/s)(?!\w))|(?<=±) ')
-OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
+LEG_PREFIX = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 
 def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
@@ -45,20 +49,20 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
     return f'{value:{"+" if signed else ""}z.{places}f} ± {sigma:.{places}f}'
 
 
-def beyond_one(ratio: float, sigma: float | None) -> str:
+def deviation_text(ratio: float, sigma: float | None) -> str:
     """Return a ratio minus 1 as text, in ppm or per cent."""
     known_sigma = sigma if sigma is not None and math.isfinite(sigma) else 0.0
     factor, unit = relative_unit(ratio - 1, known_sigma)
     return f'{with_sigma(ratio - 1, sigma, factor, signed=True)} {unit}'
 
 
-def share(relative: float) -> str:
+def relative_text(relative: float) -> str:
     """Return a relative sigma as text: two digits, in ppm or per cent."""
     factor, unit = relative_unit(relative)
     return f'{significant(factor * relative)} {unit}'
 
 
-def length(metres: float) -> str:
+def length_text(metres: float) -> str:
     """Return a length with a sensible unit and number of digits."""
     if not math.isfinite(metres):
         return 'unknown'
@@ -71,7 +75,7 @@ def length(metres: float) -> str:
     return f'{metres * 1000:.3g} mm' if metres else '0 m'
 
 
-def time_span(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration with a sensible unit."""
     if seconds < 120:
         return f'{seconds:.1f} s'
@@ -90,20 +94,20 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}{"s" * (number != 1)}'
 
 
-def wrapped(text: str, indent: str = '  ', more: str = '  ', width: int = WIDTH) -> list[str]:
-    """Return a text in lines, all but the first indented by ``more``; units stay at numbers."""
+def wrapped(text: str, indent: str = '  ', hanging: str = '  ', width: int = WIDTH) -> list[str]:
+    """Return a text in lines; all but the first have the hanging indent; units stay at numbers."""
     lines = textwrap.wrap(BEFORE_UNIT.sub('\xa0', text), width, initial_indent=indent,
-                          subsequent_indent=indent + more, break_long_words=False,
+                          subsequent_indent=indent + hanging, break_long_words=False,
                           break_on_hyphens=False)
     return [line.replace('\xa0', ' ') for line in lines]
 
 
-def known(estimates: dict[str, Estimate], name: str) -> Estimate:
+def finite_estimate(estimates: dict[str, Estimate], name: str) -> Estimate:
     """Return an estimate by name, with None for missing or non-finite numbers."""
-    found = estimates.get(name, NONE)
+    estimate = estimates.get(name, UNKNOWN)
     value, sigma = (x if x is not None and math.isfinite(x) else None
-                    for x in (found.value, found.sigma))
-    return replace(found, value=value, sigma=sigma)
+                    for x in (estimate.value, estimate.sigma))
+    return replace(estimate, value=value, sigma=sigma)
 
 
 def with_unit(estimate: Estimate) -> str:
@@ -112,7 +116,7 @@ def with_unit(estimate: Estimate) -> str:
     return with_sigma(estimate.value, estimate.sigma) + unit
 
 
-def inverse(scale: Estimate) -> str:
+def inverse_text(scale: Estimate) -> str:
     """Return the inverse scale: pulses (or rad) per metre with sigma."""
     if not scale.value:
         return ''
@@ -120,7 +124,7 @@ def inverse(scale: Estimate) -> str:
     return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
 
 
-def columns(rows: Sequence[Sequence[str]], indent: str = '  ') -> list[str]:
+def table_lines(rows: Sequence[Sequence[str]], indent: str = '  ') -> list[str]:
     """Return a table with columns as wide as their widest cell, left-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [indent + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
@@ -138,12 +142,12 @@ def join_same_reasons(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     """Return reasons; those of several legs that differ only in the leg are joined."""
     joined: dict[tuple[Any, ...], list[str]] = {}
     for reason in reasons:
-        match = OF_LEG.fullmatch(reason.text)
+        match = LEG_PREFIX.fullmatch(reason.text)
         number, text = match.groups() if match else ('', reason.text)
         joined.setdefault((replace(reason, text=text), bool(match)), []).append(number)
     by_code: dict[object, list[tuple[Reason, list[str]]]] = {}
-    for (reason, of_leg), numbers in joined.items():
-        by_code.setdefault(reason.code if of_leg else reason, []).append((reason, numbers))
+    for (reason, has_leg), numbers in joined.items():
+        by_code.setdefault(reason.code if has_leg else reason, []).append((reason, numbers))
     return tuple(reason for group in by_code.values() for reason in _name_legs(group))
 
 
@@ -154,13 +158,13 @@ def _name_legs(group: list[tuple[Reason, list[str]]]) -> list[Reason]:
         return [reason]
     most_listed = 2    # different texts of a code; of more, the first one is shown
     if len(group) <= most_listed:
-        return [replace(one, text=f'{_legs(of_one)}: {one.text}') for one, of_one in group]
-    all_legs = sorted({int(n) for _, of_one in group for n in of_one})
-    return [replace(reason, text=f'{_legs(list(map(str, all_legs)))}; of leg {numbers[0]}: '
+        return [replace(one, text=f'{_legs_text(legs)}: {one.text}') for one, legs in group]
+    all_legs = sorted({int(n) for _, legs in group for n in legs})
+    return [replace(reason, text=f'{_legs_text(list(map(str, all_legs)))}; of leg {numbers[0]}: '
                                  f'{reason.text}')]
 
 
-def _legs(numbers: list[str]) -> str:
+def _legs_text(numbers: list[str]) -> str:
     """Return increasing leg numbers as text."""
     if len(numbers) == 1:
         return f'leg {numbers[0]}'
@@ -179,12 +183,12 @@ def _legs(numbers: list[str]) -> str:
 
 def lines_of_bags(legs: tuple[LegResult, ...], width: int) -> list[str]:
     """Return the text that lists the legs of each bag, empty for a single bag."""
-    of_bag: dict[str, list[str]] = {}
+    legs_by_bag: dict[str, list[str]] = {}
     for number, leg in enumerate(legs, 1):
-        of_bag.setdefault(leg.bag, []).append(str(number))
-    if len(of_bag) < 2:
+        legs_by_bag.setdefault(leg.bag, []).append(str(number))
+    if len(legs_by_bag) < 2:
         return []
-    listed = '; '.join(f'{_legs(numbers)}: {bag}' for bag, numbers in of_bag.items())
+    listed = '; '.join(f'{_legs_text(numbers)}: {bag}' for bag, numbers in legs_by_bag.items())
     return wrapped(listed, '  ', '   ', width)
 
 
@@ -218,13 +222,14 @@ def accept_line(calibration: Calibration, acceptance: Acceptance, config: Config
 
 def accept_words(acceptance: Acceptance) -> list[str]:
     """Return the decision, a line on each value, the cause and the action."""
-    lines = [acceptance.decision.value, *(f'  {_value(entry)}' for entry in acceptance.values)]
+    lines = [acceptance.decision.value]
+    lines += [f'  {_decision_text(entry)}' for entry in acceptance.values]
     if acceptance.why:
         lines.append(f'  {acceptance.why}')
     return lines + ([f'  -> {acceptance.remedy}'] if acceptance.remedy else [])
 
 
-def _value(entry: ValueDecision) -> str:
+def _decision_text(entry: ValueDecision) -> str:
     e, angle = entry.estimate, entry.estimate.unit == 'rad'
     factor = math.degrees(1.0) if angle else 1.0
     unit = ' deg' if angle else f' {e.unit}' * (e.unit not in ('', '1'))

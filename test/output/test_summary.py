@@ -14,12 +14,12 @@ import pytest
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
 from odocal_ros.output.report_tables import value_rows
 from odocal_ros.output.summary import screen, sentence
-from odocal_ros.output.tables import budget_lines, overall, source_label
+from odocal_ros.output.tables import budget_lines, pooled_check, source_label
 from odocal_ros.output.value_text import (
-    beyond_one,
+    deviation_text,
+    duration_text,
     join_same_reasons,
-    length,
-    time_span,
+    length_text,
     with_sigma,
     wrapped,
 )
@@ -56,17 +56,17 @@ def test_digits_stop_where_the_sigma_begins(value, sigma, text):
 def test_figures_have_the_digits_signs_and_units_asked_for():
     assert with_sigma(0.0174533, 5e-5, math.degrees(1), signed=True) == '+1.0000 ± 0.0029'
     assert with_sigma(-0.0174533, None, math.degrees(1), signed=True) == '-1'
-    assert [length(x) for x in (11200.3, 1004.2, 12.345, 0.09, 0.0, math.nan)] == [
+    assert [length_text(x) for x in (11200.3, 1004.2, 12.345, 0.09, 0.0, math.nan)] == [
         '11.20 km', '1004 m', '12.35 m', '90 mm', '0 m', 'unknown']
-    assert [time_span(t) for t in (59.96, 600.0, 3600.0, 7325.0)] == [
+    assert [duration_text(t) for t in (59.96, 600.0, 3600.0, 7325.0)] == [
         '60.0 s', '10 min 00 s', '1 h 00 min', '2 h 02 min']
     assert with_sigma(-32050.0, 15191.0) == '-32000 ± 15000'
     assert with_sigma(-1e-4, 0.5) == '0.00 ± 0.50'
     assert with_sigma(1234.5, 560.0) == '1230 ± 560'
-    assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
-    assert beyond_one(1.065044, 78e-6) == '+6.5044 ± 0.0078 %'
-    assert beyond_one(1.005044, 78e-6) == '+5044 ± 78 ppm'
-    assert beyond_one(1.1, None) == '+10 %'
+    assert deviation_text(0.968, 0.0152) == '-3.2 ± 1.5 %'
+    assert deviation_text(1.065044, 78e-6) == '+6.5044 ± 0.0078 %'
+    assert deviation_text(1.005044, 78e-6) == '+5044 ± 78 ppm'
+    assert deviation_text(1.1, None) == '+10 %'
 
 
 def test_a_unit_stays_at_its_number():
@@ -148,12 +148,12 @@ def test_nothing_found_is_said_without_nan(nothing, good):
 
 def test_legs_pool_their_checks_over_fixes():
     a, b = TrackCheck(1.0, 5.0, 0.5, 2.0, 0.1), TrackCheck(3.0, 4.0, 1.5, 3.0, 0.05)
-    both = overall([(a, 3), (None, 100), (b, 1)])
+    both = pooled_check([(a, 3), (None, 100), (b, 1)])
     assert both.rms == pytest.approx(math.sqrt((3 * 1.0 + 9.0) / 4), rel=1e-15)
     assert both.mean == pytest.approx((3 * 0.5 + 1.5) / 4, rel=1e-15)
     assert (both.max, both.end, both.percent_of_distance) == (5.0, 3.0, 0.1)
-    assert overall([(None, 5)]) is None
-    assert overall([]) is None
+    assert pooled_check([(None, 5)]) is None
+    assert pooled_check([]) is None
 
 
 def test_the_heading_error_of_wheels_is_said_to_hold_the_mounting(good):

@@ -16,7 +16,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import BadConfig
 from odocal_ros.output import program_files
 from odocal_ros.output.files import as_json
-from odocal_ros.output.program_files import framed
+from odocal_ros.output.program_files import with_imu_frame
 from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.reasons import Code
 from odocal_ros.safe_io import atomic_files, text_formats
@@ -41,7 +41,7 @@ def calibration():
 
 
 def texts(frame='imu_link', bag='drive', config=None):
-    made, config = framed(calibration(), config or Config(), frame)
+    made, config = with_imu_frame(calibration(), config or Config(), frame)
     inputs = [{'bag': bag, 'sha256': None, 'topics': {}}]
     content = as_json(made, config, inputs, '2026-01-02T03:04:05+00:00')
     return made, program_files.texts(made, config, content)
@@ -157,7 +157,7 @@ def test_no_cell_of_a_spreadsheet_is_a_formula():
 
 def test_a_frame_that_nobody_names_leaves_all_as_it_is():
     made = calibration()
-    assert framed(made, Config(), '') == (made, Config())
+    assert with_imu_frame(made, Config(), '') == (made, Config())
 
 
 def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
