@@ -62,14 +62,13 @@ class Code(Enum):
     CLOCKS_DRIFT = NOTE, ('Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with '
                           'one clock. The drift matters to all software that combines them.')
     DELAY_SEEN = NOTE, ('Apply the same offset in every other program that combines these '
-                        'sensors. In odocal it improves the two-point method most.')
+                        'sensors. In odocal, set it for the two-point method.')
     ODOMETER_LATE = NOTE, ('Publish the counter with a header stamped at the time of reading, or '
                            'reduce bus or CPU load. The late messages were moved back to their '
                            'estimated times.')
-    COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg. Travel across the reset '
-                              'was interpolated from the adjacent speed.')
-    COUNTER_ROLLOVER = NOTE, ('No action needed: the rollover was removed by odometer.wrap or '
-                              'the integer type.')
+    COUNTER_RESET = CAUTION, 'Keep the encoder and its counter powered during a leg.'
+    COUNTER_ROLLOVER = NOTE, ('No action needed. The modulus is odometer.wrap or that of the '
+                              'integer type.')
     SPEED_COARSE = NOTE, ('If available, use wheel pulses or a finer speed signal of the same '
                           'bus. The smoother reduces this error: it uses the step transitions.')
     SPEED_ON_CHANGE = NOTE, ('If available, use wheel pulses or a speed that is published at a '
@@ -84,8 +83,7 @@ class Code(Enum):
                                  'the IMU x axis points backwards, change the yaw of '
                                  'imu.mounting_rpy by 3.141592654 rad instead, or set '
                                  'imu.nominal_yaw.')
-    ODOMETER_STILL = REJECT, ('Check the wheel sensor and the odometer topic: the fixes move, '
-                              'but the counter does not.')
+    ODOMETER_STILL = REJECT, 'Check the wheel sensor, its wiring and the odometer topic.'
     SEVERAL_IMUS = REJECT, ('Set imu.frame_id to the IMU to calibrate, or publish each IMU on '
                             'its own topic.')
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
@@ -133,13 +131,14 @@ class Code(Enum):
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark. Level, gyro '
                               'bias and heading are then measured at rest.')
-    LEG_TOO_SHORT = REJECT, ('Drive farther between the marks. The limit is leg.min_distance, '
-                              'without GNSS reference.min_distance.')
+    LEG_TOO_SHORT = REJECT, ('Drive farther between the marks. The limit is leg.min_distance, or '
+                              'reference.min_distance without GNSS.')
     CHORD_TOO_SHORT = REJECT, ('End the leg far from its start, or mark a straight section with '
                                '--leg. The two-point method only uses the line from start to end.')
     SPEED_TOO_LOW = CAUTION, ('Drive faster than leg.min_speed in part of the leg. If the vehicle '
                               'is always this slow, set leg.min_speed below its usual speed.')
-    LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight section for the two-point method.'
+    LEG_NOT_STRAIGHT = NOTE, ('No action needed for the smoother. For the two-point method, mark '
+                              'a straight section with --leg.')
     TRACK_MISMATCH = REJECT, ('Likely causes: wheel slip, a wrong gyro axis or unit, or bad '
                               'fixes. Check them with odocal inspect, then drive again on a firm '
                               'road under open sky.')
@@ -229,12 +228,12 @@ class Code(Enum):
     MODEL_MISMATCH = CAUTION, ('The printed action depends on the deviation. Likely causes: slip, '
                                'bad fixes, lever arms, delays, the unit of heights, a wrong '
                                'external heading, slopes.')
-    METHOD_REJECTED = CAUTION, ('Follow the remedy of the reason named. The values come from '
+    METHOD_REJECTED = CAUTION, ('Follow the action of the reason named. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
                              'affected.')
-    METHODS_DISAGREE = CAUTION, ('Check the likely cause in the text. Drive again with stops at '
-                                 'both marks and turns in between.')
+    METHODS_DISAGREE = CAUTION, ('Check the likely cause above. Drive again with stops at both '
+                                 'marks and turns in between.')
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '
                               'slip (scale), a moved IMU (angles), driver timing (delays), bad '
@@ -243,8 +242,7 @@ class Code(Enum):
                               'from the change on.')
     LEGS_UNLIKE = REJECT, ('Combine only legs of one vehicle, one mounting, and the same topics '
                            'and settings. Calibrate the other legs separately.')
-    LEGS_OVERLAP = CAUTION, ('Give each recording once. Legs that overlap in time are not '
-                             'independent.')
+    LEGS_OVERLAP = CAUTION, 'Give each recording once, and legs that do not overlap in time.'
     LEG_REJECTED = CAUTION, 'See the reasons of this leg. Drive it again or leave it out.'
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs. The required number is verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'

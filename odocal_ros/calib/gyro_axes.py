@@ -25,6 +25,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.gravity_fit import gravity_fit
 from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, LocatedFixes
+from odocal_ros.settings.levels import RAD_PER_DEG
 
 # definition: coefficients of ``gravity_fit`` of correct axes, and of mirrored or swapped ones
 CORRECT = np.array([1.0, 1j, 0.0])
@@ -237,8 +238,10 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
         return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '
                        'the fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
-    corrected_scale = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
-    return (Reason(Code.IMU_UNITS, f'turns by the gyro are {ratio:#.3g} times those by the '
-                   'fixes' + ', typical for deg/s' * degrees,
-                   f'Set imu.gyro_scale to {corrected_scale:.10g}, or correct the unit in the IMU '
-                   'driver.'),)
+    text = f'turns by the gyro are {ratio:#.3g} times those by the fixes'
+    if degrees:
+        return (Reason(Code.IMU_UNITS, text + ', typical for deg/s',
+                       f'Set imu.gyro_scale to {gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
+                       '(REP-145).'),)
+    return (Reason(Code.IMU_UNITS, text, 'Check unit and range of the gyro. If all its rates are '
+                   f'wrong by this factor, set imu.gyro_scale to {gyro_scale / ratio:.4g}.'),)

@@ -28,6 +28,7 @@ BLOCK_LAGS = (1, 3)
 # judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 CORRELATIONS = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one side may differ
+MOST_DECODING = 20.0    # judgement: largest factor between units, gears or decodings of a counter
 WINDOWS = 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0     # s, definition
 # judgement: parts of the leg for a sigma; windows for a result
 LEG_PARTS, FEWEST_WINDOWS = 8, 12
@@ -167,10 +168,16 @@ def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats)
         return ()
     _, k, factor = min(found)
     begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], fix_distance, t_fix)
-    return (Reason(Code.TRACK_MISMATCH, 'the odometer scale changes: it counts '
-                   f'{factor:.2f} times as much per metre after t = {begin:.0f} to {end:.0f} s as '
-                   'before', 'Check the driver for a change of decoding (x1, x2, x4), unit or '
-                   'gear. Mark a leg on one side of the change with --leg.'),)
+    text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
+    if not 1 / MOST_DECODING < factor < MOST_DECODING:
+        return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
+                       'per metre between fixes than before. Likely cause: the position or the '
+                       'counter is frozen', 'Check the receiver (static hold) and the counter. '
+                       'Mark a leg on one side of the change with --leg.'),)
+    return (Reason(Code.TRACK_MISMATCH, text + f'{factor:.2f} times as much per metre between '
+                   'fixes as before. Likely cause: a change of decoding (x1, x2, x4), unit or '
+                   'gear', 'Check the odometer driver, and the fixes on both sides. Mark a leg on '
+                   'one side of the change with --leg.'),)
 
 
 def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:

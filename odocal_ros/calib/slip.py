@@ -223,7 +223,7 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
         found += (Reason(
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+z.2f} m at t = {t[0]:.1f} '
-            's: the wheel spun or slid'),)
+            's. Likely cause: the wheel spun or slid'),)
     return (*found, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
 
 

@@ -18,7 +18,7 @@ from odocal_ros.fleet.statistics import FEWEST_VEHICLES, Population, population
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
-from odocal_ros.output.value_text import MAIN_VALUES, with_sigma
+from odocal_ros.output.value_text import counted, MAIN_VALUES, with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
 MOST_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
@@ -163,7 +163,8 @@ def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
     when = f', {min(dates):%Y-%m-%d} to {max(dates):%Y-%m-%d}' if dates else ''
     bags, failed, legs = (sum(row[key] for row in vehicles)
                           for key in ('bags', 'bags_failed', 'legs'))
-    return (f'{len(vehicles)} vehicles, {bags} bags ({failed} failed), {legs} legs, '
+    return (f'{counted(len(vehicles), "vehicle")}, {counted(bags, "bag")} ({failed} failed), '
+            f'{counted(legs, "leg")}, '
             f'{sum(row["distance_km"] for row in vehicles):.0f} km in '
             f'{sum(row["driven_h"] for row in vehicles):.1f} h{when}; odocal_ros {__version__}')
 

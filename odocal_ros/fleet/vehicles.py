@@ -152,6 +152,11 @@ class Vehicle:
     inputs: tuple[dict[str, Any], ...] = ()    # entries of its bags in calibration.json
 
 
+def _failure(bag: str, reason: str) -> str:
+    """Return the reason of a failed bag with the name of the bag, once."""
+    return f'{bag}: {reason.removeprefix(f"{bag}: ")}'
+
+
 def vehicle_of(job: VehicleJob) -> Vehicle:
     """Return the result of a vehicle from the rows of its bags."""
     rows = [row for row in read_rows(job.rows) if row.vehicle == job.vehicle]
@@ -159,7 +164,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     failed = [row for row in rows if row.status != DONE]
     row = {'vehicle': job.vehicle, 'model': next((b.model for b in job.bags if b.model), ''),
            'bags': len(rows), 'bags_failed': len(failed),
-           'failures': '; '.join(f'{Path(r.bag).name}: {r.reason}' for r in failed[:5])}
+           'failures': '; '.join(_failure(Path(r.bag).name, r.reason) for r in failed[:5])}
     driven = driven_legs(done, {bag.bag: bag for bag in job.bags})
     if not driven:
         limits = with_settings(Config(), job.settings).accept.limits

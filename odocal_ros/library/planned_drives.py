@@ -53,9 +53,9 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
                        f'the limits are {most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h')
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
-        raise BadUsage(f'--turns {turns}: required: 0 to {int(cruise / turn_time)}; each turn '
-                       f'takes {turn_time:g} s of the {cruise:.0f} s at full speed. Use a longer '
-                       '--distance or fewer turns')
+        raise BadUsage(f'--turns {turns}: the limit is {int(cruise / turn_time)}: a turn takes '
+                       f'{turn_time:g} s, and this drive is at full speed for {cruise:.0f} s. Use '
+                       'fewer turns or a longer --distance')
     step = max(DRIVE_STEP, duration / 20_000)
     t = np.linspace(0.0, duration, max(2, math.ceil(duration / step) + 1))
     knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])

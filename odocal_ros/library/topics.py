@@ -214,7 +214,7 @@ def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
     if slot == 'fix':
         return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
-    allowed = ' or '.join(types) if len(types) < 3 else 'an odometer type'
+    allowed = ' or '.join(types) if len(types) < 3 else 'counts, angles or speeds'
     used = [topic for topic in chosen.values() if topics[topic].msgtype in types]
     except_for = ' besides the IMU' if slot == 'heading' else (
         f' besides {", ".join(used)}' if used else '')

@@ -6,7 +6,6 @@
 from argparse import ArgumentParser, Namespace
 from functools import partial
 from importlib import import_module
-import math
 import sys
 
 from odocal_ros.errors import BadUsage
@@ -46,6 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Show the panel until Ctrl-C."""
     try:
+        from rich import print as print_panel
         from rich.live import Live
         from rich.panel import Panel
 
@@ -54,14 +54,14 @@ def run(args: Namespace) -> int:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '
                        f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
+    if args.once:
+        with StatusListener(args.node, WAIT_S) as listener:
+            for level, status, hint in listener:
+                print_panel(panel(level, args.node, status, hint))
+                return 0
+        raise BadUsage(f'no status on {args.node}/status for {WAIT_S:g} s: {START_IT}')
     waiting = Panel(f'no status on {args.node}/status yet: {START_IT}', title=args.node)
-    wait_s = WAIT_S if args.once else math.inf
-    with StatusListener(args.node, wait_s) as listener, Live(
-            waiting, auto_refresh=False) as shown:
+    with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
         for level, status, hint in listener:
             shown.update(panel(level, args.node, status, hint), refresh=True)
-            if args.once:
-                return 0
-    if args.once:
-        raise BadUsage(f'no status on {args.node}/status for {WAIT_S:g} s: {START_IT}')
     return 0

@@ -14,7 +14,9 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from rich.console import Group
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
@@ -23,6 +25,7 @@ from rich.text import Text
 from std_msgs.msg import String
 
 from odocal_ros.calib.number_text import relative_unit
+from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.forecast import PREDICTED_REST_S, three_digits
 from odocal_ros.live.messages import LATCHED
 from odocal_ros.output.value_text import with_sigma
@@ -114,6 +117,12 @@ class StatusListener:
 
     def __init__(self, node_name: str, wait_s: float = math.inf) -> None:
         """End the iteration if no status has come for ``wait_s`` s."""
+        name = f'/{node_name.strip("/")}'
+        try:
+            validate_full_topic_name(f'{name}/status')
+        except NameValidationException:
+            raise BadUsage(f"'{node_name}' is not the name of a node; ros2 node list shows the "
+                           'names') from None
         self._until = time.monotonic() + wait_s
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
@@ -122,7 +131,6 @@ class StatusListener:
         self._executor.add_node(self._node)
         self._status: DiagnosticArray | None = None
         self._hint: str | None = None
-        name = f'/{node_name.strip("/")}'
         self._node.create_subscription(DiagnosticArray, f'{name}/status', self._receive, LATCHED)
         self._node.create_subscription(String, f'{name}/hint', self._receive_hint, LATCHED)
 

@@ -239,7 +239,7 @@ def _findings(content: dict[str, Any]) -> list[str]:
     if not content['findings']:
         return ['all data for a calibration is available'] if content['command'] else []
     lines = []
-    for method, title in ((None, 'before calibrating (counts of the whole recording)'), (
+    for method, title in ((None, 'before calibrating (counts: the time that all topics cover)'), (
             'two_point', 'for the two-point method only; the smoother is not affected')):
         reasons = [reason for reason in content['findings'] if reason['method'] == method]
         lines += [title] * bool(reasons)
@@ -251,7 +251,7 @@ def _findings(content: dict[str, Any]) -> list[str]:
 def _command(content: dict[str, Any]) -> list[str]:
     lines = []
     if content['replay_error']:
-        lines.append('replay without options fails:')
+        lines.append('odocal replay without options stops with:')
         lines += [part for line in content['replay_error'].split('\n')
                   for part in wrapped(line.strip(), '  ' + '  ' * line.startswith(' '))]
     if content['command']:

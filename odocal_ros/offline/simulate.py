@@ -70,8 +70,8 @@ DEGREES = {
     'slope': 'steepest slope of the road (default 0: level)',
     'latitude': 'latitude of the start (default 40)',
     'longitude': 'longitude of the start (default 116)',
-    'orientation_sigma': 'publish the IMU orientation with a heading error of this size',
-    'heading_sigma': 'publish the topic /heading with an error of this size',
+    'orientation_sigma': 'publish the IMU orientation with a constant heading error, 1 sigma',
+    'heading_sigma': 'publish the topic /heading with a constant error, 1 sigma',
 }
 LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
 

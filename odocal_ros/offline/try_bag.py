@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         labels = ', '.join(INPUTS[slot].label for slot in missing)
         raise BadData(f'{args.bag}: no usable topic for: {labels}; '
                       + '; '.join(_missing_action(slot, content['topics']) for slot in missing))
-    options = [*_suggested_options(content['command'], bool(args.leg)), *_user_options(args)]
+    options = [*_suggested_options(content['command'], args), *_user_options(args)]
     print_text('\n'.join(_overview(content, choices, options, args.settings)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
@@ -154,11 +154,14 @@ def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:
         print_text(f'enter a number from 1 to {len(names)}')
 
 
-def _suggested_options(replay_command: str, without_legs: bool) -> list[str]:
-    """Return the replay options that inspect suggests, each followed by its value."""
+def _suggested_options(replay_command: str, args: argparse.Namespace) -> list[str]:
+    """Return the options that inspect suggests and the user has not given, with their values."""
     words = shlex.split(replay_command)[3:]
-    pairs = zip(words[::2], words[1::2], strict=True)
-    return [word for pair in pairs if not (without_legs and pair[0] == '--leg') for word in pair]
+    given = {text.partition('=')[0] for text in args.settings}
+    return [word for option, value in zip(words[::2], words[1::2], strict=True)
+            if not (option == '--leg' and args.leg)
+            and not (option == '--set' and value.partition('=')[0] in given)
+            for word in (option, value)]
 
 
 def _user_options(args: argparse.Namespace) -> list[str]:

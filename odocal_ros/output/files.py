@@ -177,8 +177,8 @@ class Results:
             yield
         except OSError as error:
             raise BadUsage(
-                f'{self.directory}: results cannot be written ({error.strerror}); choose a folder '
-                'that can (--output, or output.directory of the node)') from None
+                f'{self.directory}: results cannot be written ({error.strerror}); choose a '
+                'writable folder (--output, or output.directory of the node)') from None
 
     @contextmanager
     def name_results_when_interrupted(self) -> Iterator[None]:

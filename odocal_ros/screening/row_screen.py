@@ -24,7 +24,6 @@ LABEL = {slot: one.label for slot, one in INPUTS.items()}
 NO_ROW_CODES = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
                 **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
-UNSTAMPED = 'Set {}.arrival_time to true, or let the driver stamp its messages.'
 NO_RECEPTION = ('Drive under open sky if possible: the likely cause is a tunnel, buildings or '
                 'trees. The leg stays valid; missing data increases the uncertainties.')
 
@@ -91,14 +90,21 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
             NO_ROW_CODES[slot],
             f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
             + f': {zero} have no stamp (0)' * (zero > 0),
-            UNSTAMPED.format(INPUTS[slot].clock or slot) * (zero > 0)))
+            _unstamped_remedy(slot) * (zero > 0)))
     return clean, t
+
+
+def _unstamped_remedy(slot: str) -> str:
+    return (f'Set {INPUTS[slot].clock or slot}.arrival_time to true, or let the driver stamp its '
+            'messages.')
 
 
 def _time_text(samples: Samples, index: int, leg: Leg) -> str:
     """Return the time of a row in seconds from the start mark (arrival time without a stamp)."""
-    stamp = samples.stamp_ns[index] if samples.stamp_ns[index] > 0 else samples.received_ns[index]
-    return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
+    stamp = samples.stamp_ns[index]
+    if stamp > 0:
+        return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
+    return f't = {(samples.received_ns[index] - leg.start_ns) * 1e-9:.2f} s (arrival)'
 
 
 def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
@@ -125,7 +131,8 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
             first = int(np.argmax(bad))
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
                                 f'{LABEL[slot]} messages {what}, first at '
-                                f'{_time_text(samples, first, leg)}; dropped'))
+                                f'{_time_text(samples, first, leg)}; dropped',
+                                '' if stamped[first] else _unstamped_remedy(slot)))
     good = stamped & finite
     suspect = _damaged(impossible, good, slot, found,
                        min(glitches.DAMAGED_SHARE * len(impossible), glitches.SEVERAL_ROWS))

@@ -174,12 +174,14 @@ def test_a_change_that_does_not_matter_is_not_reported(constant):
 
 @pytest.mark.core
 @pytest.mark.parametrize(('ratio', 'sigma', 'text'), [
-    ([1.4] * 4 + [0.9] + [0.7] * 5, 1e-3, '2.00 times as much per metre after t = 40 to 50 s'),
+    ([1.4] * 4 + [0.9] + [0.7] * 5, 1e-3, 'after t = 40 to 50 s the odometer counts 2.00 times as '
+     'much per metre'),
     ([0.7] * 4 + [0.9] + [1.4] * 5, 1e-3, '0.50 times'),
+    ([1.0] * 5 + [1e-6] * 5, 1e-3, 'Likely cause: the position or the counter is frozen'),
     ([1.0] * 10, 1e-3, ''), ([1.01] * 5 + [0.99] * 5, 1e-4, ''),
     ([1.05] * 5 + [0.95] * 5, 0.05, ''), ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3, ''),
     (np.linspace(0.9, 1.1, 10), 1e-3, ''), ([1.0] * 5 + [np.nan] * 5, 1e-3, '')],
-    ids=['halved', 'doubled', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
+    ids=['halved', 'doubled', 'frozen', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
 def test_a_counter_that_changes_is_found_with_place_and_factor(ratio, sigma, text):
     """Ten sections of 100 m in 10 s each."""
     edges = np.linspace(0.0, 1000.0, len(ratio) + 1)

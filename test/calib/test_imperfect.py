@@ -180,13 +180,13 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
 
 
 @pytest.mark.parametrize(('set_to', 'found', 'ratio', 'text', 'do'), [
-    ((0.0, 0.0, 1.5), 0.7, 0.1, 'z: set to +1.50 m, estimated +2.20 ± 0.05 m; accounted',
-     'Measure .* z again'),
-    ((0.0, 0.0, 0.0), -0.73, 0.1, 'z: not set, estimated -0.73 ± 0.05 m; accounted',
-     'Measure .* z and set it'),
+    ((0.0, 0.0, 1.5), 0.7, 0.1, 'z: set to +1.50 m, estimated +2.20 ± 0.05 m. The other values',
+     r'Measure .* \(z\) again'),
+    ((0.0, 0.0, 0.0), -0.73, 0.1, 'z: not set, estimated -0.73 ± 0.05 m. The other values',
+     r'Measure .* \(z\) and set it'),
     # the result and the report have no value for it
     ((0.0, 0.0, 0.0), -0.73, 0.5, 'z: not set, estimated -0.73 ± 0.05 m (too uncertain for a '
-     'result); accounted', 'Measure .* z and set it'),
+     'result). The other', r'Measure .* \(z\) and set it'),
     ((0.0, 0.0, 0.0), 9.39, 0.1, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
      'Ignore the estimate')])
 def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, text, do):
@@ -209,7 +209,7 @@ def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
     reason, = remarks._lever_arm_reasons(value, sigma, np.zeros(len(CONSTANTS)), with_settings(
         Config(), {'imu.lever_arm': imu_arm}))
     assert 'odometer.lever_arm x: not set, estimated +1.00' in reason.text
-    assert reason.remedy.startswith('Measure odometer.lever_arm x, y and set it. Axes: ')
+    assert reason.remedy.startswith('Measure odometer.lever_arm (x, y) and set it. Axes: ')
     assert part in reason.remedy
     assert 'Slip in turns' in reason.remedy
     assert 'On z' not in reason.remedy

@@ -63,7 +63,7 @@ def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknow
     for moving, rest, gyro, cause, other in (
             (1e-2, 1e-3, 5e-3, 'vibration: gyro samples vary 10 times as much in motion as at '
              'rest', 'imu.gyro_noise'),
-            (1e-2, 8e-3, 1e-2, 'If this is its normal noise, set imu.gyro_noise to 0.01 '
+            (1e-2, 8e-3, 1e-2, 'If this is normal for this gyro, set imu.gyro_noise to 0.01 '
              '(rad/s/sqrt(Hz)).', 'cause is vibration'),
             (1e-3, 1e-3, 1e-2, 'unknown: single samples vary less', 'at rest it is similar')):
         text = find_noise_cause(noisy(moving, rest), {'gyro': gyro, 'accel': 1.0}, ['gyro'])

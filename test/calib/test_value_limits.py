@@ -199,8 +199,9 @@ class TestCheck:
     @pytest.mark.parametrize(('factor', 'code', 'text'), [
         (1.0, None, ''), (-1.0, Code.GYRO_SIGN, 'ratio -1.'),
         (57.3, Code.IMU_UNITS, 'Set imu.gyro_scale to 0.01745329252'),
-        (14.0, Code.IMU_UNITS, 'Set imu.gyro_scale to 0.07'),
-        (0.3, Code.IMU_UNITS, 'Set imu.gyro_scale to 3.3')])
+        (14.0, Code.IMU_UNITS, 'set imu.gyro_scale to 0.07'),
+        (0.3, Code.IMU_UNITS, 'Check unit and range of the gyro. If all its rates are wrong by '
+         'this factor, set imu.gyro_scale to 3.3')])
     def test_turns_by_gyro_and_by_fixes(self, factor, code, text):
         """Round a slalom of radius 100 m at 10 m/s: the course turns by -+0.1 rad/s."""
         rate = 0.1 * np.sign(np.sin(T_WAY / 10))

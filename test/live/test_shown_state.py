@@ -91,8 +91,14 @@ def test_once_without_a_node_ends(monkeypatch, capsys):
     monkeypatch.setattr(commands, 'WAIT_S', 0.5)
     assert main(['watch', '/nobody', '--once']) == 2
     out, err = capsys.readouterr()
-    assert 'no status on /nobody/status yet' in out
+    assert not out
     assert 'no status on /nobody/status for 0.5 s: start the node' in err
+
+
+def test_a_name_that_no_node_can_have_is_refused(capsys):
+    pytest.importorskip('rich')
+    assert main(['watch', 'not a name', '--once']) == 2
+    assert "'not a name' is not the name of a node; ros2 node list" in capsys.readouterr().err
 
 
 def test_the_bars_are_shares_of_what_is_asked():

@@ -78,6 +78,6 @@ def test_bags_without_any_input(data_dir, capsys, name):
     seen, text = inspect(data_dir / 'reader_bags' / name, capsys)
     assert codes(seen) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
     assert seen['command'] == ''
-    assert 'replay without options fails:\n  no odometer' in text
+    assert 'odocal replay without options stops with:\n  no odometer' in text
     unwrapped = ' '.join(text.split())       # a long path moves the line breaks
     assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)

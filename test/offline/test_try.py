@@ -3,6 +3,7 @@
 
 """odocal try: it takes the likeliest topics, says why, and its command gives the same result."""
 
+import argparse
 from dataclasses import replace
 import io
 import json
@@ -165,10 +166,14 @@ def test_the_rate_of_equal_stamps_is_unknown(tmp_path, monkeypatch, capsys):
     assert json.loads(capsys.readouterr().out)['topics'][0]['rate_hz'] is None
 
 
-def test_a_leg_of_the_user_replaces_the_suggested_ones():
+def test_options_of_the_user_replace_the_suggested_ones():
     command = "odocal replay bag --leg 1:2 --set 'imu.mounting_rpy=[0, 0, 1]' --leg 5:9"
-    assert try_bag._suggested_options(command, True) == ['--set', 'imu.mounting_rpy=[0, 0, 1]']
-    assert try_bag._suggested_options(command, False) == shlex.split(command)[3:]
+    for leg, settings, kept in (
+            (['3:4'], [], ['--set', 'imu.mounting_rpy=[0, 0, 1]']),
+            ([], [], ['--leg', '1:2', '--set', 'imu.mounting_rpy=[0, 0, 1]', '--leg', '5:9']),
+            ([], ['imu.mounting_rpy=[0,0,0]'], ['--leg', '1:2', '--leg', '5:9'])):
+        given = argparse.Namespace(leg=leg, settings=settings)
+        assert try_bag._suggested_options(command, given) == kept
 
 
 @pytest.mark.parametrize('name', ['comma2k19_rav4', 'husky_parking_lot'])

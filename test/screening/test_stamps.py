@@ -22,8 +22,8 @@ def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
     inputs, codes = screen_with(spoilt(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
     n, t = len(leg.odometer.stamp_ns), (leg.odometer.received_ns[100] - leg.start_ns) * 1e-9
     assert codes[Code.BAD_ROWS_DROPPED] == (
-        f'5 of {n} odometer messages have no stamp (zero or negative), first at t = {t:.2f} s; '
-        'dropped')
+        f'5 of {n} odometer messages have no stamp (zero or negative), first at t = {t:.2f} s '
+        '(arrival); dropped')
     assert len(inputs.travel.t) == n - 5
     assert inputs.travel.s[-1] == leg.odometer.value[-1] - leg.odometer.value[0]
 

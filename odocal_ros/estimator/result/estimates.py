@@ -173,7 +173,8 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
     deviation = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[layout.YAW] > limit / factor:
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (
-            'too little acceleration, or too few turns')
+            'too little acceleration, or too few turns' if sigma[layout.YAW] > limit else
+            'the model errors, see the other warnings')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
                               f'{np.rad2deg(factor * sigma[layout.YAW]):.2f} deg{limit_text}. '
                               f'Likely cause: {cause}'))

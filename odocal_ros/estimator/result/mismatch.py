@@ -13,6 +13,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from odocal_ros.calib.number_text import significant
 from odocal_ros.data.arrays import Array, by_row, Floats, thinned
 from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
@@ -69,14 +70,14 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     noisy = excess > WORSE_THAN_GRADE
     worse = noise_texts + _biases_over_grade(problem, fit, config)
     reasons = [Reason(
-        Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
-        f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used'
+        Code.IMU_WORSE_THAN_GRADE, f'{" and ".join(worse)} times that of the {config.imu.grade} '
+        f'grade (limit {WORSE_THAN_GRADE:g}); the size estimated on this drive is used'
         + '. The noise may not be white; uncertainties were increased' * noisy,
         remedy)] if worse else []
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
     if noisy and not worse:
-        contradictions[f'IMU noise is {excess:.1f} times that of its grade (limit '
+        contradictions[f'IMU noise is {significant(excess)} times that of its grade (limit '
                        f'{WORSE_THAN_GRADE:g}) and may not be white'] = remedy
     contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
@@ -99,7 +100,7 @@ def _noise_over_grade(problem: Problem, level: dict[str, float],
     configured, used = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
-    texts = [f'{NAMES[name]} noise is {level[name] / configured[name]:.1f} times'
+    texts = [f'{NAMES[name]} noise is {significant(level[name] / configured[name])}'
              for name in sensors if level[name] > WORSE_THAN_GRADE * configured[name]]
     remedy = find_noise_cause(problem, level, [
         name for name in sensors
@@ -121,7 +122,7 @@ def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
     for name in _sensors(problem):
         bias, sigma, sold = biases[name]
         if np.max(np.abs(bias) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE:
-            texts.append(f'{NAMES[name]} bias is {np.max(np.abs(bias) / sigma):.1f} times')
+            texts.append(f'{NAMES[name]} bias is {significant(np.max(np.abs(bias) / sigma))}')
     return texts
 
 
@@ -131,7 +132,8 @@ def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
         return {}, 0.0
     step = last_step(fit)
     return {f'after {fit.iterations} iterations ' + (
-        f'the estimates still changed by {step:.2g} sigma'
+        f'the estimates still changed by {step:.2g} sigma '
+        f'(limit {CONVERGENCE.max_final_step:g})'
         if step > CONVERGENCE.max_final_step else 'the noise levels still changed'):
         'Check lever arms, time offsets and units, and drive with stops, starts and turns.'}, step
 
@@ -227,11 +229,13 @@ def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]
                      f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
                      'engine and motors.')
     texts += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
-              f'this is its normal noise, {_setting(name, level)}' for name in sensor_noise_names]
+              f'this is normal for this {NAMES[name]}, {_setting(name, level)}'
+              for name in sensor_noise_names]
     texts += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
         'single samples vary less than their means over seconds. ' if at_rest else
         'there is no standstill to compare with. ')
-        + f'Mount the IMU firmly. If this is its normal noise, {_setting(name, level)}'
+        + f'Mount the IMU firmly. If this is normal for this {NAMES[name]}, '
+        f'{_setting(name, level)}'
         for name in unknown]
     return ' '.join(texts)
 

@@ -242,15 +242,15 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
                 texts.append(f'{name} {axis}: not set, estimated {text}{rough}')
                 action = 'Measure {} and set it.'
             axes_of[action, name].append(axis)
-    actions = [action.format(f'{name} {", ".join(axes)}')
+    actions = [action.format(f'{name} ({", ".join(axes)})')
                for (action, name), axes in axes_of.items()]
     is_z = {axis == 'z' for (action, _), axes in axes_of.items() if 'easure' in action
             for axis in axes}
     if is_z:
         actions += [LEVER_ARM_AXES, IMU_ARM[any(config.imu.lever_arm)],
                     *(OTHER_CAUSE[key] for key in sorted(is_z))]
-    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}; accounted for',
-                   ' '.join(actions))] if texts else []
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}. The other values are for '
+                   'the estimated position', ' '.join(actions))] if texts else []
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
