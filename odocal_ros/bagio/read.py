@@ -82,7 +82,7 @@ class Bag:
 
     def _missing_data_notes(self) -> list[Reason | str]:
         """Return notes on missing data, with its duration if metadata or the next file give it."""
-        found: list[Reason | str] = []
+        reasons: list[Reason | str] = []
         metadata = self._source.metadata
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
@@ -91,11 +91,11 @@ class Bag:
                 metadata.whole if len(self._parts) == 1 else None)
             note = f'{part.recorded_path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
-                found.append(f'{note}, but all {span.count} messages were read')
+                reasons.append(f'{note}, but all {span.count} messages were read')
                 continue
             if not part.count:
-                found.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
-                                    'read'))
+                reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
+                                      'read'))
                 continue
             span = span or (metadata.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
@@ -104,13 +104,13 @@ class Bag:
             missing = ('without metadata.yaml the lost time is unknown' if end_ns is None else
                        f'{lost:.1f} s at the end are missing' if lost > LEAST_LOSS else
                        'the end is there, messages before it are missing')
-            found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
-                                f'{seconds:.1f} s were read; {missing}'))
+            reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
+                                  f'{seconds:.1f} s were read; {missing}'))
         lost = (metadata.whole.end_ns - self.end_ns) * 1e-9 if metadata.whole else 0.0
-        if not found and lost > LEAST_LOSS:
-            found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
-                                'listed in metadata.yaml, are missing'))
-        return found
+        if not reasons and lost > LEAST_LOSS:
+            reasons.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
+                                  'listed in metadata.yaml, are missing'))
+        return reasons
 
     def read(self, readers: Mapping[str, RowReader], feed: Feed,
              progress: Callable[[float], None] | None = None) -> None:

@@ -101,7 +101,7 @@ def relevant_reasons(reasons: Iterable[Reason], method: str,
                      estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
     """Return a method's reasons, without those about values that another method gives."""
     return tuple(r for r in reasons if r.code not in REASON_ESTIMATES or (
-        given := estimates.get(REASON_ESTIMATES[r.code])) is None or given.method == method)
+        estimate := estimates.get(REASON_ESTIMATES[r.code])) is None or estimate.method == method)
 
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
@@ -114,7 +114,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
              and methods[n].verdict is not Verdict.REJECTED]
     if len(sound) < len(METHOD_ORDER):
         return []
-    (first, second), found = sound, []
+    (first, second), reasons = sound, []
     for name, (word, cause) in COMPARED.items():
         a, b = (m.estimates.get(name) for m in sound)
         if a is None or b is None or a.value is None or b.value is None \
@@ -126,7 +126,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
         if abs(difference) > REMARK_SIGMAS * sigma:
             text = (format_change(difference / a.value) if name == 'scale_factor' else
                     f'{math.degrees(difference):+z.3f} deg')
-            found.append(Reason(
+            reasons.append(Reason(
                 Code.METHODS_DISAGREE, f'{word}: {second.name} and {first.name} differ by {text}, '
                 f'{abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
-    return found
+    return reasons

@@ -86,8 +86,12 @@ def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 
 def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
-                   t_stop: float, least: float) -> tuple[Reason, ...]:
-    """Return the reason if wheels or fixes do not move between the marks; least: of fixes, m."""
+                   t_stop: float, min_motion: float) -> tuple[Reason, ...]:
+    """
+    Return the reason if wheels or fixes do not move between the marks.
+
+    min_motion : of the fixes, m.
+    """
     # judgement: with slow fixes a mark is between two of them; three before it give the position
     mark_margin, count_before = 0.5, 3      # s
     rows = slice(max(0, np.searchsorted(t_fix, -mark_margin) - count_before),
@@ -101,7 +105,7 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
         t = t[1:-1]
     # 10 sigmas: judgement, a leg is longer. Many receivers state far more than their noise
     sigma = min(fix_sigma, fix_white_noise(fixes))
-    fixes_move = np.hypot(*np.ptp(fixes, axis=0)) > max(least, 10 * sigma)
+    fixes_move = np.hypot(*np.ptp(fixes, axis=0)) > max(min_motion, 10 * sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
@@ -140,9 +144,9 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
     for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
         # not at the end of the data: errors of the fixes of a parked vehicle move as far
         is_no_slide = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
-        least = max(GNSS_MOVES if is_no_slide else FURTHEST_SLIDE, 10 * fix_sigma)
-        distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], least)
-        if distance >= least:
+        motion_limit = max(GNSS_MOVES if is_no_slide else FURTHEST_SLIDE, 10 * fix_sigma)
+        distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], motion_limit)
+        if distance >= motion_limit:
             found.append((distance, begin[k], end[k]))
     return found
 
@@ -159,22 +163,22 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
         if end >= travel.t[-1]:
             continue
-        t, p, few = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
+        t, p, count = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
         has_left, is_before_end = (np.hypot(*(p - np.median(at, axis=0)).T) > limit
-                                   for at in (p[:few], p[-few:]))
+                                   for at in (p[:count], p[-count:]))
         spans.append((t[np.argmax(has_left)], t[len(t) - 1 - np.argmax(is_before_end[::-1])]))
     return np.reshape(np.array(spans, float), (-1, 2))
 
 
-def _motion_of_fixes(fixes: Floats, least: float) -> float:
-    """Return the motion of (k, 2) fixes without jumps and noise, m, 0 below ``least``."""
+def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:
+    """Return the motion of (k, 2) fixes without jumps and noise, m, 0 below ``motion_limit``."""
     count = 20      # of parts, enough that motion extends over more than two of them
     if len(fixes) < count:
         return 0.0
     parts = np.array_split(fixes, count)
-    if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < least:
+    if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < motion_limit:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in parts])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
@@ -183,17 +187,17 @@ def _motion_of_fixes(fixes: Floats, least: float) -> float:
 
 
 def path_and_chord(t_fix: Floats, fixes_n: Floats,
-                   least: float = GNSS_MOVES) -> tuple[float, float]:
+                   min_distance: float = GNSS_MOVES) -> tuple[float, float]:
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
-    The path connects fixes at least ten times their white noise, and ``least`` or 2 m, apart, so
-    that noise does not accumulate. Fixes out of reach of a vehicle are left out.
+    The path connects fixes at least ten times their white noise, and ``min_distance`` or 2 m,
+    apart, so that noise does not accumulate. Fixes out of reach of a vehicle are left out.
     """
     p = fixes_n[find_reachable(t_fix, fixes_n), :2]
     if len(p) < 2:
         return 0.0, 0.0
-    knots = [*separated_fixes(p, max(min(2.0, least), 10 * fix_white_noise(p))), len(p) - 1]
+    knots = [*separated_fixes(p, max(min(2.0, min_distance), 10 * fix_white_noise(p))), len(p) - 1]
     path = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
     return path, float(np.hypot(*(p[-1] - p[0])))
 
@@ -225,14 +229,14 @@ def fix_white_noise(fixes_n: Floats) -> float:
     return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 
-def separated_fixes(fixes_n: Floats, least: float) -> list[int]:
-    """Return indices of fixes, (k, 2 or more), at least ``least`` m apart, from the first."""
+def separated_fixes(fixes_n: Floats, min_distance: float) -> list[int]:
+    """Return indices of fixes, (k, 2 or more), from the first, at least min_distance, m, apart."""
     knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
     begin, ahead = 1, 64       # fixes searched at a time: the next knot is usually among them
     while begin < len(p):
-        far = np.hypot(*(p[begin:begin + ahead] - p[knots[-1]]).T) >= least
-        if far.any():
-            knots.append(begin + int(np.argmax(far)))
+        is_distant = np.hypot(*(p[begin:begin + ahead] - p[knots[-1]]).T) >= min_distance
+        if is_distant.any():
+            knots.append(begin + int(np.argmax(is_distant)))
             begin = knots[-1] + 1
         else:
             begin += ahead

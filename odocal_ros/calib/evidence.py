@@ -112,12 +112,12 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:
     """Return a path shifted to the position of a mark."""
-    here = path(np.array(pin.t))
+    at_mark = path(np.array(pin.t))
 
     def at(t: Floats) -> Floats:
         out = np.empty((len(t), 3))
         for rows in chunks(len(t)):       # the sums behind a path are 3 x 3 a row
-            out[rows] = pin.position_n + path(t[rows]) - here
+            out[rows] = pin.position_n + path(t[rows]) - at_mark
         return out
     return at
 

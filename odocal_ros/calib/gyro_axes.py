@@ -184,17 +184,17 @@ def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
 
 
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
-               sigma: float, least: float = GNSS_MOVES) -> float | None:
+               sigma: float, min_motion: float = GNSS_MOVES) -> float | None:
     """
     Return turns by the gyro over turns of the course by fixes, None without correlation.
 
     t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
-    2 or more), float s, m, and m horizontally.   least : least significant motion of fixes, m.
+    2 or more), float s, m, and m horizontally.   min_motion : of the fixes, m.
     """
     covered = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
     t_fix, fixes_n = t_fix[covered], fixes_n[covered]
     # m: the sigma of a course is then 0.14 rad
-    knots = separated_fixes(fixes_n, max(min(5.0, least), 10 * sigma))
+    knots = separated_fixes(fixes_n, max(min(5.0, min_motion), 10 * sigma))
     if len(knots) < 5:
         return None
     ends = t_fix[knots]

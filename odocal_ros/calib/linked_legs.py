@@ -125,11 +125,16 @@ class LinkedLegs:
         self.marginals = marginals
         self._information: dict[float, LegInformation] = {}
 
-    def information(self, least: float = 0.0) -> 'LegInformation':
-        """Return the information of the legs, in directions with more than ``least`` priors."""
-        if least not in self._information:      # requested for each constant
-            self._information[least] = _in_units(self.marginals, self.unit, least)
-        return self._information[least]
+    def information(self, min_information: float = 0.0) -> 'LegInformation':
+        """
+        Return the information of the legs, in directions with at least some information.
+
+        min_information : in units of that of the priors.
+        """
+        if min_information not in self._information:      # requested for each constant
+            self._information[min_information] = _in_units(
+                self.marginals, self.unit, min_information)
+        return self._information[min_information]
 
     def indices(self, j: int) -> Ints:
         """Return the indices of the constants of leg j in the unknowns: (m,)."""
@@ -259,13 +264,13 @@ class LegInformation:
 
 
 def _in_units(marginals: Sequence[MarginalInformation], unit: Floats,
-              least: float) -> LegInformation:
-    """Return the information of legs in units (m,), in directions with more than ``least``."""
+              min_information: float) -> LegInformation:
+    """Return the information of legs in units (m,), in directions with ``min_information``."""
     J, m = len(marginals), len(unit)
     out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
     for j, marginal in enumerate(marginals):
         eigenvalues, V = np.linalg.eigh(marginal.information * np.multiply.outer(unit, unit))
-        kept = eigenvalues > max(LEG_ROUNDING * eigenvalues[-1], least, 1e-300)
+        kept = eigenvalues > max(LEG_ROUNDING * eigenvalues[-1], min_information, 1e-300)
         eigenvalues, V = eigenvalues[kept], V[:, kept]
         along = V.T @ (marginal.gradient * unit)
         out.D[j], out.gradient[j] = V * eigenvalues @ V.T, V @ along

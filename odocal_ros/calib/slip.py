@@ -120,8 +120,8 @@ class _Windows:
         excess = self.excess(delay)
         # the usual excess of the drive (rough road, soft suspension) is no event
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
-        least = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
-        limit = max(least, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
+        min_size = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
+        limit = max(min_size, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
         return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 
@@ -157,8 +157,8 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
     """Return time and size of each event, by (m,) middles, s, and excess, m, of windows."""
     # windows that contain an event are one group; those in its middle contain all of it
-    beyond = np.flatnonzero(np.abs(excess) > limit)
-    groups = np.split(beyond, np.flatnonzero(np.diff(middle[beyond]) > SPIN_WINDOW / 2) + 1)
+    rows = np.flatnonzero(np.abs(excess) > limit)
+    groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SPIN_WINDOW / 2) + 1)
     centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
     k = np.array([c for c in centres if abs(excess[c]) > limit], int)
     return middle[k], excess[k]
@@ -190,17 +190,17 @@ def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, spe
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
     """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : ``unforced_sign``."""
-    found = []
+    reasons = []
     for code, tested_sign, relation, where in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
             (Code.TRAVEL_EXCESS, 1, 'more', 'while it brakes to a stop')):
         size, at = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
         if len(at):
-            found.append(Reason(code, (
+            reasons.append(Reason(code, (
                 f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '
                 f'{len(at)} place{"s" * (len(at) > 1)} {where}, {"the largest " * (len(at) > 1)}'
                 f'at t = {at[np.argmax(size)]:.0f} s')))
-    return found
+    return reasons
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
@@ -211,20 +211,20 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """Return the reasons for delay, slip and unforced travel; time_offset : as configured, s."""
-    found: tuple[Reason, ...] = ()
+    reasons: tuple[Reason, ...] = ()
     by_force = slips.unforced_sign == 0
     t, size, delay = slips.t[by_force], slips.size[by_force], slips.delay
     if delay:
-        found += (Reason(
+        reasons += (Reason(
             Code.DELAY_SEEN, f'odometer stamps are about {abs(delay):.2f} s '
             f'{"late" if delay > 0 else "early"} relative to the IMU, or the speed is low-pass '
             f'filtered; odometer.time_offset = {time_offset - delay:.2f} would remove a delay'),)
     if len(t):
-        found += (Reason(
+        reasons += (Reason(
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+z.2f} m at t = {t[0]:.1f} '
             's. Likely cause: the wheel spun or slid'),)
-    return (*found, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
+    return (*reasons, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
 
 
 def _column(kind: type = float) -> NDArray[Any]:

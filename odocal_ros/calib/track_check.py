@@ -169,8 +169,8 @@ def _piece_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
                       length / PIECE_STARTS) if len(path) else np.empty(0)
     a = np.searchsorted(path, begin)
     b = np.searchsorted(path, path[a] + length)
-    whole = b < len(path)
-    a, b = a[whole], b[whole]
+    is_complete = b < len(path)
+    a, b = a[is_complete], b[is_complete]
     has_fixes = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
     return a[has_fixes], b[has_fixes]
 
@@ -289,10 +289,11 @@ def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
 
 def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
-    back = find_reversed(pieces)
-    if not back.any():
+    is_reversed = find_reversed(pieces)
+    if not is_reversed.any():
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'
-    return (Reason(Code.TRACK_MISMATCH, f'in {int(back.sum())} of {len(back)} sections the track '
-                   f'runs opposite to the fixes. Likely cause: the vehicle reversed and {how}',
+    return (Reason(Code.TRACK_MISMATCH, f'in {int(is_reversed.sum())} of {len(is_reversed)} '
+                   'sections the track runs opposite to the fixes. Likely cause: the vehicle '
+                   f'reversed and {how}',
                    Code.REVERSING_UNSIGNED.remedy),)

@@ -57,7 +57,7 @@ class Chord:
 
     @property
     def M(self) -> Floats:
-        """Return attitude summed over travel between the marks, (3, 3)."""
+        """Return M of docs/method.md (T3): attitude summed over travel, (3, 3) scale units."""
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 
 

@@ -124,8 +124,8 @@ def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: floa
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
         # 2e-3: tyres that warm up differently change the ratio by less
-        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)
-        if abs(change) > least and abs(change) / sigma > best[0]:
+        limit = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)
+        if abs(change) > limit and abs(change) / sigma > best[0]:
             best = (abs(change) / sigma, float(change), share, at)
     sigmas, change, share, at = best
     if not change:

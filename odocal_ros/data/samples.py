@@ -88,8 +88,9 @@ class OdometerSamples(Samples):
     value: Values = column()       # int64 for counters (uint64 as its int64 bits), else float64
 
     def _dtype(self, one: Field[Any]) -> Any:
-        whole = one.name == 'value' and np.issubdtype(np.asarray(self.value).dtype, np.integer)
-        return np.int64 if whole else super()._dtype(one)
+        is_integer = one.name == 'value' and np.issubdtype(
+            np.asarray(self.value).dtype, np.integer)
+        return np.int64 if is_integer else super()._dtype(one)
 
 
 @dataclass(frozen=True)

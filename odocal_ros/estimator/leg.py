@@ -121,8 +121,8 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     """
     T = np.diff(t)
     fastest = 5.0       # m/s, judgement: no robot indoors; the positions of a car are from GNSS
-    far = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
-    if not leg.origin.is_local or (far > fastest * T).any():
+    distance = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    if not leg.origin.is_local or (distance > fastest * T).any():
         return T
     path = np.max([np.abs(np.diff(one.at(t))) for one in leg.wheels or (leg.travel,)], axis=0)
     at_rest = 0.01      # share of the time, judgement: a pose may change without motion

@@ -186,6 +186,6 @@ def main_sources(method: MethodResult, parameter: str) -> tuple[tuple[str, float
     """Return (name, sigma) of the main error sources of a parameter, the largest first."""
     row = method.parameters.index(parameter)
     sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
-    least = SOURCE_SHARE * sum(size**2 for size in sizes.values())
-    return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > least),
+    min_variance = SOURCE_SHARE * sum(size**2 for size in sizes.values())
+    return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > min_variance),
                         key=lambda source: -source[1]))

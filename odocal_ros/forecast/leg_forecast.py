@@ -94,10 +94,10 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
                             is_needed: Callable[[], bool]) -> Forecast:
     """Return the two_point forecast of the leg with its end points."""
     inputs = leg_so_far.screened_in_cells(leg, config).inputs
-    driven = leg_so_far.drive_profile(inputs, config)
+    profile = leg_so_far.drive_profile(inputs, config)
     sigmas = Sigmas(config=_with_expected_heading(leg, config),
                     **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})
-    drive = _with_final_rest(_thin(driven), is_needed)
+    drive = _with_final_rest(_thin(profile), is_needed)
     prediction = predict(drive, sigmas)
 
     def forecast(parameter: str, limit: float, why: str = '') -> ParameterForecast:

@@ -209,9 +209,10 @@ class SmootherSoFar:
         inputs = screened.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs IMU and odometer samples')
-        few = too_few_samples_reason(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
-        if few:
-            raise BadData(few.text)
+        reason = too_few_samples_reason(
+            len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
+        if reason:
+            raise BadData(reason.text)
         _raise_if_unusable(screened.reasons)
         located = locate_fixes(inputs, config)
         if not located.rough:
@@ -226,9 +227,9 @@ class SmootherSoFar:
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         smoother_leg = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
                                          located.rough, t_stop)
-        few = missing_samples_reason(smoother_leg)
-        if few:
-            raise BadData(few.text)
+        reason = missing_samples_reason(smoother_leg)
+        if reason:
+            raise BadData(reason.text)
         return smoother_leg
 
 

@@ -168,35 +168,35 @@ def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     moving = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])
     k = min(moving + 1, len(drive.t) - 1)
     v, yaw = drive.speed[k], 0.0
-    t, speed, turned = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    t, speed, turn_angle = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     brake = abs(v) / BRAKING
     if brake > DRIVE_STEP:          # the drive ends in motion
         times = _time_grid(brake)
-        t, speed, turned = [times], [v * (1 - times / brake)], [np.zeros_like(times)]
+        t, speed, turn_angle = [times], [v * (1 - times / brake)], [np.zeros_like(times)]
     town_turn = 22.0, 30.0    # s, begin and end in the minute
     for minute in range(minutes):
         times = _time_grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
         angle = QUARTER * TOWN_SIDES[minute % len(TOWN_SIDES)]
         t.append(times + brake + minute * TOWN_T[-1])
         speed.append(np.interp(times, TOWN_T, TOWN_SPEED))
-        turned.append(yaw + np.interp(times, town_turn, [0.0, angle]))
+        turn_angle.append(yaw + np.interp(times, town_turn, [0.0, angle]))
         yaw += angle
-    return insert_section(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
+    return insert_section(drive, k, *(np.concatenate(x) for x in (t, speed, turn_angle)))
 
 
-def insert_section(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
+def insert_section(drive: Drive, k: int, t: Floats, speed: Floats, turn_angle: Floats) -> Drive:
     """
     Return the drive with a section inserted after row k; the rest is delayed and rotated.
 
-    drive : as planned.   k : row between the marks.   t, speed, turned : (m,) s since row k, above
-    0 and rising; m/s; rad turned to the left since row k.
+    drive : as planned.   k : row between the marks.   t, speed, turn_angle : (m,) s since row k,
+    above 0 and rising; m/s; rad to the left since row k.
     """
     return replace(
         drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),
         speed=np.insert(drive.speed, k + 1, speed),
         slope=np.insert(drive.slope, k + 1, np.full(len(t), drive.slope[k])),
-        yaw=np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turned,
-                            drive.yaw[k + 1:] + turned[-1]]))
+        yaw=np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turn_angle,
+                            drive.yaw[k + 1:] + turn_angle[-1]]))
 
 
 def _middle_row(drive: PlannedDrive) -> int:

@@ -204,11 +204,11 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float =
         name: 2 / max(tau, 1.0) * (1 - white) * variance
         for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
     values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
-    least = {name: problem.min_levels.get(name, 0.0) for name in values}
+    minimum = {name: problem.min_levels.get(name, 0.0) for name in values}
     # the bound is for one fix, not for the fixes that it replaces
-    least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
-    return problem.initial_levels.replaced(
-        correlation_time=tau, **{name: max(value, least[name]) for name, value in values.items()})
+    minimum |= {name: minimum[name] / fixes_in_one for name in ('fix', 'fix_up')}
+    return problem.initial_levels.replaced(correlation_time=tau, **{
+        name: max(value, minimum[name]) for name, value in values.items()})
 
 
 def fit_at_truth(problem: Problem, ideal: IdealSamples, levels: Levels) -> Fit:

@@ -79,9 +79,9 @@ class ThinnedLeg:
         """Return the samples so far as a leg, up to the last cell of IMU, or else odometer."""
         form, cells = self.form, self._cells | {slot: self._counts(slot) for slot in self._recent}
         if form.quantity != 'rate':
-            whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
+            is_integer = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in cells else True
-            form = replace(COUNTER if whole else UNROLLED, scale_unit=form.scale_unit,
+            form = replace(COUNTER if is_integer else UNROLLED, scale_unit=form.scale_unit,
                            sides=form.sides)
         leading = cells.get('imu', cells.get('odometer'))
         stop_ns = start_ns if leading is None else int(leading.stamp_ns[-1])

@@ -97,8 +97,8 @@ class CoarseSpeed:
         power = self.step**2 / 12 * duration * (self.value[first] != 0)
         total = np.interp(t, np.append(begin, self.t[-1]), running_sum(power * duration))
         # before and after a motion the speed is within a step of zero, for an unknown time
-        moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
-        at_rest = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
+        T_moving, T = np.abs(self.time_in_motion(t)), np.diff(t)
+        at_rest = np.where((T_moving > 0) & (T_moving < T), self.step * (T - T_moving), 0.0)
         return np.diff(total) + at_rest**2 / 3      # uniform within this travel to each side
 
     @cached_property
@@ -217,9 +217,9 @@ def _may_be_grid(u: Ints) -> bool:
     A peak with coherence c, GRID_COHERENCE, is within half a step of one of them, so that phases
     differ by at most pi / 4 to either side: there it is at least (c - sqrt(1 - c^2)) / sqrt(2).
     """
-    least = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
+    limit = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
     lowest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
-    return bool(_coherence(u, GRID_ROUGH)[lowest:].max() >= least)
+    return bool(_coherence(u, GRID_ROUGH)[lowest:].max() >= limit)
 
 
 def _step_of_few_values(value: Floats, u: Floats, count: Ints) -> float | None:

@@ -123,20 +123,20 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
-                least: float = GNSS_MOVES) -> float | None:
+                min_chord: float = GNSS_MOVES) -> float | None:
     """
     Return metres per unit of travel from distances between fixes, None without motion.
 
-    It is the median of equal sections of the path, as short as possible with chords of ``least`` m
-    and eight sigmas. Despite outliers its error is a few per cent: enough for thresholds and for
-    scales without a nominal value. If the path folds back within ``least`` (the lanes of a mower),
-    the ratio of shorter sections is larger and is used.
+    It is the median of equal sections of the path, as short as possible with chords of
+    ``min_chord``, m, and eight sigmas. Despite outliers its error is a few per cent: enough for
+    thresholds and for scales without a nominal value. If the path folds back within ``min_chord``
+    (the lanes of a mower), the ratio of shorter sections is larger and is used.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):
         return None
     s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
-    scale = section_ratio(s, s[:, None], p, max(least, 8 * sigma))
+    scale = section_ratio(s, s[:, None], p, max(min_chord, 8 * sigma))
     if scale is None or len(s) < 5:
         return scale
     # third differences of white noise have 20 times its variance
@@ -145,12 +145,12 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     return short if short is not None and short > FOLDED * scale else scale
 
 
-def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | None:
+def section_ratio(s: Floats, path: Floats, p: Floats, min_chord: float) -> float | None:
     """
     Return the median ratio of distance between fixes to distance on a path, None without sections.
 
     s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
-    sections are equal in travel, as short as possible with a median of ``least`` m between fixes.
+    sections are equal in travel, as short as possible with a median distance of ``min_chord``, m.
     """
     path_length = running_sum(np.abs(np.diff(s)))
     pieces = len(s) // 2
@@ -159,7 +159,7 @@ def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | N
         chord = np.hypot(*np.diff(p[k], axis=0).T)
         run = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
         moves = run > 0
-        if moves.any() and np.median(chord[moves]) >= least:
+        if moves.any() and np.median(chord[moves]) >= min_chord:
             return float(np.median(chord[moves] / run[moves]))
         pieces //= 2
     return None

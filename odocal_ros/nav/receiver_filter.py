@@ -36,8 +36,8 @@ def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, squa
         return _tracking_error(t, place, velocity, at, np.sqrt(-square / 2))
 
     if abs(square) <= LEAST_LAG2:
-        least = -LEAST_LAG2 if square < 0 else LEAST_LAG2
-        rate = error(least) / least
+        small = -LEAST_LAG2 if square < 0 else LEAST_LAG2
+        rate = error(small) / small
         return rate * square, rate
     value = error(square)
     lag2_step = 1e-4    # relative, of the difference that gives a derivative
@@ -74,9 +74,9 @@ class _Track:
     """Cubics between positions and velocities, extrapolated linearly, and means of their past."""
 
     def __init__(self, t: Floats, place: Floats, velocity: Floats) -> None:
-        beyond = 10.0       # s of extrapolation at the last velocity
-        self.t = np.append(t, t[-1] + beyond)
-        self.place = np.concatenate([place, place[-1:] + beyond * velocity[-1:]])
+        extrapolation = 10.0       # s of extrapolation at the last velocity
+        self.t = np.append(t, t[-1] + extrapolation)
+        self.place = np.concatenate([place, place[-1:] + extrapolation * velocity[-1:]])
         self.velocity = np.concatenate([velocity, velocity[-1:]])
         self.T, self.bend, self.twist = _cubic_coefficients(self.t, self.place, self.velocity)
 

@@ -42,9 +42,9 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     at_rest = _still_wheels(middle, travel, metres_per_unit) & steady
     at_rest &= _not_turning(rate, at_rest, edges, shortest)
     spans = _spans(at_rest, edges, shortest)
-    moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
+    path = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
     speed_limit = 0.02    # m/s, largest mean speed of a long standstill
-    return spans[moved <= speed_limit * (spans[:, 1] - spans[:, 0])
+    return spans[path <= speed_limit * (spans[:, 1] - spans[:, 0])
                  + _travel_limit(travel, metres_per_unit)]
 
 

@@ -268,13 +268,13 @@ def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fix
         reckoned = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
         reckoned = reckoned - reckoned[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
-        least = max(COURSE_DISTANCE, 8 * sigma_fix)
+        min_distance = max(COURSE_DISTANCE, 8 * sigma_fix)
         distance = np.hypot(*reckoned.T)
-        if (distance >= least).any():
-            k = int(np.argmax(distance >= least))
+        if (distance >= min_distance).any():
+            k = int(np.argmax(distance >= min_distance))
             yaw = np.arctan2(*fixed[k, ::-1]) - np.arctan2(*reckoned[k, ::-1])
             return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / distance[k]), ()
-        cause = f'less than {least:.0f} m from the start within {course_time:.0f} s'
+        cause = f'less than {min_distance:.0f} m from the start within {course_time:.0f} s'
     else:
         cause = f'fewer than 2 fixes within {course_time:.0f} s of the start'
     return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {cause}',

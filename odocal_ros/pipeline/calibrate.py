@@ -75,11 +75,11 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     if not screened.usable:
         return leg_result(leg, inputs, screened.reasons)
     result = result_of(inputs, screened.reasons)
-    back, scale = _reversed_sections(result, inputs)
-    if not len(back):
+    reversed_spans, scale = _reversed_sections(result, inputs)
+    if not len(reversed_spans):
         return result
-    found = reversing_reasons(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
-    return result_of(inputs.mirrored(back), (*screened.reasons, *found))
+    found = reversing_reasons(reversed_spans, inputs.travel, scale, BY_FIT, config.odometer.signed)
+    return result_of(inputs.mirrored(reversed_spans), (*screened.reasons, *found))
 
 
 def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:
@@ -131,12 +131,12 @@ def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
     if leg.stop_ns <= leg.start_ns:
         missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark',
                               'Set the start mark first, then the stop mark.'))
-    for n, least, code, topic in (
+    for n, required, code, topic in (
             (len(inputs.t_imu), 4, Code.NO_IMU, 'IMU'),
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
-        if n < least:
+        if n < required:
             missing.append(Reason(code, f'{n} usable {topic} message{"s" * (n != 1)}; '
-                                  f'required: {least} or more'))
+                                  f'required: {required} or more'))
     if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none received: reported already
         missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
     return missing

@@ -134,15 +134,16 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
     return combine_method(name, results, walked)
 
 
-def _combine_method(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
-                    carried: CarriedInformation | None, local: bool) -> MethodResult:
+def _combine_method(name: str, leg_results: Sequence[tuple[MethodResult, int, int]],
+                    config: Config, carried: CarriedInformation | None,
+                    local: bool) -> MethodResult:
     """
     Return the combination of results that are not rejected, or of all if all are rejected.
 
-    driven : result, start time, ns, and number of each leg.
+    leg_results : result, start time, ns, and number of each leg.
     """
-    usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
-    results, times_ns, numbers = zip(*(usable or driven), strict=True)
+    usable = [one for one in leg_results if one[0].verdict is not Verdict.REJECTED]
+    results, times_ns, numbers = zip(*(usable or leg_results), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,
                                carried if usable else None, local)
     if usable or len(results) == 1:

@@ -74,18 +74,18 @@ def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[R
     DELAY_SEEN is from the last method in METHODS that estimates delays. Reasons on slip and delay
     of the odometer are from the last one that checks them and is not rejected, else the first.
     """
-    found: list[Reason] = []
+    reasons: list[Reason] = []
     delay_reasons: list[Reason] = []
     odometer: tuple[Reason, ...] | None = None
     for run in (runs[name] for name in METHODS if name in runs):
-        found += run.data_reasons
+        reasons += run.data_reasons
         scale = run.result.estimates['scale_factor'].value
         if run.delays is not None and scale is not None:
             delay_reasons = beyond_model.delay_notes(prepared, run.delays, scale)
         is_usable = odometer is None or run.result.verdict is not Verdict.REJECTED
         if run.odometer_reasons is not None and is_usable:
             odometer = run.odometer_reasons
-    return [*found, *(odometer or ()), *delay_reasons]
+    return [*reasons, *(odometer or ()), *delay_reasons]
 
 
 def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:

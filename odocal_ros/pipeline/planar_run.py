@@ -176,8 +176,8 @@ def known_values(run: planar.Run, config: settings.Config) -> planar.PriorKnowle
         gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
     if not config.gnss.correlation_time > 0:
         return known
-    moved = np.linalg.norm(np.diff(run.position, axis=0), axis=1).sum()
-    return replace(known, drift_length=config.gnss.correlation_time * moved / (
+    path = np.linalg.norm(np.diff(run.position, axis=0), axis=1).sum()
+    return replace(known, drift_length=config.gnss.correlation_time * path / (
         run.t[-1] - run.t[0]))
 
 

@@ -254,17 +254,17 @@ def _compared_section(prepared: PreparedLeg, path: Path,
     """Return the pin of the path, a mask of fixes to compare, path length, m, and reasons."""
     pin: MarkFix | None = start
     begin, end = start.t, prepared.t_fit
-    found: tuple[Reason, ...] = ()
+    reasons: tuple[Reason, ...] = ()
     if prepared.holdout:
         pin = prepared.mark(prepared.t_fit, path)
         begin, end = prepared.t_fit, prepared.inputs.t_stop
     end = min(end, prepared.covered[1])
     between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
     if pin is not None:
-        inside, found = without_outliers(prepared, path, pin, between)
+        inside, reasons = without_outliers(prepared, path, pin, between)
         between &= inside
     a, b = np.interp([begin, end], *path_length_over_time(prepared))
-    return pin, between, b - a, found
+    return pin, between, b - a, reasons
 
 
 def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:

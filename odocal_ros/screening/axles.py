@@ -51,9 +51,9 @@ def usable_axles(wheels: Wheels, imu: Imu,
     """
     axles = pair_wheels(wheels.wheels)
     faults = [_faults(axle, axles, imu, between) for axle in axles]
-    reasons = [reason for of_axle in faults for reason in of_axle]
+    fault_reasons = [reason for of_axle in faults for reason in of_axle]
     if len(axles) < 2:
-        return wheels, reasons
+        return wheels, fault_reasons
     # the working wheel of a broken axle is used to detect steering of the others
     usable = [_working_wheel(axle, of_axle) if of_axle else axle for axle, of_axle in zip(
         axles, faults, strict=True)]
@@ -65,15 +65,15 @@ def usable_axles(wheels: Wheels, imu: Imu,
                if not of_axle for wheel in axle]
     steered, fixed = ([wheel for wheel in working if bool(wheel.ahead) is steers]
                       for steers in (True, False))
-    if reasons and (not fixed or sum(map(bool, usable)) < 2):
-        return wheels, reasons
-    found = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_subject(axle)} left out of the mean')
-             for axle, of_axle in zip(axles, faults, strict=True) for reason in of_axle]
+    if fault_reasons and (not fixed or sum(map(bool, usable)) < 2):
+        return wheels, fault_reasons
+    reasons = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_subject(axle)} left out of the mean')
+               for axle, of_axle in zip(axles, faults, strict=True) for reason in of_axle]
     if steered:
-        found.append(Reason(Code.WHEELS_STEERED, f'{_subject(steered)} steered: a '
-                            'steered wheel travels farther in turns. The scale factor is that of '
-                            f'the mean of {_names(fixed)}'))
-    return wheels.only(working), found
+        reasons.append(Reason(Code.WHEELS_STEERED, f'{_subject(steered)} steered: a '
+                              'steered wheel travels farther in turns. The scale factor is that '
+                              f'of the mean of {_names(fixed)}'))
+    return wheels.only(working), reasons
 
 
 def _working_wheel(axle: Axle, faults: Sequence[Reason]) -> Axle:
@@ -109,8 +109,8 @@ def _distances_ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
         _squared_distance(mean_travel(axle), first, imu, between, uncertain_t)
         for axle in axles[1:])]
     squares, sigmas = np.transpose(estimates)
-    least = int(np.argmin(squares))
-    square, sigma = squares - squares[least], np.hypot(sigmas, sigmas[least])
+    reference = int(np.argmin(squares))
+    square, sigma = squares - squares[reference], np.hypot(sigmas, sigmas[reference])
     ahead: list[float] = np.where(square > FAULT_SIGMAS * sigma, np.sqrt(square), 0.0).tolist()
     return ahead
 

@@ -64,7 +64,7 @@ def stamp_offsets(config: Config) -> dict[str, float]:
 def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
     """Return reasons for clocks that differ from the IMU's at equal times of arrival."""
     offset = stamp_offsets(config)
-    found: list[Reason] = []
+    reasons: list[Reason] = []
     imu = _stamped(leg.imu)
     for slot in TOPICS:
         samples = _stamped(leg.rows(slot))
@@ -75,12 +75,12 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
         if abs(ahead) > CLOCK_DIFFERENCE_LIMIT:
             group = INPUTS[slot].clock
             hint = f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
-            found.append(Reason(
+            reasons.append(Reason(
                 Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
                 'from IMU stamps that arrive at the same time; the limit is '
                 f'{CLOCK_DIFFERENCE_LIMIT:g} s'
                 f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', clock_remedy(ahead)))
-    return found
+    return reasons
 
 
 def clock_remedy(ahead: float) -> str:
@@ -129,7 +129,7 @@ def _may_be_clock_step(stamp_ns: Ints) -> Bools:
 def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
     """Return a leg without the steps of clocks that were set during it; CLOCK_SET for each."""
     rows: dict[str, Samples] = {}
-    found: list[Reason] = []
+    reasons: list[Reason] = []
     for slot in ('imu', *TOPICS):
         stamped = _stamped(leg.rows(slot))
         last_rows, sizes = _clock_steps(stamped)
@@ -145,7 +145,7 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
         stamp_ns = samples.stamp_ns.copy()
         stamp_ns[stamp_ns > 0] -= shift[section]
         rows[slot] = replace(samples, stamp_ns=stamp_ns)
-        found += [Reason(
+        reasons += [Reason(
             Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {size:+z.3f} s at t = '
             f'{(stamped.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s; '
             f'{"earlier" if shift[section[k]] else "later"} stamps were corrected')
@@ -153,7 +153,7 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
         if slot == 'imu':
             leg = replace(leg, start_ns=leg.start_ns - int(shift[0]),
                           stop_ns=leg.stop_ns - int(shift[-1]))
-    return leg.with_rows(**rows), found
+    return leg.with_rows(**rows), reasons
 
 
 def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
@@ -185,8 +185,8 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
         return
     count, (force,) = bin_means(t, edges, inputs.f_b)
     force[count == 0] = inputs.usual_f_b
-    moved = np.diff(travel.at(edges))
-    odometer = _delay(_without_slow_changes(np.gradient(moved)[:, None], SLOW_FORCE),
+    travel_steps = np.diff(travel.at(edges))
+    odometer = _delay(_without_slow_changes(np.gradient(travel_steps)[:, None], SLOW_FORCE),
                       _without_slow_changes(force, SLOW_FORCE))
     if odometer:
         yield 'odometer', odometer
@@ -227,13 +227,13 @@ def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
     share = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
         float((y**2).sum()), 1e-12)
     best = 1 + int(np.argmax(share[1:-1]))
-    before, here, after = share[best - 1:best + 2]
-    parabola_top = (after - before) / max(2 * (2 * here - before - after), 1e-12)
+    before, top, after = share[best - 1:best + 2]
+    parabola_top = (after - before) / max(2 * (2 * top - before - after), 1e-12)
     delay_s = OFFSET_CELL * (cells[best] + np.clip(parabola_top, -0.5, 0.5))
     small = np.abs(OFFSET_CELL * cells + x_delay) <= OFFSET_REACH
     others = share[(np.abs(OFFSET_CELL * cells - delay_s) > ACCELERATION_S) | small].max()
     samples = len(y) * OFFSET_CELL / ACCELERATION_S
-    unexplained = np.maximum(1.0 - np.array([others, here]), 1e-6)      # share of the variance
+    unexplained = np.maximum(1.0 - np.array([others, top]), 1e-6)      # share of the variance
     log_odds = samples / 2 * np.log(unexplained[0] / unexplained[1])
     return float(delay_s + x_delay) if log_odds > DELAY_LOG_ODDS else 0.0
 

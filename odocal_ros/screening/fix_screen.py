@@ -110,12 +110,12 @@ def has_position(fix: FixSamples) -> Bools:
 
 def _far_from_most(fix: FixSamples, good: Bools) -> Bools:
     """Return a mask of good fixes far from most others: (n,) bool."""
-    far = np.zeros(len(good), bool)
+    is_far = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
         away_from_most = 1e6    # m from the median fix: not a real position
-        far[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
-    return far
+        is_far[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
+    return is_far
 
 
 def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
@@ -227,15 +227,15 @@ def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,
         return []
     every = min(max(1, round(COMPARISON_INTERVAL / float(np.median(np.diff(t))))), len(t) - 1)
     t, positions, sigma, track = t[::every], positions[::every], sigma[::every], track[::every]
-    rows, deviation, driven = _deviations(t, np.diff(positions), np.diff(track))
+    rows, deviation, in_motion = _deviations(t, np.diff(positions), np.diff(track))
     if not len(rows):
         return []
-    usual, driven_rows = float(np.median(deviation[driven])), rows[driven]
-    smooth = deviation[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
+    usual, driven_rows = float(np.median(deviation[in_motion])), rows[in_motion]
+    smooth = deviation[in_motion] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
     # jumps below the stated error are caused by changes of satellites
-    least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
-    for k in np.flatnonzero(deviation > least):
+    jump_limit = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
+    for k in np.flatnonzero(deviation > jump_limit):
         last = int(np.searchsorted(driven_rows, rows[k]))
         first = _smooth_begin(smooth[:last])
         if first == last:
@@ -248,27 +248,29 @@ def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,
     return spans
 
 
-def _deviations(t: Floats, moved: Complexes, steps: Complexes) -> tuple[Ints, Floats, Bools]:
+def _deviations(t: Floats, fix_steps: Complexes,
+                track_steps: Complexes) -> tuple[Ints, Floats, Bools]:
     """
-    Return rows of moved, their deviations, m, and True if two adjacent rows are in motion: (n,).
+    Return rows of fix_steps, their deviations, m, and True if they and the rows before are moving.
 
-    t : (k,) s.   moved, steps : (k - 1,) displacements by fixes and by the track, m. The ratio of
-    the two, a scale and a rotation, should be that of the last row in motion before, which may
-    not be adjacent: a jump may come at a standstill. Empty with too few rows in motion.
+    t : (k,) s.   fix_steps, track_steps : (k - 1,) displacements by fixes and by the track, m. The
+    ratio of the two, a scale and a rotation, should be that of the last row in motion before,
+    which may not be adjacent: a jump may come at a standstill. Empty with too few rows in motion.
     """
     dt = np.diff(t)
     complete = dt < MISSING_INTERVALS * np.median(dt)
-    moving = complete & (np.abs(steps) > LEAST_DISPLACEMENT)
-    before = np.maximum.accumulate(np.where(moving, np.arange(len(steps)), -1))[:-1]
+    moving = complete & (np.abs(track_steps) > LEAST_DISPLACEMENT)
+    before = np.maximum.accumulate(np.where(moving, np.arange(len(track_steps)), -1))[:-1]
     rows = np.flatnonzero(complete[1:] & (before >= 0)) + 1
     before = before[rows - 1]
-    driven = moving[rows] & (before == rows - 1)
-    if driven.sum() <= SMOOTH_ROWS:
-        return rows[:0], np.empty(0), driven[:0]
-    ratio, acceleration = moved[before] / steps[before], np.gradient(steps) / np.median(dt)
-    change = acceleration[rows] - acceleration[before] * steps[rows] / steps[before]
-    deviation = _without_delay(moved[rows] - ratio * steps[rows], ratio * change)
-    return rows, deviation, driven
+    in_motion = moving[rows] & (before == rows - 1)
+    if in_motion.sum() <= SMOOTH_ROWS:
+        return rows[:0], np.empty(0), in_motion[:0]
+    ratio = fix_steps[before] / track_steps[before]
+    acceleration = np.gradient(track_steps) / np.median(dt)
+    change = acceleration[rows] - acceleration[before] * track_steps[rows] / track_steps[before]
+    deviation = _without_delay(fix_steps[rows] - ratio * track_steps[rows], ratio * change)
+    return rows, deviation, in_motion
 
 
 def _without_delay(deviation: Complexes, by_second: Complexes) -> Floats:

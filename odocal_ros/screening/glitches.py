@@ -57,14 +57,14 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
     largest_value = 1e300    # of unbounded columns: sums and products with it stay finite
-    most = BEYOND_SENSOR.get(name, largest_value)
+    largest = BEYOND_SENSOR.get(name, largest_value)
 
     def not_usable(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
         # smaller values, except 0, are damaged: judgement. Two rotations by right angles leave
         # 1e-68 of a value in axes of exact zeros
         least_value = 1e-80
-        usable = (size <= most) & ((size >= least_value) | (size == 0))
+        usable = (size <= largest) & ((size >= least_value) | (size == 0))
         return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
         return by_row(not_usable, column)
@@ -103,16 +103,16 @@ def near_impossible_groups(impossible: Bools) -> Bools:
     return suspect
 
 
-def find_spikes(t: Floats, x: Floats, least: float) -> Bools:
+def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back: (n,) bool.
 
-    t : (n,) s, rising.   x : (n, k) values.   least : smallest step of a spike from row to row.
+    t : (n,) s, rising.   x : (n, k) values.   min_step : smallest step of a spike from row to row.
     All False if so many rows jump that it is normal for the sensor.
     """
     found = np.zeros(len(x), bool)
     steps = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
-    large = np.flatnonzero(steps > least)
+    large = np.flatnonzero(steps > min_step)
     if not len(large):
         return found
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
@@ -129,26 +129,26 @@ def find_spikes(t: Floats, x: Floats, least: float) -> Bools:
     return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
-def isolated_outliers(x: Floats, least: float) -> Bools:
+def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
     """
     Return a mask of isolated outliers with no motion before and after.
 
-    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all False if
-    there are so many that it is normal for the sensor.
+    x : (n, k).   min_deviation : of an outlier.   Returns (n,) bool, all False if there are so
+    many that it is normal for the sensor.
     """
     edge = NEIGHBOUR_ROWS + 1
 
     def is_outlier(x: Floats) -> Bools:
         m = len(x) - 2 * edge
         deviations = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
-        if not (deviations > least).any():
+        if not (deviations > min_deviation).any():
             return np.zeros(m, bool)
         # rows next to an outlier deviate too: the largest deviation of the others
         nearby = reduce(np.maximum, (deviations[NEIGHBOUR_ROWS + k:][:m]
                                      for d in range(2, edge) for k in (-d, d)))
         deviation = deviations[NEIGHBOUR_ROWS:][:m]
         difference = np.abs(x[edge + 1:][:m] - x[NEIGHBOUR_ROWS:][:m])
-        of_column: Bools = ((deviation > np.maximum(least, SINGLE_TIMES * nearby))
+        of_column: Bools = ((deviation > np.maximum(min_deviation, SINGLE_TIMES * nearby))
                             & (difference < EQUAL_NEIGHBOURS * deviation))
         return reduce_columns(np.logical_or, of_column)
 
@@ -208,7 +208,7 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                        imu: ImuConfig) -> tuple[Reason, ...]:
     """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
     found = []
-    for sensor, x_i, scale, unit, least in (
+    for sensor, x_i, scale, unit, min_limit in (
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
         for axis, x in zip('xyz', columns(x_i), strict=True):
@@ -217,7 +217,7 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                 limit = extreme(x, initial=0.0)
                 at_limit = x == limit
                 count, size = int(np.count_nonzero(at_limit)), abs(limit * scale)
-                if size < least or count < FEWEST_AT_LIMIT:
+                if size < min_limit or count < FEWEST_AT_LIMIT:
                     continue
                 following = extreme(x, where=inside(x, limit), initial=none)
                 if count > TIMES_NEXT * np.count_nonzero(x == following):

@@ -29,12 +29,12 @@ LEAST_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm tha
 ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
-def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
+def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, reasons: list[Reason],
                    name: str = 'odometer') -> Floats:
     """Return the sampling times of rows stamped at t, (n,) s: late ones are moved back."""
     if len(t) < 4 * NODE_STEP:
         return t
-    whole = np.issubdtype(samples.value.dtype, np.integer)
+    is_integer = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
         # a speed is as smooth as travel, but does not determine the time of a row in a burst
         _, even, is_smoother = _smoothest_rhythm(t, samples.value.astype(float))
@@ -42,16 +42,16 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, foun
     else:
         step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
                 else samples.value[1:].astype(float))
-        sampled = _correct_bursts(t, running_sum(step), ROUNDING_COUNTS if whole else 0.0)
+        sampled = _correct_bursts(t, running_sum(step), ROUNDING_COUNTS if is_integer else 0.0)
     delay = t - sampled
     least_delay, least_share = 0.02, 0.3    # s, of an interval: larger delays are reported
     late = delay > max(least_delay, least_share * intervals(t)[0])
     if late.any():
         worst, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
-        found.append(Reason(Code.ODOMETER_LATE, f'{int(late.sum())} of {len(t)} {name} messages '
-                            f'arrived late, in {max(bursts, 1)} burst{"s" * (bursts > 1)}, by up '
-                            f'to {delay[worst]:.3g} s at t = {t[worst]:.2f} s; moved back to '
-                            'their estimated times'))
+        reasons.append(Reason(
+            Code.ODOMETER_LATE, f'{int(late.sum())} of {len(t)} {name} messages arrived late, in '
+            f'{max(bursts, 1)} burst{"s" * (bursts > 1)}, by up to {delay[worst]:.3g} s at t = '
+            f'{t[worst]:.2f} s; moved back to their estimated times'))
     return sampled
 
 
@@ -132,11 +132,11 @@ def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     # of equally smooth ones the first is used, by medians: that of the earliest rows has steps
     found = [(_unevenness(t, even, travel), interval, even) for interval in reversed(intervals(t))
              for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
-    least = min(ratio for ratio, _, _ in found)
+    lowest = min(ratio for ratio, _, _ in found)
     smoother_ratio, equal_ratio = 0.9, 1.1    # judgement: limits of the ratio, over that of others
-    is_smoother = least < smoother_ratio
+    is_smoother = lowest < smoother_ratio
     _, interval, even = next(
-        x for x in found if x[0] <= equal_ratio * least) if is_smoother else found[-1]
+        x for x in found if x[0] <= equal_ratio * lowest) if is_smoother else found[-1]
     return interval, even, is_smoother
 
 
@@ -157,11 +157,11 @@ def _rhythm_of_earliest(t: Floats, interval: float) -> Floats:
     """Return the rhythm of the rows with the smallest delays, by morphological opening."""
     rows = interval * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / interval) + 1, len(t))
-    least = _running_minimum(t - rows, window)
+    earliest = _running_minimum(t - rows, window)
     # in the last window, an increase by whole intervals is caused by lost rows
-    end, jitter = least[len(t) - window:], 0.25     # of an interval: allowance for jitter
+    end, jitter = earliest[len(t) - window:], 0.25     # of an interval: allowance for jitter
     end[:] = end[0] + interval * np.floor((end - end[0]) / interval + jitter)
-    even = rows - _running_minimum(-least[::-1], window)[::-1]
+    even = rows - _running_minimum(-earliest[::-1], window)[::-1]
     return even + np.median(t - even)      # a constant delay is not corrected
 
 
@@ -202,14 +202,14 @@ def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
     """Return the deviation of the travel of rows from the cubic through adjacent rows: (m,)."""
     last = len(t) - 1
     nodes = [np.clip(rows + step, 0, last) for step in NODES]
-    times, here = [t[node] for node in nodes], t[rows]
+    times, t_row = [t[node] for node in nodes], t[rows]
     predicted = np.zeros(len(rows))      # Lagrange's form of the cubic, minus travel
     for node, time in zip(nodes, times, strict=True):
         weight = np.ones(len(rows))
         for other in times:
             if other is not time:
                 difference = time - other        # 0 for simultaneous rows, or at an end
-                weight *= (here - other) / np.where(np.abs(difference) > 1e-9, difference, 1e-9)
+                weight *= (t_row - other) / np.where(np.abs(difference) > 1e-9, difference, 1e-9)
         predicted += weight * (travel[node] - travel[rows])
     return np.where((rows + NODES[0] >= 0) & (rows + NODES[-1] <= last), -predicted, 0.0)
 

@@ -27,18 +27,18 @@ STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
-                       found: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
+                       reasons: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
     """
     Return rows and times, s, without false or repeated counts; false increments are interpolated.
 
-    name : of the odometer, for the reasons, which are added to ``found``.
+    name : of the odometer, for the reasons, which are added to ``reasons``.
     """
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
-            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'counts are frozen or isolated outliers, first at t = '
-                                f'{t[np.argmax(false)]:.2f} s; dropped'))
+            reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
+                                  'counts are frozen or isolated outliers, first at t = '
+                                  f'{t[np.argmax(false)]:.2f} s; dropped'))
         samples, t = take(samples, ~false), t[~false]
         held = held_counts(samples.value, form.modulus)
         return take(samples, ~held), t[~held]
@@ -48,9 +48,9 @@ def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
             good = np.interp(t, t[~false], samples.value[~false].astype(float))
             kept: NDArray[Any] = np.where(false, good, samples.value).astype(samples.value.dtype)
             samples = replace(samples, value=kept)
-            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'increments are isolated outliers, first at t = '
-                                f'{t[np.argmax(false)]:.2f} s; replaced by interpolation'))
+            reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
+                                  'increments are isolated outliers, first at t = '
+                                  f'{t[np.argmax(false)]:.2f} s; replaced by interpolation'))
     return samples, t
 
 
@@ -194,7 +194,7 @@ def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
     It is v^2 / 2a with the smallest published speed v and the acceleration a of adjacent rows.
     """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
-    least = 2 * travel.coarse.step if travel.coarse else 0.0
+    min_speed = 2 * travel.coarse.step if travel.coarse else 0.0
     # least ratio to the counted travel in a dead band
     dead_band_ratio = 1.5
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
@@ -204,7 +204,7 @@ def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
         rows = rows[(rows >= 0) & (rows < len(size))]
         v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
         duration = abs(travel.t[rows[-1]] - travel.t[rows[0]])
-        if v > least and change > 0 and duration > 0:
+        if v > min_speed and change > 0 and duration > 0:
             counted = v * (travel.t[edge + 1] - travel.t[edge]) / 2
             total = min(v**2 * duration / (2 * change), v)      # no longer than 2 s
             hidden[edge] = total - counted if total > dead_band_ratio * counted else 0.0

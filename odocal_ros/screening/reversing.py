@@ -49,23 +49,25 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     if len(begins) < 2:
         return none
     force = _Forces(t, t_imu, w_b, f_b)
-    before, here, after = (travel.at(t + d) for d in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
-    acceleration = (before - 2 * here + after) / ACCELERATION_TIME**2
+    before, middle, after = (travel.at(t + d) for d in (
+        -ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
+    acceleration = (before - 2 * middle + after) / ACCELERATION_TIME**2
     ratio, sigma = np.array([_ratio(t, acceleration, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
-    driven = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
+    path = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
     significant = np.abs(ratio) > FAULT_SIGMAS * sigma
-    forward_sign = np.sign((driven * np.sign(ratio))[significant].sum())
+    forward_sign = np.sign((path * np.sign(ratio))[significant].sum())
     usual = significant & (np.sign(ratio) == forward_sign)
     if not forward_sign or not usual.any():
         return none
     usual_ratio = np.median(np.abs(ratio[usual]))
     low, high = 0.5, 2.0    # limits of the ratio of a reversed start over the usual one
-    back = significant & ~usual & (np.abs(ratio) > low * usual_ratio) & (
+    is_reversed = significant & ~usual & (np.abs(ratio) > low * usual_ratio) & (
         np.abs(ratio) < high * usual_ratio)
-    back &= (t[ends] > between[0]) & (t[begins] < between[1])
+    is_reversed &= (t[ends] > between[0]) & (t[begins] < between[1])
     # at the last step of the grid the vehicle still moves
-    return np.stack([t[begins[back]] - ACCELERATION_TIME, t[ends[back]] + ACCELERATION_TIME], -1)
+    return np.stack([t[begins[is_reversed]] - ACCELERATION_TIME,
+                     t[ends[is_reversed]] + ACCELERATION_TIME], -1)
 
 
 def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
@@ -80,30 +82,30 @@ def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
                   REVERSING_STEP)
     begins, ends = _sections_between_stops(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
     spans = np.stack([t[begins] - ACCELERATION_TIME, t[ends] + ACCELERATION_TIME], -1)
-    driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
+    path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
     slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
     least_backwards = 1.0    # m of path
-    twice = slipped / np.maximum(2 * driven, least_backwards)
+    twice = slipped / np.maximum(2 * path, least_backwards)
     low, high = 0.8, 1.2    # of twice the path length, as slip of a reversed section
-    return spans[(driven > least_backwards) & (twice > low) & (twice < high)]
+    return spans[(path > least_backwards) & (twice > low) & (twice < high)]
 
 
-def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
+def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, evidence: str,
                       signed: bool) -> tuple[Reason, ...]:
-    """Return REVERSING_UNSIGNED with the reversed sections; seen: BY_IMU or BY_FIT."""
+    """Return REVERSING_UNSIGNED with the reversed sections; evidence : BY_IMU or BY_FIT."""
     if not len(spans):
         return ()
     how = 'the counter does not count down' if signed else 'odometer.signed is false'
-    driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
+    path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
     each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
-            for (a, b), m in zip(spans.tolist(), driven.tolist(), strict=True)]
+            for (a, b), m in zip(spans.tolist(), path.tolist(), strict=True)]
     most_listed = 3    # sections listed in the text
     more = f' and {len(each) - most_listed} more' if len(each) > most_listed else ''
     times = f'{len(each)} time{"s" * (len(each) > 1)}'
-    return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen} while the odometer counts up: the '
-                   f'vehicle reversed and {how}; counted as reverse: '
+    return (Reason(Code.REVERSING_UNSIGNED, f'{times} {evidence} while the odometer counts up: '
+                   f'the vehicle reversed and {how}; counted as reverse: '
                    f'{"; ".join(each[:most_listed])}{more}'),)
 
 
@@ -136,8 +138,8 @@ class _Forces:
         self.angle = integral_at(t, t_imu, w_b)
         times = [t + d for d in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
         self.speed_before, self.speed = integrals_at(times[:2], t_imu, f_b)
-        before, here, after = twice_integrals_at(times, t_imu, f_b[:, 0])
-        self.along = (before - 2 * here + after) / ACCELERATION_TIME**2
+        before, middle, after = twice_integrals_at(times, t_imu, f_b[:, 0])
+        self.along = (before - 2 * middle + after) / ACCELERATION_TIME**2
 
 
 def _ratio(t: Floats, acceleration: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:

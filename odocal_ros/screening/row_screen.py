@@ -55,16 +55,16 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
 
 
 def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
-                found: list[Reason]) -> tuple[Any, Floats]:
+                reasons: list[Reason]) -> tuple[Any, Floats]:
     """Return the usable rows of a topic, and their times from the start mark, s: (n,)."""
     sent = leg.rows(slot)
     if slot in WHEELS:
         sent = _zero_faded_speeds(sent)
-    good, impossible = _finite(sent, slot, leg, found)
+    good, impossible = _finite(sent, slot, leg, reasons)
     clean = sent if good.all() else take(sent, good)
     clean = _separate_equal_stamps(clean) if slot in WHEELS else clean
-    clean = _spread_packets(clean, found) if slot == 'imu' else clean
-    order = _rising(clean, slot, leg, found)
+    clean = _spread_packets(clean, reasons) if slot == 'imu' else clean
+    order = _rising(clean, slot, leg, reasons)
     clean = clean if order is None else take(clean, order)
     t = work_array(len(clean.stamp_ns))
     for some in chunks(len(t)):
@@ -75,18 +75,18 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     elif slot in WHEELS and leg.form_of(slot).quantity == 'rate':
         spikes = glitches.speed_glitches(t, clean.value.astype(float))
     if spikes.any():
-        found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
-                            f'{LABEL[slot]} messages are isolated outliers, first at t = '
-                            f'{t[np.argmax(spikes)]:.2f} s; dropped'))
+        reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
+                              f'{LABEL[slot]} messages are isolated outliers, first at t = '
+                              f'{t[np.argmax(spikes)]:.2f} s; dropped'))
         # outliers and impossible values together may be a damaged group, unless one was found
         if not glitches.near_impossible_groups(impossible).any():
             rows = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
             impossible[rows[spikes]] = True
-            spikes |= _damaged(impossible, good, slot, found)[rows]
+            spikes |= _damaged(impossible, good, slot, reasons)[rows]
         clean, t = take(clean, ~spikes), t[~spikes]
     if len(sent.stamp_ns) and not len(t) and slot in NO_ROW_CODES:
         zero = int((sent.stamp_ns <= 0).sum())
-        found.append(Reason(
+        reasons.append(Reason(
             NO_ROW_CODES[slot],
             f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
             + f': {zero} have no stamp (0)' * (zero > 0),
@@ -107,7 +107,7 @@ def _time_text(samples: Samples, index: int, leg: Leg) -> str:
     return f't = {(samples.received_ns[index] - leg.start_ns) * 1e-9:.2f} s (arrival)'
 
 
-def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
+def _finite(samples: Any, slot: str, leg: Leg, reasons: list[Reason]) -> tuple[Bools, Bools]:
     """Return masks of rows with a stamp and all required values, and of finite impossible rows."""
     stamped = samples.stamp_ns > 0
     finite, impossible = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
@@ -129,26 +129,26 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
                       (stamped & ~finite, bad_value)):
         if bad.any():
             first = int(np.argmax(bad))
-            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
-                                f'{LABEL[slot]} messages {what}, first at '
-                                f'{_time_text(samples, first, leg)}; dropped',
-                                '' if stamped[first] else _unstamped_remedy(slot)))
+            reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
+                                  f'{LABEL[slot]} messages {what}, first at '
+                                  f'{_time_text(samples, first, leg)}; dropped',
+                                  '' if stamped[first] else _unstamped_remedy(slot)))
     good = stamped & finite
-    suspect = _damaged(impossible, good, slot, found,
+    suspect = _damaged(impossible, good, slot, reasons,
                        min(glitches.DAMAGED_SHARE * len(impossible), glitches.SEVERAL_ROWS))
     return good & ~suspect, impossible
 
 
-def _damaged(impossible: Bools, good: Bools, slot: str, found: list[Reason],
+def _damaged(impossible: Bools, good: Bools, slot: str, reasons: list[Reason],
              limit: float = np.inf) -> Bools:
     """Return rows near groups of impossible rows; add ROWS_DAMAGED, or for more than ``limit``."""
     suspect = glitches.near_impossible_groups(impossible)
     count = int(impossible.sum())
     if suspect.any() or count > limit:
-        found.append(Reason(Code.ROWS_DAMAGED, f'{count} of {len(impossible)} {LABEL[slot]} '
-                            'messages hold impossible values or are outliers; '
-                            f'{int((suspect & good & ~impossible).sum())} messages next to them '
-                            'were dropped too'))
+        reasons.append(Reason(Code.ROWS_DAMAGED, f'{count} of {len(impossible)} {LABEL[slot]} '
+                              'messages hold impossible values or are outliers; '
+                              f'{int((suspect & good & ~impossible).sum())} messages next to them '
+                              'were dropped too'))
     return suspect
 
 
@@ -173,7 +173,7 @@ def _separate_equal_stamps(samples: Any) -> Any:
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
 
 
-def _spread_packets(imu: Any, found: list[Reason]) -> Any:
+def _spread_packets(imu: Any, reasons: list[Reason]) -> Any:
     """Return IMU samples; packets of one stamp are distributed over the time since the last."""
     stamp, packed_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
     step = np.diff(stamp)
@@ -189,29 +189,29 @@ def _spread_packets(imu: Any, found: list[Reason]) -> Any:
     usual = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
     duration = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
     rows_to_last = np.repeat(first + count - 1, count) - np.arange(len(stamp))
-    found.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
-                        f'{LABEL["imu"]} messages repeat the previous stamp: all messages of '
-                        'a packet have one stamp; they were spread evenly over the time since '
-                        'the previous packet',
-                        'Stamp each message with the time of its measurement.'))
+    reasons.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
+                          f'{LABEL["imu"]} messages repeat the previous stamp: all messages of '
+                          'a packet have one stamp; they were spread evenly over the time since '
+                          'the previous packet',
+                          'Stamp each message with the time of its measurement.'))
     return replace(imu, stamp_ns=stamp - rows_to_last * np.repeat(duration // count, count))
 
 
-def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:
+def _rising(samples: Samples, slot: str, leg: Leg, reasons: list[Reason]) -> Ints | None:
     """Return the largest set of rows with strictly increasing stamps; None for all."""
     stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all():
         return None
     keep = _longest_rising(stamp)
-    same, back = int((step == 0).sum()), int((step < 0).sum())
+    same, backward = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
     faults = [f'{same} repeat the previous stamp'] * (same > 0)
-    faults += [f'{back} backward step{"s" * (back > 1)} (up to {-step.min() * 1e-9:.3g} '
-               's)'] * (back > 0)
-    found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not increase: '
-                        f'{" and ".join(faults)}, first at {_time_text(samples, first, leg)}; '
-                        f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
+    faults += [f'{backward} backward step{"s" * (backward > 1)} (up to {-step.min() * 1e-9:.3g} '
+               's)'] * (backward > 0)
+    reasons.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not increase: '
+                          f'{" and ".join(faults)}, first at {_time_text(samples, first, leg)}; '
+                          f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
     return keep
 
 

@@ -52,56 +52,56 @@ def screen(leg: Leg, config: Config,
     """
     leg, levelled = with_assumed_force(leg, config)
     leg, local = without_north(leg, config)
-    found: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
-    found += _missing(leg, found)
+    reasons: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
+    reasons += _missing(leg, reasons)
     if check_faults:
         leg, clock_steps = clocks.without_clock_steps(leg)
-        found += [*clock_steps, *clocks.clock_reasons(leg, config)]
-    rows = _usable(leg, config, check_faults, found)
-    inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, found))
+        reasons += [*clock_steps, *clocks.clock_reasons(leg, config)]
+    rows = _usable(leg, config, check_faults, reasons)
+    inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, reasons))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
     wheels = rows.wheels      # the mean has the rows of the first one
     for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
-        found += topic_gap(slot, one.t)
+        reasons += topic_gap(slot, one.t)
     if check_faults:
-        found += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
-        found += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
-        found += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
+        reasons += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
+        reasons += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
+        reasons += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
-            wheels, reasons = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
-                                           (0.0, inputs.t_stop))
-            found += reasons
+            wheels, axle_reasons = usable_axles(
+                wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
+            reasons += axle_reasons
         inputs = replace(inputs, **_travel(leg, wheels))
     release_mapped_memory()
     if check_faults and not local:
-        inputs = _without_dead_reckoned(inputs, config, found)
-    return (inputs if levelled else _without_reversing(inputs, config, found)), tuple(found)
+        inputs = _without_dead_reckoned(inputs, config, reasons)
+    return (inputs if levelled else _without_reversing(inputs, config, reasons)), tuple(reasons)
 
 
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
     """Return a leg with all stamps on the clock of the IMU, its inputs, and all reasons."""
     inputs, reasons = screen(leg, config)
-    found, late_by = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
+    delay_reasons, late_by = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
     for clock, late in late_by.items():
         slots = [slot for slot, one in INPUTS.items() if one.clock == clock]
         by_ns = -round(late * 1e9)
         leg = leg.with_rows(**{
             slot: clocks.shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
-        found.append(Reason(
+        delay_reasons.append(Reason(
             Code.DELAY_SEEN, f'{INPUTS[slots[0]].label} stamps are about {abs(late):.1f} s '
             f'{"late" if late > 0 else "early"} relative to the IMU (estimated from the '
             'motion); the stamps were corrected',
             'Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with one clock.'))
-    if found:
+    if delay_reasons:
         inputs, reasons = screen(leg, config)
         inputs = replace(inputs, aligned=late_by)
-    return leg, inputs, (*found, *reasons)
+    return leg, inputs, (*delay_reasons, *reasons)
 
 
-def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
+def _missing(leg: Leg, reasons: list[Reason]) -> list[Reason]:
     codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
-    known = {reason.code for reason in found}      # NO_IMU if imu.frame_id is missing
+    known = {reason.code for reason in reasons}      # NO_IMU if imu.frame_id is missing
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
             for slot, code in codes.items()
             if not len(leg.rows(slot).stamp_ns) and code not in known]
@@ -119,11 +119,11 @@ class UsableTopics:
     external: dict[str, UsableRows]
 
 
-def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -> UsableTopics:
+def _usable(leg: Leg, config: Config, check_faults: bool, reasons: list[Reason]) -> UsableTopics:
     offset = clocks.stamp_offsets(config)
 
     def rows(slot: str) -> UsableRows:
-        sent, t = usable_rows(slot, leg, config, offset[slot], found)
+        sent, t = usable_rows(slot, leg, config, offset[slot], reasons)
         if check_faults and hasattr(sent, 'q_ni'):
             sent = without_invalid_orientations(sent)
         return UsableRows(sent, t)
@@ -132,18 +132,18 @@ def _usable(leg: Leg, config: Config, check_faults: bool, found: list[Reason]) -
     t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
     external = {slot: rows(slot) for slot in EXTERNAL_SLOTS}
     release_mapped_memory()
-    wheels = travel_of_wheels(leg, config, rows, found)
-    found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
-              for form in (leg.form, leg.form_right) if form and form.chosen]
+    wheels = travel_of_wheels(leg, config, rows, reasons)
+    reasons += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
+                for form in (leg.form, leg.form_right) if form and form.chosen]
     return UsableTopics(imu, t_imu, wheels, *rows('fix'), external)
 
 
-def _fixes(leg: Leg, config: Config, rows: UsableTopics, found: list[Reason]) -> dict[str, Any]:
+def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) -> dict[str, Any]:
     """Return fixes and external sensors as fields of Inputs; add the reasons for unused ones."""
     fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
     use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
-    found += fix_reasons
-    found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
+    reasons += fix_reasons
+    reasons += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]
     # receivers without a height publish 0
     height = fix.height if fix.height.any() or (fix.status == LOCAL).any() else np.full(
@@ -151,11 +151,11 @@ def _fixes(leg: Leg, config: Config, rows: UsableTopics, found: list[Reason]) ->
     geodetic = np.stack([fix.latitude, fix.longitude, height], -1)[use]
     rounding, rounding_reasons = rounding_variance(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
-    found += rounding_reasons
+    reasons += rounding_reasons
     contradiction = velocity_reasons(
         velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance
     ) if config.gnss.use_velocity else ()
-    found += contradiction
+    reasons += contradiction
     if contradiction:
         external = external | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
@@ -181,16 +181,17 @@ def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
             'uncertain_t': wheels.uncertain_t, 'uncertain_sigma': wheels.uncertain_sigma}
 
 
-def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+def _without_reversing(inputs: Inputs, config: Config, reasons: list[Reason]) -> Inputs:
     """Return inputs with the counts of starts in reverse made negative; add the reason."""
-    back = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
+    reversed_spans = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
                            (0.0, inputs.t_stop))
-    metres = locate_fixes(inputs, config).rough or None if len(back) else None
-    found += reversing_reasons(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
-    return inputs.mirrored(back)
+    metres = locate_fixes(inputs, config).rough or None if len(reversed_spans) else None
+    reasons += reversing_reasons(
+        reversed_spans, inputs.travel, metres, BY_IMU, config.odometer.signed)
+    return inputs.mirrored(reversed_spans)
 
 
-def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+def _without_dead_reckoned(inputs: Inputs, config: Config, reasons: list[Reason]) -> Inputs:
     """Return inputs without fixes that the receiver has dead-reckoned; add the reason."""
     located = locate_fixes(inputs, config)
     if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
@@ -204,11 +205,11 @@ def _without_dead_reckoned(inputs: Inputs, config: Config, found: list[Reason]) 
     steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    dropped, reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
-                                           np.interp(inputs.t_fix, t, track))
-    if not reasons:
+    dropped, drop_reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
+                                                np.interp(inputs.t_fix, t, track))
+    if not drop_reasons:
         return inputs
-    found += reasons
+    reasons += drop_reasons
     kept = ~dropped
     return replace(inputs, t_fix=inputs.t_fix[kept], geodetic=inputs.geodetic[kept],
                    covariance_n=inputs.covariance_n[kept], rounding_n=inputs.rounding_n[kept],

@@ -168,12 +168,12 @@ def _fit_right_wheel(design: Floats, y: Floats, floor: float) -> tuple[Floats, F
     drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_CELL
     fits = [robust_fit(design, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
-    least = min(sigma for _, _, sigma in fits)
+    smallest = min(sigma for _, _, sigma in fits)
     # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
     # straights to a fit with turns than to one without
     gyro_noise = 2e-4
     losses = [np.minimum(1.0, ((y - design @ x) / (
-        TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
+        TUKEY * np.hypot(smallest, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(losses))][:2]
 
 
@@ -185,9 +185,9 @@ def _rolling(steps: Floats, quantum: float) -> Bools:
 
 def _stalled_cells(pair: WheelPair, steps: Floats, k: int) -> Bools:
     """Return a mask of cells in which wheel k is still for 2 s or more while the other rolls."""
-    own, other = np.abs(steps[k]), np.abs(steps[1 - k])
+    this_wheel, other = np.abs(steps[k]), np.abs(steps[1 - k])
     other_rolls = _rolling(steps, pair.quantum)[1 - k]
-    still: Bools = pair.known & (own <= STALLED_SHARE * other) & other_rolls
+    still: Bools = pair.known & (this_wheel <= STALLED_SHARE * other) & other_rolls
     shortest_stall = 2.0    # s without a count while the other wheel rolls; shorter is slip
     for a, b in runs(still):
         if ((b - a) * FAULT_CELL < shortest_stall
@@ -239,9 +239,9 @@ def _dead_reasons(pair: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple
                    'wheel: the mean of both wheels is not the travel of the vehicle'),)
 
 
-def percent_text(part: float, whole: float) -> str:
+def percent_text(part: float, total: float) -> str:
     """Return part / whole as text in per cent."""
-    return f'{100 * part / whole:.2g} %'
+    return f'{100 * part / total:.2g} %'
 
 
 def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: float,
@@ -266,8 +266,9 @@ def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: f
     spans = [(a, b) for a, b in runs(against) if (b - a) * FAULT_CELL >= against_time]
     if ratio <= 0 or not spans:
         return ()
-    back = [-step[step < 0].sum() for step in steps]
-    unsigned = [k for k in (0, 1) if back[k] <= 3 * pair.quantum + STALLED_SHARE * back[1 - k]]
+    backward = [-step[step < 0].sum() for step in steps]
+    unsigned = [k for k in (0, 1)
+                if backward[k] <= 3 * pair.quantum + STALLED_SHARE * backward[1 - k]]
     which = (f'the {pair.names[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
              else 'one wheel counts up while the other counts down')
     a, b = spans[0]

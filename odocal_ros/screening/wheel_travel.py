@@ -30,8 +30,8 @@ from odocal_ros.screening.odometer_rows import (
 )
 from odocal_ros.settings.config import Config
 
-# known spans of whole counts, and of angles in rad or deg
-SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
+# known spans of integer counts, and of angles in rad or deg
+SPANS = {'integer': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
 NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
 
@@ -53,16 +53,16 @@ def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
     padded = np.pad(step, median_reach, mode='edge')
     usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1),
                       axis=-1)
-    whole = np.issubdtype(value.dtype, np.integer)
+    is_integer = np.issubdtype(value.dtype, np.integer)
     jump = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
     least_jump = 8.0    # counts, smallest jump against the travel
-    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + least_jump * whole, 1.5 * top)
+    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + least_jump * is_integer, 1.5 * top)
     rows = np.flatnonzero(large & (jump * usual <= 0))      # a frozen counter catches up forwards
     if not len(rows):
         return None
     size = np.abs(jump[rows])
-    tolerance = np.abs(usual[rows]) / 2 + (3.0 if whole else 1e-3 * size)
+    tolerance = np.abs(usual[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
     span, sigma = _span_of(value, rows, float(np.median(size)), float(np.median(tolerance)))
     agree = np.abs(size - span) <= 2 * tolerance
     agreeing_share = 0.8    # share of the jumps that must agree
@@ -76,8 +76,8 @@ def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
 
 def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[float, float]:
     """Return the span of jumps after rows with this median size, and its sigma; NaN: none."""
-    whole = np.issubdtype(value.dtype, np.integer)
-    spans = SPANS['whole' if whole else 'angle']
+    is_integer = np.issubdtype(value.dtype, np.integer)
+    spans = SPANS['integer' if is_integer else 'angle']
     known = float(spans[np.argmin(np.abs(spans - size))])
     # judgement, of the span: largest deviation of a single jump from a known span
     single_limit = np.inf if len(rows) > 1 else 0.01 * known
@@ -86,7 +86,7 @@ def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[
     fewest_jumps = 3    # for a span that is not a known one
     if len(rows) < fewest_jumps:
         return np.nan, 0.0
-    if not whole:
+    if not is_integer:
         return size, tolerance / np.sqrt(3 * len(rows))
     span, sigma = _measured_span(value, rows, size, tolerance)
     return (span, sigma) if span <= spans[-1] else (np.nan, 0.0)    # wider: values are damaged
@@ -130,7 +130,7 @@ def correct_rollovers(
     times = len(span.rows)
     about = f'about {span.size:.0f} (± {span.sigma:.0f})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
-    angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
+    angle = span.size in NAMED_SPANS     # exact, but odometer.wrap needs an integer
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
     do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
     # judgement: few counters roll over so often; values of two counters alternate
@@ -183,30 +183,30 @@ class Wheels:
 
 
 def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
-                     found: list[Reason]) -> Wheels:
-    """Return the travel of the wheels of a leg; reasons are added to ``found``."""
+                     reasons: list[Reason]) -> Wheels:
+    """Return the travel of the wheels of a leg; reasons are added to ``reasons``."""
     # rows(slot) gives usable rows and their times, s
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
     samples, t = rows(slots[0])
     if len(slots) == 1 and len(config.odometer.keys) > 1 and len(t):
-        found.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
-                            'marks: only the left wheel is used'))
-    wheels = [_corrected_travel(samples, t, leg.form, config, found, names[0])]
+        reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
+                              'marks: only the left wheel is used'))
+    wheels = [_corrected_travel(samples, t, leg.form, config, reasons, names[0])]
     for slot, name in zip(slots[1:], names[1:], strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
-            found.append(Reason(
+            reasons.append(Reason(
                 Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used'))
             return _joined(wheels[:1])
         samples, t = rows(slot)
         if not len(t):
-            found.append(Reason(Code.WHEEL_DEAD, f'the {name} wheel has no usable value between '
-                                f'the marks: only the {names[0]} wheel is used'))
+            reasons.append(Reason(Code.WHEEL_DEAD, f'the {name} wheel has no usable value between '
+                                  f'the marks: only the {names[0]} wheel is used'))
             return _joined(wheels[:1])
-        wheels.append(_corrected_travel(samples, t, form, config, found, name))
+        wheels.append(_corrected_travel(samples, t, form, config, reasons, name))
     return _joined(wheels)
 
 
@@ -215,19 +215,19 @@ def _joined(wheels: list[tuple[Travel, Floats, Floats]]) -> Wheels:
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
-                      found: list[Reason], side: str) -> tuple[Travel, Floats, Floats]:
+                      reasons: list[Reason], side: str) -> tuple[Travel, Floats, Floats]:
     """Return the travel of a wheel, times, s, and sigmas of its uncertain travel."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     uncertain_t = uncertain_sigma = np.empty(0)
     if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, reasons, uncertain_t, uncertain_sigma = correct_rollovers(
+        samples, new_reasons, uncertain_t, uncertain_sigma = correct_rollovers(
             t, samples, step, name, only_counter=not side)
-        found.extend(reasons)
-    samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
-    t = sampling_times(samples, t, form, found, f'{side} odometer'.strip())
-    travel, reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
-    found.extend(reasons)
+        reasons.extend(new_reasons)
+    samples, t = without_false_rows(samples, t, form, reasons, f'{side} odometer'.strip())
+    t = sampling_times(samples, t, form, reasons, f'{side} odometer'.strip())
+    travel, new_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
+    reasons.extend(new_reasons)
     travel, gap_t, gap_sigma = with_gap_uncertainty(travel, samples.value, form)
     return (replace(travel, name=side), np.append(uncertain_t, gap_t),
             np.append(uncertain_sigma, gap_sigma))

@@ -55,11 +55,11 @@ def first_values(run: Run, width: float) -> FirstValues:
     align = _Alignment(run, position, windows, scale_guess)
     # cost of the positions and of their mirror image for each width and ratio
     costs, mirrored = np.stack([align(w, RATIOS)[0] for w in np.log(WIDTHS)], axis=1)
-    least = costs.min(axis=1)
-    padded = np.pad(least, 1, constant_values=np.inf)
-    minima = np.flatnonzero((least <= padded[:-2]) & (least <= padded[2:]))
+    lowest = costs.min(axis=1)
+    padded = np.pad(lowest, 1, constant_values=np.inf)
+    minima = np.flatnonzero((lowest <= padded[:-2]) & (lowest <= padded[2:]))
     refined = []      # (cost, (log width, ratio - 1))
-    for k in minima[np.argsort(least[minima])][:MOST_MINIMA]:
+    for k in minima[np.argsort(lowest[minima])][:MOST_MINIMA]:
         guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
         better = minimize(lambda x: align(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
                           options={'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]],

@@ -168,21 +168,21 @@ def refused_planar_result(reasons: Iterable[Reason], unit: str) -> MethodResult:
 
 def _fit_reasons(fit: Fit) -> list[Reason]:
     """Return the reasons against a fit as a whole."""
-    found = [] if fit.converged else [Reason(
+    reasons = [] if fit.converged else [Reason(
         Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations; '
         'its uncertainties were doubled',
         'Check odometer.wheels, odometer.drive and the time offsets, and drive left and right '
         'turns.')]
     if fit.swapped:
-        found.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
-                            'left and right wheels are swapped'))
+        reasons.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
+                              'left and right wheels are swapped'))
     noisy = max(WHEEL_NOISE, key=lambda name: fit.levels[name])
     if fit.levels[noisy] > NOISE_LIMIT:
-        found.append(Reason(
+        reasons.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
             f'per metre ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive and the time offsets.'))
-    return found
+    return reasons
 
 
 def _gradient(quantity: Quantity, fit: Fit) -> Floats:

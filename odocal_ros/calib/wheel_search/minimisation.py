@@ -77,7 +77,7 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
     for three parameters.
     """
     n = len(gradient)
-    best, least = np.zeros(n), np.inf     # at least a corner is found
+    best, lowest = np.zeros(n), np.inf     # at least a corner is found
     for face in product((None, low, high), repeat=n):
         free = np.array([side is None for side in face])
         y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
@@ -87,8 +87,8 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
             if (y < low).any() or (y > high).any():
                 continue
         value = gradient @ y + y @ hessian @ y / 2
-        if value < least:
-            best, least = y, value
+        if value < lowest:
+            best, lowest = y, value
     return best
 
 
@@ -105,14 +105,14 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
     search = _BoxSearch(value, space, np.asarray(half, dtype=float),
                         np.asarray(width, dtype=float), x)
     first = last = search.surface()
-    iterations, most = 1, 300    # surfaces; with the widest range a hundred are needed
+    iterations, max_iterations = 1, 300    # surfaces; with the widest range a hundred are needed
     while True:
         converged = search.step(last)
         if converged and search.on_edge.any():
             if not (widen and search.widen()):
                 break
             converged = False
-        if converged or iterations == most:
+        if converged or iterations == max_iterations:
             break
         last = search.surface()
         iterations += 1
@@ -165,15 +165,15 @@ class _BoxSearch:
         shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < least_curvature * self.least)
         narrow = 1e-3    # share of the first width, box of the last surface
         converged = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
-        beyond = np.abs(move) > self.w
+        outside = np.abs(move) > self.w
         rounding = 1e-12    # share of the criterion by which equal values may differ
         if value_there <= self.least * (1 + rounding):
             self.q, self.least = self.q + move, value_there
         else:
-            beyond = self._to_best_of_grid(bound)
+            outside = self._to_best_of_grid(bound)
         grow, shrink = 2.0, 0.25
         larger = np.minimum(grow * self.w, self.first_width)
-        self.w = np.where(beyond, larger, np.where(shrinks, shrink * self.w, self.w))
+        self.w = np.where(outside, larger, np.where(shrinks, shrink * self.w, self.w))
         return converged
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:
@@ -230,8 +230,8 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     iterations, converged = 0, False
     r, J = _linearise(leg, space.T @ q)
     value = _value(leg, r, robust)
-    most = 200    # iterations; with reweighting a few are needed for each digit
-    while not converged and iterations < most:
+    max_iterations = 200    # iterations; with reweighting a few are needed for each digit
+    while not converged and iterations < max_iterations:
         iterations += 1
         root = np.sqrt(np.tile(weights(_d2(r), leg.sigma, robust), 2))
         step = _solve(root[:, None] * (J @ space.T), -root * r)

@@ -186,8 +186,8 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
         mean: Floats = d2.mean(axis=1)
         return mean
     z2 = d2 / np.maximum(sigma, LEAST_SIGMA)**2
-    far = z2 > HUBER**2
-    mean = np.where(far, 2 * HUBER * np.sqrt(np.where(far, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
+    tail = z2 > HUBER**2
+    mean = np.where(tail, 2 * HUBER * np.sqrt(np.where(tail, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
     return mean
 
 

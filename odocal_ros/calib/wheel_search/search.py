@@ -143,34 +143,34 @@ def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: boo
 
 def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
              fixed_difference: bool) -> tuple[Reason, ...]:
-    found = []
+    reasons = []
     if fixed_difference:
         sigma = 100 * free.sigma_difference
         how = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
                'do not separate left and right wheel')
-        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {how} (condition number '
-                            f'{free.condition:.2g}, correlation '
-                            f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
-                            'together'))
+        reasons.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {how} (condition number '
+                              f'{free.condition:.2g}, correlation '
+                              f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
+                              'together'))
     if refined.widened:
         changes = [f'{name} ± {_amount(k, before)} to ± {_amount(k, after)}'
                    for k, (name, before, after) in enumerate(zip(
                      NAMES, ranges.half, refined.half, strict=True)) if after > before]
-        found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
-                            f'range, which was widened: {", ".join(changes)}'))
+        reasons.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
+                              f'range, which was widened: {", ".join(changes)}'))
     if not refined.converged or refined.on_edge:
         where = 'ends on the edge of the widest range' if refined.on_edge else \
             f'has not converged after {refined.iterations} response surfaces'
-        found.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
+        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
     else:
         difference = np.abs(refined.x - direct.x)
         difference[2] = abs(wrap(difference[2]))
         share = float((difference / ranges.half).max())
         agree = 1e-3    # of the range: largest difference of surface and least squares
         if share > agree or not direct.converged:
-            found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
-                                f'differ by {100 * share:.2g} % of the range'))
-    return tuple(found)
+            reasons.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
+                                  f'differ by {100 * share:.2g} % of the range'))
+    return tuple(reasons)
 
 
 def _amount(k: int, value: float) -> str:

@@ -76,8 +76,8 @@ class Axle:
         roll = moving_mean((left_up[1:] + left_up[:-1]) / 2)
         path = np.linalg.norm(self.v_n[1:] + self.v_n[:-1], axis=1) * np.diff(self.state.t)
         share = path / max(path.sum(), 1e-9)
-        off = acceleration - share @ acceleration
-        by_acceleration = share @ (off * roll) / max(share @ off**2, 1e-9)
+        deviation = acceleration - share @ acceleration
+        by_acceleration = share @ (deviation * roll) / max(share @ deviation**2, 1e-9)
         bank: Floats = roll - share @ (roll - by_acceleration * acceleration)
         return bank
 

@@ -110,8 +110,8 @@ class Motion:
         out = copy(self)
         out.sums = self.sums.take(rows)
         for name in INTERVAL_ATTRIBUTES:
-            whole = getattr(self, name)
-            setattr(out, name, whole if whole is None else whole[rows])
+            values = getattr(self, name)
+            setattr(out, name, values if values is None else values[rows])
         return out
 
     @property

@@ -120,9 +120,9 @@ class PointRows(Factor):
         """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
         for _, size in self._sizes(self.r / np.sqrt(self.weight / self.rows_per_independent)):
-            far = np.maximum(size / TAIL_SIGMAS, 1.0)
+            excess = np.maximum(size / TAIL_SIGMAS, 1.0)
             total += float((np.minimum(size, TAIL_SIGMAS)**2
-                            + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
+                            + 2 * TAIL_SIGMAS**2 * np.log(excess)).sum())
         return total / self.rows_per_independent
 
     def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
@@ -162,10 +162,11 @@ class PointRows(Factor):
             interval = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
-            def gather(x: Floats, rows: slice = rows, own: Ints = interval, place: Ints = place,
-                       counts: Ints = counts, largest: int = largest) -> Floats:
+            def gather(x: Floats, rows: slice = rows, interval: Ints = interval,
+                       place: Ints = place, counts: Ints = counts,
+                       largest: int = largest) -> Floats:
                 out = np.zeros((len(counts), largest, *x.shape[1:]))
-                out[own, place] = x[rows]
+                out[interval, place] = x[rows]
                 return out.reshape(len(counts), -1, x.shape[2])
 
             yield present[some], gather

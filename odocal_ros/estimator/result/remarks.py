@@ -159,9 +159,9 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
     count, total = int(outlier.sum()), len(outlier)
     if count < max(LEAST_OUTLIERS, OUTLIER_SHARE * total):
         return []
-    far = np.hypot(*fixes.raw[outlier, :2].T).max()
+    largest = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {total} fixes ({100 * count / total:.0f} %) '
-                   f'are outliers, up to {far:.1f} m from the track; they were down-weighted',
+                   f'are outliers, up to {largest:.1f} m from the track; they were down-weighted',
                    POSE_OUTLIER_REMEDY if problem.leg.origin.is_local else '')]
 
 

@@ -138,6 +138,6 @@ class PaperDrive:
         with np.errstate(invalid='ignore', divide='ignore'):
             _, yaw = chord_error(north, east, dx, dy, chord, 1.0)
             across = (north * dy - east * dx) / chord
-        moved = chord > 1.0      # m: before, a chord has no direction
-        return Growth(path.t, np.where(moved, yaw, np.nan), np.where(moved, across, 0.0),
+        has_moved = chord > 1.0      # m: before, a chord has no direction
+        return Growth(path.t, np.where(has_moved, yaw, np.nan), np.where(has_moved, across, 0.0),
                       x[:, U])

@@ -28,11 +28,11 @@ def plane_error(latitude: Floats | float, longitude: Floats | float, central_mer
     of latitude: dx by dL to 1.2e-5, the cross terms to 1 %, dy by dlam to 0.3 %.
     """
     s, c = np.sin(latitude), np.cos(latitude)
-    off = central_meridian - longitude
+    to_meridian = central_meridian - longitude
     c0, c1 = 6367558.49686, 32005.79642    # m, of the arc of meridian
-    dx = ((c0 + c1 * (s * s - c * c) + C / 2 * np.cos(2 * latitude) * off**2) * dL
-          - C * s * c * off * dlam)
-    return dx, C * s * off * dL + C * c * dlam
+    dx = ((c0 + c1 * (s * s - c * c) + C / 2 * np.cos(2 * latitude) * to_meridian**2) * dL
+          - C * s * c * to_meridian * dlam)
+    return dx, C * s * to_meridian * dL + C * c * dlam
 
 
 def chord_error(x: Floats | float, y: Floats | float, dx: Floats | float, dy: Floats | float,

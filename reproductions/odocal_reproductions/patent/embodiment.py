@@ -129,8 +129,8 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     heading_step = np.deg2rad(0.25)
     half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
     array = nearly_balanced(LEVELS)     # 81 rows
-    small, whole = (_levels(rows, half) for rows in (array, full_factorial(LEVELS)))
-    (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, whole))
+    small, full = (_levels(rows, half) for rows in (array, full_factorial(LEVELS)))
+    (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, full))
     step = 2 * half / (np.array(LEVELS) - 1)
     spaces = Space(fixed_difference=False), Space(fixed_difference=True)
     refined, together = (
@@ -147,7 +147,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
         left, right, heading_deg = errors
         return row(name, np.array([left / radius, right / radius, np.deg2rad(heading_deg)]))
 
-    best = row(f'best of {len(small)}', x_small), row(f'best of all {len(whole)}', x_whole)
+    best = row(f'best of {len(small)}', x_small), row(f'best of all {len(full)}', x_whole)
     rows = [row_of('start values', (0.0, 0.0, 0.0))]
     rows += [row_of(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
     rows += [row_of('printed as best', FOUND), *best,
