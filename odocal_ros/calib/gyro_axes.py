@@ -119,7 +119,7 @@ def _inverted_turns(orientation: ImuOrientation, found: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
-            f'{orientation.inward:.2f} ± {orientation.inward_sigma:.2f} instead of 1)')
+            f'{orientation.inward:.2f} ± {orientation.inward_sigma:.1g} instead of 1)')
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:

@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, running_sum, runs
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_faults import robust_fit, WheelPair
+from odocal_ros.screening.wheel_faults import robust_fit, SENT_TWICE_REMEDY, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH
 
 # statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
@@ -94,7 +94,7 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least, track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
                        f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '
-                       'sent twice'),)
+                       'sent twice', SENT_TWICE_REMEDY),)
     if width - WHOLE_DRIVE_SIGMAS * sigma <= 0 < width + WHOLE_DRIVE_SIGMAS * sigma:
         return (Reason(Code.ODOMETER_CHOSEN, 'too few turns to test whether left and right wheel '
                        f'are swapped (track width from turns {width:.2f} ± {sigma:.2g} m): the '
@@ -154,4 +154,5 @@ def counter_reasons(pair: WheelPair, ratio: float, width: float,
     left, right = pair.names
     return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {right} wheel counts {ratio:.3f} times as '
                    f'much as the {left} wheel: the scale refers to the mean count, at a point '
-                   f'{abs(offset):.2f} m {"right" if offset > 0 else "left"} of the axle centre'),)
+                   f'{abs(offset):.2f} m {"right" if offset > 0 else "left"} of the axle centre',
+                   'Check the counts per revolution and the tyre size of both wheels.'),)

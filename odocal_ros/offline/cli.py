@@ -10,6 +10,7 @@ command as an extension of ros2cli, ``ros2 odocal``.
 """
 
 import argparse
+from difflib import get_close_matches
 import importlib
 import json
 import os
@@ -72,7 +73,10 @@ class _Parser(argparse.ArgumentParser):
         """Refuse unknown arguments here: the parser of the command names its own help."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+            options = [word for word in unknown if word.startswith('-')] or unknown
+            similar = get_close_matches(options[0], self._option_string_actions, 1, 0.75)
+            self.error(f'unrecognized arguments: {" ".join(options)}'
+                       + ''.join(f'; did you mean {name}?' for name in similar))
         return found, unknown
 
 

@@ -182,11 +182,13 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
     reasons = []
     if not any(w_b[some].any() for some in chunks(len(w_b))):
         reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
-                              'imu.gyro_scale is 0'))
+                              'imu.gyro_scale is 0', 'Check the gyro in the IMU driver, or name '
+                              'another topic with --imu-topic.'))
     no_gravity = 0.01    # m/s^2, far below gravity in any unit
     if size < no_gravity:
         reasons.append(Reason(Code.NO_IMU, 'the acceleration contains no gravity: the IMU '
-                              'publishes none or removes gravity, or imu.accel_scale is 0'))
+                              'publishes none or removes gravity, or imu.accel_scale is 0',
+                              'Publish accelerations that include gravity (REP-145).'))
         return tuple(reasons), False
     if not 0.85 * G < size < 1.15 * G:
         if 0.85 < size < 1.15:

@@ -89,8 +89,9 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         reasons.append(Reason(
             NO_ROW_CODES[slot],
             f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
-            + f': {zero} have no stamp (0)' * (zero > 0),
-            _unstamped_remedy(slot) * (zero > 0)))
+            + (f': {zero} have no stamp (0)' if zero else ': values are missing or impossible'),
+            _unstamped_remedy(slot) if zero else 'Check the driver that sends these messages, and '
+            'wait for valid values before the drive.'))
     return clean, t
 
 

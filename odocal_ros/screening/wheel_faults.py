@@ -28,6 +28,8 @@ TUKEY = 4.685
 FAULT_CELL = 0.5          # s, judgement: duration of a cell
 STALLED_SHARE = 0.02      # judgement: of the other wheel's travel; a stalled wheel travels less
 OTHER_WHEEL_COUNTS = 8    # judgement: least counts of the other wheel during a stall
+SENT_TWICE_REMEDY = ('Check odometer.left and odometer.right, and in the driver that each wheel '
+                     'has its own counter.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
     left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
-                       'twice'),)
+                       'twice', SENT_TWICE_REMEDY),)
     stalled = [_stalled_cells(pair, steps, k) for k in (0, 1)]
     any_stalled = np.any(stalled, axis=0)
     turn = np.diff(pair.turn)

@@ -199,7 +199,8 @@ def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, 
             reasons.append(Reason(
                 Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
-                f'{names[0]} wheel is used'))
+                f'{names[0]} wheel is used', 'Publish both wheels as one kind of value. If only '
+                'the modulus differs, set odometer.wrap.'))
             return _joined(wheels[:1])
         samples, t = rows(slot)
         if not len(t):

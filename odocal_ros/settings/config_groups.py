@@ -111,8 +111,9 @@ class AcceptConfig:
     def __post_init__(self) -> None:
         for name, (low, high) in self.limits.items():
             if not low < high:
-                raise BadConfig(f'accept.{name}_min = {low:g} is not below accept.{name}_max = '
-                                f'{high:g}')
+                unit = ' rad' * name.endswith('angle')
+                raise BadConfig(f'accept.{name}_min = {low:g}{unit} is not below '
+                                f'accept.{name}_max = {high:g}{unit}')
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:

@@ -143,6 +143,7 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
     (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: required: 0 to 180'),
     (['--storage', 'tape'], '--storage tape: required: one of mcap'),
     (['--frobnicate'], 'unrecognized arguments: --frobnicate (see odocal simulate --help)'),
+    (['--fix-nois', 'rtk', '--sede', '2'], 'unrecognized arguments: --sede; did you mean --seed?'),
     (['--real', 'squad=1'], 'no such parameter; similar: squat'),
     (['--real', 'squat'], 'required: finite numbers'),
     (['--vehicle', 'real', '--odometer', 'speed'], 'has its own odometer'),

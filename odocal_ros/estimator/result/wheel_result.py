@@ -127,7 +127,9 @@ def _track_width(left: Wheel, right: Wheel,
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
                              f'match the gyro turns: the track width would be {width:.2g} m; '
-                             f'the lower limit is {TRACK_WIDTH.least:g} m')]
+                             f'the lower limit is {TRACK_WIDTH.least:g} m',
+                             'Check that odometer.left and odometer.right are the wheels of one '
+                             'axle, or set odometer.track_width.')]
     limit = TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least)
     if sigma >= limit:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
@@ -136,8 +138,8 @@ def _track_width(left: Wheel, right: Wheel,
     far = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * configured, sigma))
     if configured and abs(width - configured) > far:
         return Estimate(width, sigma, 'm'), [Reason(
-            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} ± '
-            f'{sigma:.4f} m; odometer.track_width is {configured:.4g} m; the limit of the '
+            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.3f} ± '
+            f'{sigma:.2g} m; odometer.track_width is {configured:.4g} m; the limit of the '
             f'difference is {far:.2g} m')]
     return Estimate(width, sigma, 'm'), []
 
