@@ -232,8 +232,8 @@ class Code(Enum):
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
                              'affected.')
-    METHODS_DISAGREE = CAUTION, ('Check the likely cause above. Drive again with stops at both '
-                                 'marks and turns in between.')
+    METHODS_DISAGREE = CAUTION, ('Check the cause that METHODS_DISAGREE names. Drive again with '
+                                 'stops at both marks and turns in between.')
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '
                               'slip (scale), a moved IMU (angles), driver timing (delays), bad '

@@ -46,7 +46,7 @@ def fit_text(scale: SpeedScale) -> str:
     offset, lag = scale.offset, scale.lag
     low = 'low' if offset[0] > 0 else 'high'
     later = 'later' if lag[0] > 0 else 'earlier'
-    return (f'Fit: factor {with_sigma(*scale.factor)}; the odometer reads '
+    return (f'Fit: scale factor {with_sigma(*scale.factor)}; the odometer reads '
             f'{with_sigma(abs(offset[0]), offset[1])} m/s {low} and is '
             f'{with_sigma(abs(lag[0]), lag[1])} s {later} than the fixes')
 
@@ -58,7 +58,7 @@ def by_speed(scale: SpeedScale, name: str) -> style.Drawing:
     style.add_legend(figure, ax)
     fit = fit_text(scale) or 'No fit: the speed varies too little'
     text = ('Path length from the fixes divided by that of the raw odometer. Each point is a '
-            'group of sections of a few seconds. A constant factor gives a level line. '
+            'group of sections of a few seconds. A constant factor gives a horizontal line. '
             f'{fit}.')
     return 'Scale against speed', text, style.svg(figure, f'{name}-by-speed', text)
 
@@ -74,9 +74,9 @@ def by_window(windows: Floats, name: str) -> style.Drawing:
     ax.set_xticks(length, [f'{x:g}' for x in length], minor=False)
     ax.set_xticks([], minor=True)
     text = ('Ratio of displacements, fixes to calibrated track, minus 1, in windows of seconds to '
-            'minutes. Bars: one sigma, from the scatter over eight parts of the leg. A level line '
-            'at 0 shows that fix errors do not depend on the motion. If short windows differ, the '
-            'fixes contain an odometer, or are filtered or late.')
+            'minutes. Bars: one sigma, from the scatter over eight parts of the leg. A horizontal '
+            'line at 0 shows that fix errors do not depend on the motion. If short windows '
+            'differ, the fixes contain an odometer, or are filtered or late.')
     picture = style.svg(figure, f'{name}-by-window', text)
     return 'Scale against the length of the window', text, picture
 
