@@ -166,9 +166,10 @@ class LinkedLegs:
 
     def _leg_equations(self, legs: 'LegInformation', scatter: dict[str, float] | None,
                        ) -> tuple[Floats, Floats, float, int]:
-        """Return H, g and cost at zero of the legs alone, and the rank of their information."""
-        # the drifting constant of a leg is the sum of its steps from the leg on: rows and columns
-        # of the steps are sums over the legs up to each
+        """Return H, g, the cost at x = 0 and the rank of the information of the legs alone."""
+        # with the scatter eliminated, a leg has the information D - T DA'. Its drifting constant
+        # is the sum of the steps from this leg on, so rows and columns of a step are sums over
+        # the legs up to it
         J, k = len(legs.D), self.drifting
         common = np.delete(np.arange(len(self.names)), k)
         T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
@@ -176,11 +177,11 @@ class LinkedLegs:
         g_legs = gradient + (legs.D @ offset[:, :, None]
                              - T @ (np.swapaxes(DA, 1, 2) @ offset[:, :, None]))[:, :, 0]
         cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())
-        of_drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', T, DA[:, k])
+        drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', T, DA[:, k])    # (J, m) column k
         total = legs.D.sum(axis=0) - np.tensordot(T, DA, ((0, 2), (0, 2)))
-        across = np.cumsum(of_drifting[:, common], axis=0)
-        steps = np.cumsum(of_drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
-        return (np.block([[total[np.ix_(common, common)], across.T], [across, steps]]),
+        by_step = np.cumsum(drifting[:, common], axis=0)
+        steps = np.cumsum(drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
+        return (np.block([[total[np.ix_(common, common)], by_step.T], [by_step, steps]]),
                 np.concatenate([g_legs.sum(axis=0)[common], np.cumsum(g_legs[:, k])]), cost, rank)
 
     def solve(self, scatter: dict[str, float] | None = None) -> tuple[Floats, Floats]:

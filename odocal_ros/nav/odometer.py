@@ -16,7 +16,7 @@ from odocal_ros.reasons import Code, Reason
 # judgement: a step this many times the 95th percentile of the moving rate is not motion
 RESET_FACTOR = 5.0
 # s to each side of a row for smoothing. Judgement: in which a vehicle accelerates evenly
-SMOOTHED = 0.2
+SMOOTHING_REACH = 0.2
 FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
 
 
@@ -37,13 +37,13 @@ class Travel:
 
     def smoothed(self) -> 'Travel':
         """
-        Return travel with the rounding of counts averaged, by parabolas over SMOOTHED.
+        Return travel with the rounding of counts averaged, by parabolas.
 
         The slope between rounded rows is no speed: rounding would change with the delay, and a fit
         with few other errors would not converge. Rows beside gaps and at the ends are kept.
         """
         step = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
-        m = int(SMOOTHED / step)        # rows to each side
+        m = int(SMOOTHING_REACH / step)        # rows to each side
         if m < 2 or len(self.t) <= 2 * m:
             return self
         # parabola by least squares at its middle (Savitzky and Golay 1964)
@@ -114,15 +114,19 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
         return first
     if not all(len(one.t) for one in others):
         return Travel(first.t[:0], first.s[:0], first.quantum)
-    all_have = (first.t >= max(one.t[0] for one in others)) & (
+    common = (first.t >= max(one.t[0] for one in others)) & (
         first.t <= min(one.t[-1] for one in others))
-    t = first.t[all_have]
-    s = sum((one.at(t) for one in others), first.s[all_have]) / len(travels)
+    t = first.t[common]
+    s = sum((one.at(t) for one in others), first.s[common]) / len(travels)
     return Travel(t, s - (s[0] if len(s) else 0.0), first.quantum / np.sqrt(len(travels)))
 
 
 def without_rollover(step: Values, modulus: int) -> Values:
-    """Return steps (n,) without rollovers; modulus: counts, 0: floats; 64 bits wrap already."""
+    """
+    Return steps, (n,), without rollovers.
+
+    modulus : of the counter; 0 for floats. Differences of 64-bit integers wrap already.
+    """
     half = modulus // 2
     return (step + half) % modulus - half if 0 < modulus < 2**63 else step
 

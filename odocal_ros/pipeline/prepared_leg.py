@@ -36,7 +36,7 @@ from odocal_ros.settings.config import Config
 
 # called with the number of passes, and Stage.change
 PassCallback = Callable[[int, float], None]
-WHOLE_FROM = 10.0     # judgement: sigmas, larger ones are shown without decimals
+SHOWN_WITHOUT_DECIMALS = 10.0     # judgement: sigmas, from which on a change is
 FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
@@ -73,9 +73,9 @@ class Stage:
         """Return the stage as text."""
         if not self.passes:
             return self.name
-        change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'
+        decimals = 0 if self.change >= SHOWN_WITHOUT_DECIMALS else 2
         return (f'{self.name}, {self.passes} pass{"es" * (self.passes > 1)} done, remaining '
-                f'change {change} sigma')
+                f'change {self.change:.{decimals}f} sigma')
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +216,10 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if not prepared.origin.is_local:       # else the position on the Earth is unknown
         fields |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
                               prepared.origin.height)}
-    pin, between, path_length, found = _compared_section(prepared, after, start)
+    pin, between, path_length, section_reasons = _compared_section(prepared, after, start)
     fields['reference_n'] = prepared.fixes_n[between]
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
-        return fields, found
+        return fields, section_reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residual_before, residual_after = (
         track_check.track_residuals(path, pin, fixes) for path in paths)
@@ -231,7 +231,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
                              start, paths, prepared.config, prepared.t_fit, prepared.covered)
     return fields | {'evidence': evidence}, (
-        *found, *track_check.worse_check_reasons(*errors, bool(prepared.nominal)),
+        *section_reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal)),
         *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
                                                   evidence.fix_distance))
 
@@ -241,12 +241,12 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     start = prepared.mark(prepared.covered[0], path, 'start')
     if start is None:
         return {}, ()
-    pin, between, path_length, found = _compared_section(prepared, path, start)
+    pin, between, path_length, reasons = _compared_section(prepared, path, start)
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
-        return {}, found
+        return {}, reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residuals = track_check.track_residuals(path, pin, fixes)
-    return {'check': asdict(track_check.track_statistics(residuals, path_length))}, found
+    return {'check': asdict(track_check.track_statistics(residuals, path_length))}, reasons
 
 
 def _compared_section(prepared: PreparedLeg, path: Path,

@@ -85,7 +85,8 @@ def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
 # 25 C, 2 % more over temperature), used as 3 sigma; factory-calibrated MEMS have about 0.3 %,
 # fibre gyros some hundred ppm, ring lasers some ppm: orders of magnitude, not of one product.
 # Accelerometer scale: 3 % at most for a new consumer chip (MPU-6050); calibrated 0.3 %; combined
-# with fibre gyros some hundred ppm, with ring lasers a hundred.
+# with fibre gyros some hundred ppm, with ring lasers a hundred. Columns: gyro noise, bias and walk
+# of the bias; the same of the accelerometer; scale errors of both; misalignment; g-sensitivity
 GRADES: dict[str, Grade] = {
     'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01, 0.5, 0.06),
     'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3, 0.1, 0.01),

@@ -189,8 +189,8 @@ def test_running_products_are_those_of_a_loop(n):
     eps_b = rng.standard_normal((max(n - 1, 0), 3)) * 1e-6
     x = x_0 = rng.standard_normal(6) * 1e-3
     loop = [x]
-    for S in error_model._steps(path, None, eps_b[..., None])[1:]:
-        loop.append(S[:, :6] @ loop[-1] + S[:, 6])
+    for transition in error_model._transitions(path, None, eps_b[..., None])[1:]:
+        loop.append(transition[:, :6] @ loop[-1] + transition[:, 6])
     # rounding of n products
     scale, atol = np.abs(loop).max(axis=0), 1e-15 * n
     assert_allclose(propagate(path, x_0, eps_b) / scale, loop / scale, rtol=0, atol=atol)

@@ -74,13 +74,14 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     digits = np.array([[k // p**i % p for i in range(m)] for k in range(q)])
     weight = p**np.arange(m)
     add = ((digits[:, None] + digits) % p) @ weight
-    whole = np.zeros((q, q, 2 * m - 1), np.int64)
+    # products of the polynomials, then their remainders by the modulus
+    products = np.zeros((q, q, 2 * m - 1), np.int64)
     for i, j in product(range(m), repeat=2):
-        whole[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
+        products[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
     modulus = irreducible(p, m)
     for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (modulus - x^m)
-        whole[..., k - m:k] -= whole[..., k, None] * np.array(modulus[:m], np.int64)
-    return add, (whole[..., :m] % p) @ weight
+        products[..., k - m:k] -= products[..., k, None] * np.array(modulus[:m], np.int64)
+    return add, (products[..., :m] % p) @ weight
 
 
 def irreducible(p: int, m: int) -> tuple[int, ...]:

@@ -114,60 +114,61 @@ def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float]
     x_0 : (6,) states at the first epoch.   eps_b : (3,) or (m - 1, 3) gyro drift in b, rad/s,
     constant or mean of each interval.   radius : see the module.
     """
-    S = _steps(path, radius, np.asarray(eps_b, dtype=float)[..., None])
-    _compose(S)
-    x: Floats = S[..., :6] @ np.asarray(x_0, dtype=float) + S[..., 6]
+    transitions = _transitions(path, radius, np.asarray(eps_b, dtype=float)[..., None])
+    _compose(transitions)
+    x: Floats = transitions[..., :6] @ np.asarray(x_0, dtype=float) + transitions[..., 6]
     return x
 
 
-def _steps(path: Path, radius: float | None, drift_b: Floats) -> Floats:
+def _transitions(path: Path, radius: float | None, drift_b: Floats) -> Floats:
     """
     Return the transition to each epoch, (m, 6, 7): [A | B], x_1 = A x_0 + B; the first is [I | 0].
 
     drift_b : (..., 3, 1) drift in b, rad/s.
     """
-    S = np.zeros((len(path.t), 6, 7))
-    S[:1, range(6), range(6)] = 1.0
-    drift_b = np.broadcast_to(drift_b, (len(S) - 1, 3, 1))
-    chunk = 4096    # steps at a time: in the cache it is three times as fast
-    for first in range(0, len(S) - 1, chunk):
+    transitions = np.zeros((len(path.t), 6, 7))
+    transitions[:1, range(6), range(6)] = 1.0
+    drift_b = np.broadcast_to(drift_b, (len(transitions) - 1, 3, 1))
+    chunk = 4096    # intervals at a time: in the cache it is three times as fast
+    for first in range(0, len(transitions) - 1, chunk):
         rows = slice(first, first + chunk)
-        _fill(S[1:][rows], path, slice(first, first + chunk + 1), rows, radius, drift_b[rows])
-    return S
+        _fill(transitions[1:][rows], path, slice(first, first + chunk + 1), rows, radius,
+              drift_b[rows])
+    return transitions
 
 
-def _fill(S: Floats, path: Path, epochs: slice, intervals: slice, radius: float | None,
+def _fill(transitions: Floats, path: Path, epochs: slice, intervals: slice, radius: float | None,
           drift_b: Floats) -> None:
-    """Write [A | B] of intervals into S; epochs: those at their edges."""
+    """Write [A | B] of intervals into transitions; epochs: those at their edges."""
     dt = np.diff(path.t[epochs])[:, None, None]
     latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude[epochs], path.height[epochs]))
     Fdt = coefficients(latitude, height, path.velocity_n[intervals], radius) * dt
     # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
-    S[..., :6] = Fdt + Fdt @ Fdt / 2
-    S[:, range(6), range(6)] += 1.0
+    transitions[..., :6] = Fdt + Fdt @ Fdt / 2
+    transitions[:, range(6), range(6)] += 1.0
     C_nb = path.C_nb[epochs]
     rotation = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
     # the drift of an interval acts for half of it on average
-    S[..., 6:] = Fdt[..., :3] @ rotation / -2
-    S[:, :3, 6:] -= rotation
+    transitions[..., 6:] = Fdt[..., :3] @ rotation / -2
+    transitions[:, :3, 6:] -= rotation
 
 
-def _compose(S: Floats) -> None:
+def _compose(transitions: Floats) -> None:
     """
     Replace transitions from epoch to epoch by those from the first epoch, in place: (n, 6, 7).
 
-    A parallel scan: blocks of steps are composed side by side, then their ends by recursion.
+    A parallel scan: blocks of transitions are composed side by side, then their ends by recursion.
     """
     most_steps = 64    # of a block
-    width = min(most_steps, max(2, int(np.sqrt(len(S)))))
-    for k in range(1, min(width, len(S))):
-        step = S[k::width]
-        step[:] = _product(step, S[k - 1::width][:len(step)])
-    ends = S[width - 1::width].copy()
+    width = min(most_steps, max(2, int(np.sqrt(len(transitions)))))
+    for k in range(1, min(width, len(transitions))):
+        step = transitions[k::width]
+        step[:] = _product(step, transitions[k - 1::width][:len(step)])
+    ends = transitions[width - 1::width].copy()
     if len(ends) > 1:
         _compose(ends)
     for k in range(width):
-        step = S[width + k::width]
+        step = transitions[width + k::width]
         step[:] = _product(step, ends[:len(step)])
 
 
