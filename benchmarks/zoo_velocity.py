@@ -57,7 +57,7 @@ def run_drive(seed, asked):
         row[name] = {'seconds': time.process_time() - begin, **outcome(calibration, drive.truth)}
         smoother = calibration.legs[0].methods.get('smoother')
         details = smoother.details if smoother else {}
-        row[name] |= {'outside': details.get('outside', {}).get('velocity'),
+        row[name] |= {'external': details.get('external', {}).get('velocity'),
                       'level': details.get('noise', {}).get('velocity')}
     return row
 

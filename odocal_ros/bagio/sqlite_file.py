@@ -26,11 +26,11 @@ COLUMNS = 4      # format: of rosbag2, id (NULL: it is the row number), topic_id
 INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
-AS_STORED = 'SELECT rowid, topic_id, timestamp, data FROM messages ORDER BY rowid'
+ROWS_AS_WRITTEN = 'SELECT rowid, topic_id, timestamp, data FROM messages ORDER BY rowid'
 # sorts row numbers, not rows with their data; without LIMIT sqlite ignores that order
-BY_TIME = ('SELECT m.rowid, topic_id, timestamp, data FROM (SELECT rowid AS row FROM messages '
-           'ORDER BY timestamp LIMIT -1) CROSS JOIN messages AS m ON m.rowid = row')
-TEXTS = ('name', 'type', 'serialization_format')
+ROWS_BY_TIME = ('SELECT m.rowid, topic_id, timestamp, data FROM (SELECT rowid AS row FROM '
+                'messages ORDER BY timestamp LIMIT -1) CROSS JOIN messages AS m ON m.rowid = row')
+TOPIC_COLUMNS = ('name', 'type', 'serialization_format')
 
 
 class LeafPages:
@@ -45,7 +45,7 @@ class LeafPages:
             raise ValueError('no page size')
         self._usable = self._size - head[20]
         pages = len(self._map) // self._size
-        self.cut = len(self._map) < struct.unpack_from('>I', head, 28)[0] * self._size
+        self.is_truncated = len(self._map) < struct.unpack_from('>I', head, 28)[0] * self._size
         found = ((self._first_row(page), page) for page in range(1, pages))
         self._pages = [page for row, page in sorted((r, p) for r, p in found if r is not None)]
 
@@ -55,31 +55,31 @@ class LeafPages:
         is_leaf = self._map[offset:offset + 1] == bytes([LEAF])
         return next((row for row, *_ in self._rows_of(page)), None) if is_leaf else None
 
-    def rows(self, keys: Container[int] | None, last: int = -1
+    def rows(self, topic_ids: Container[int] | None, last: int = -1
              ) -> Iterator[tuple[int, int, bytes]]:
         """
         Yield (topic_id, timestamp, data) of some topics in the order of writing.
 
-        keys : topics; None: all, without their data.   last : rows up to this one are skipped.
+        topic_ids : None: all topics, without data.   last : rows up to this one are skipped.
         """
         # bytes that all rows together can have: large rows do not share overflow pages
-        left = 2 * len(self._map)
+        remaining_bytes = 2 * len(self._map)
         for page in self._pages:
-            for row, key, time_ns, payload in self._rows_of(page):
+            for row, topic_id, time_ns, payload in self._rows_of(page):
                 if row <= last:              # a stale copy of a page has earlier rows
                     continue
                 data = b''
-                if keys is not None and key in keys:
+                if topic_ids is not None and topic_id in topic_ids:
                     try:
                         data = payload()
                     except (ValueError, IndexError, struct.error):
                         continue             # its overflow pages are missing
-                    left -= len(data)
-                    if left < 0:
+                    remaining_bytes -= len(data)
+                    if remaining_bytes < 0:
                         return
                 last = row
-                if keys is None or key in keys:
-                    yield key, time_ns, data
+                if topic_ids is None or topic_id in topic_ids:
+                    yield topic_id, time_ns, data
 
     def _rows_of(self, page: int) -> Iterator[tuple[int, int, int, Callable[..., Any]]]:
         """Yield (row, topic_id, timestamp, function that returns the data) of a page."""
@@ -90,32 +90,33 @@ class LeafPages:
                 offset = struct.unpack_from('>H', data, 8 + 2 * i)[0]
                 size, offset = _varint(data, offset)
                 row, offset = _varint(data, offset)
-                key, time_ns, skip = _record(data, offset)
+                topic_id, time_ns, skip = _record(data, offset)
             except (ValueError, IndexError, struct.error):
                 continue                     # not a row of messages
-            yield row, key, time_ns, partial(self._payload, data, offset, size, skip)
+            yield row, topic_id, time_ns, partial(self._payload, data, offset, size, skip)
 
     def _payload(self, data: bytes, offset: int, size: int, skip: int) -> bytes:
         """Return a row of ``size`` bytes at an offset of a page, without the first ``skip``."""
         if size > min(len(self._map), MESSAGE_BYTES * limit_factor()):
             raise ValueError('larger than the file')
-        # the part of a row in its page (fileformat2, 1.6); the rest is in a chain of other pages
+        # the part of a row in its page (fileformat2, 1.6: X, M, K); the rest is in a chain of
+        # overflow pages, each of which begins with the number of the next
         largest = self._usable - 35
         if size <= largest:
             return data[offset:offset + size][skip:]
-        least = (self._usable - 12) * 32 // 255 - 23
-        local = least + (size - least) % (self._usable - 4)
-        local = local if local <= largest else least
-        parts, have = [data[offset:offset + local]], local
+        smallest = (self._usable - 12) * 32 // 255 - 23
+        local = smallest + (size - smallest) % (self._usable - 4)
+        local = local if local <= largest else smallest
+        parts, length = [data[offset:offset + local]], local
         page = struct.unpack_from('>I', data, offset + local)[0]
-        while have < size:
+        while length < size:
             start = (page - 1) * self._size
             if page < 2 or start + self._size > len(self._map):
                 raise ValueError('overflow page missing')
-            whole = self._map[start:start + self._usable]
-            page = struct.unpack_from('>I', whole)[0]
-            parts.append(whole[4:4 + size - have])
-            have += len(parts[-1])
+            overflow = self._map[start:start + self._usable]
+            page = struct.unpack_from('>I', overflow)[0]
+            parts.append(overflow[4:4 + size - length])
+            length += len(parts[-1])
         return b''.join(parts)[skip:]
 
     def close(self) -> None:
@@ -173,13 +174,13 @@ class SqliteFile(BagFile):
         self._db = sqlite3.connect(f'file:{quote(str(path.resolve()))}?mode=ro&immutable=1',
                                    uri=True, check_same_thread=False)
         try:
-            self._guard()
+            self._restrict_sqlite()
             self._open()
         except BaseException:
             self.close()
             raise
 
-    def _guard(self) -> None:
+    def _restrict_sqlite(self) -> None:
         """Restrict sqlite to reading rows of tables, each no larger than file and limit."""
         db = self._db
         db.text_factory = lambda raw: raw.decode(errors='replace')
@@ -195,18 +196,18 @@ class SqliteFile(BagFile):
         """Yield the rows of a query, or raise Damaged."""
         steps = 10_000    # of sqlite's virtual machine between two checks of their number
         # for any file, plus a number for each byte: reading a row of ten bytes takes about 30
-        left = int((20_000_000 + 20 * self._size) * limit_factor()) // steps
+        checks_left = int((20_000_000 + 20 * self._size) * limit_factor()) // steps
 
         def stop() -> bool:
-            nonlocal left
-            left -= 1
-            return left < 0
+            nonlocal checks_left
+            checks_left -= 1
+            return checks_left < 0
         self._db.set_progress_handler(stop, steps)
         try:
             for row in self._db.execute(sql, values):  # noqa: UP028 that would close the cursor
                 yield row
         except sqlite3.Error as error:
-            raise Damaged('damaged pages' if left >= 0 else
+            raise Damaged('damaged pages' if checks_left >= 0 else
                           'its tables contain a cycle') from error
         except (OverflowError, ValueError) as error:
             raise Damaged('damaged pages') from error
@@ -218,10 +219,11 @@ class SqliteFile(BagFile):
             raise Damaged(f'{", ".join(sorted(views))}: no table')
         definitions = self._definitions()
         self._channels = {
-            key: Channel(topic, msgtype, 0, form, definitions.get(msgtype, ('', '')))
-            for key, topic, msgtype, form in self._query(
-                f'SELECT id, {", ".join(TEXTS)} FROM topics')
-            if isinstance(key, int) and all(isinstance(x, str) for x in (topic, msgtype, form))}
+            topic_id: Channel(topic, msgtype, 0, form, definitions.get(msgtype, ('', '')))
+            for topic_id, topic, msgtype, form in self._query(
+                f'SELECT id, {", ".join(TOPIC_COLUMNS)} FROM topics')
+            if isinstance(topic_id, int)
+            and all(isinstance(x, str) for x in (topic, msgtype, form))}
         try:
             self._count()
         except Damaged as error:
@@ -243,28 +245,29 @@ class SqliteFile(BagFile):
             self._leaf_pages = LeafPages(self.path)
         except (ValueError, struct.error, IndexError) as second:
             raise Damaged(f'{error}; {second}') from None
-        self.damage = 'cut off' if self._leaf_pages.cut else str(error)
+        self.damage = 'cut off' if self._leaf_pages.is_truncated else str(error)
 
     def _scan(self) -> Iterator[tuple[int, int]]:
         rows: Iterator[tuple[Any, ...]] = (
             self._leaf_pages.rows(None) if self._leaf_pages
             else self._query('SELECT topic_id, timestamp, NULL FROM messages'))
         before = -1
-        for key, time_ns, _ in rows:
-            if key in self._channels and is_valid_time(time_ns):
+        for topic_id, time_ns, _ in rows:
+            if topic_id in self._channels and is_valid_time(time_ns):
                 self._sorted &= time_ns >= before
                 before = time_ns
-                yield key, time_ns
+                yield topic_id, time_ns
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time; as written if damaged."""
         channels, last = self._channels_of(topics), -1
         if not self._leaf_pages:
             try:
-                for row, key, time_ns, raw in self._query(AS_STORED if self._sorted else BY_TIME):
-                    if key in channels and is_valid_time(time_ns):
+                sql = ROWS_AS_WRITTEN if self._sorted else ROWS_BY_TIME
+                for row, topic_id, time_ns, raw in self._query(sql):
+                    if topic_id in channels and is_valid_time(time_ns):
                         # text and numbers are not messages: readers count b'' as unreadable
-                        yield channels[key], time_ns, raw if isinstance(raw, bytes) else b''
+                        yield channels[topic_id], time_ns, raw if isinstance(raw, bytes) else b''
                     last = row
                 self._refuse_if_changed()
                 return
@@ -273,9 +276,10 @@ class SqliteFile(BagFile):
                 self._use_leaf_pages(error)
                 self._count()
         assert self._leaf_pages
-        for key, time_ns, raw in self._leaf_pages.rows(channels, last if self._sorted else -1):
+        skipped = last if self._sorted else -1
+        for topic_id, time_ns, raw in self._leaf_pages.rows(channels, skipped):
             if is_valid_time(time_ns):
-                yield channels[key], time_ns, raw
+                yield channels[topic_id], time_ns, raw
 
     def _refuse_if_changed(self) -> None:
         """Raise BadBag if the file was written since it was opened: SQL may see a mixture."""

@@ -15,10 +15,10 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST
 
-# motion without counts is a fault of the odometer if it is longer than wheels slide
-FURTHEST_SLIDE = 100.0      # m: physical
-LONGEST_SLIDE = 20.0        # s: physical, after it GNSS_MOVES is enough
-LEAST_SHARE = 0.01          # judgement, of the path
+# limits of a slide of locked wheels; more motion without counts is a fault of the odometer
+SLIDE_DISTANCE = 100.0      # m: physical
+SLIDE_TIME = 20.0           # s: physical; after a longer time, GNSS_MOVES is the limit
+LEAST_SHARE = 0.01          # judgement: share of the path without counts that is reported
 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -106,11 +106,11 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
     # 10 sigmas: judgement, a leg is longer. Many receivers state far more than their noise
     sigma = min(fix_sigma, fix_white_noise(fixes))
     fixes_move = np.hypot(*np.ptp(fixes, axis=0)) > max(min_motion, 10 * sigma)
-    pick = (travel.t >= 0) & (travel.t <= t_stop)
-    if pick.sum() < 2:
+    inside = (travel.t >= 0) & (travel.t <= t_stop)
+    if inside.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     # three counts: a wheel at rest on the edge of a pulse may count once in each direction
-    wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
+    wheels_move = np.ptp(travel.s[inside]) > 3 * travel.quantum
     if wheels_move and fixes_move:
         return _stopped_counter_reasons(travel, t, fixes, fix_sigma)
     if fixes_move:
@@ -141,10 +141,10 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
     end = travel.t[np.append(counts, len(travel.t) - 1)]
     found = []
     # shorter intervals cannot contain that distance
-    for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
+    for k in np.flatnonzero(end - begin > SLIDE_DISTANCE / FASTEST):
         # not at the end of the data: errors of the fixes of a parked vehicle move as far
-        is_no_slide = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
-        motion_limit = max(GNSS_MOVES if is_no_slide else FURTHEST_SLIDE, 10 * fix_sigma)
+        is_no_slide = end[k] - begin[k] > SLIDE_TIME and end[k] < travel.t[-1]
+        motion_limit = max(GNSS_MOVES if is_no_slide else SLIDE_DISTANCE, 10 * fix_sigma)
         distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], motion_limit)
         if distance >= motion_limit:
             found.append((distance, begin[k], end[k]))
@@ -166,8 +166,8 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
         t, p, count = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
-        has_left, is_before_end = (np.hypot(*(p - np.median(at, axis=0)).T) > limit
-                                   for at in (p[:count], p[-count:]))
+        has_left, is_before_end = (np.hypot(*(p - np.median(end_fixes, axis=0)).T) > limit
+                                   for end_fixes in (p[:count], p[-count:]))
         spans.append((t[np.argmax(has_left)], t[len(t) - 1 - np.argmax(is_before_end[::-1])]))
     return np.reshape(np.array(spans, float), (-1, 2))
 
@@ -224,7 +224,7 @@ def find_reachable(t_fix: Floats, fixes_n: Floats) -> Bools:
 def fix_white_noise(fixes_n: Floats) -> float:
     """Return the white noise of fixes, m, by the median of their second differences."""
     if len(fixes_n) < 5:
-        return 2.5      # typical, m
+        return 2.5      # m, of a receiver without corrections
     bend = np.diff(fixes_n[:, :2], n=2, axis=0)
     return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 

@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from odocal_ros.data import samples as kinds
+from odocal_ros.data import samples
 from odocal_ros.data.arrays import by_row, Ints, runs
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, WHEELS
 from odocal_ros.data.samples import (
@@ -27,11 +27,11 @@ from odocal_ros.errors import BadData
 
 MOST_DAYS = 7          # judgement: of a leg
 # slot -> function that returns no rows
-EMPTY: dict[str, Callable[[], Samples]] = {
+NO_ROWS: dict[str, Callable[[], Samples]] = {
     'imu_other': OtherImuSamples.none,
-    **{slot: getattr(kinds, one.kind).none for slot, one in INPUTS.items()}}
-SLOTS = tuple(EMPTY)
-OTHERS = (*WHEELS[2:], *EXTERNAL_SLOTS)      # definition: slots without a field of a leg
+    **{slot: getattr(samples, source.kind).none for slot, source in INPUTS.items()}}
+SLOTS = tuple(NO_ROWS)
+OTHER_SLOTS = (*WHEELS[2:], *EXTERNAL_SLOTS)      # definition: slots without a field in ``Leg``
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 
@@ -52,7 +52,7 @@ class Leg:
     odometer: OdometerSamples = field(default_factory=OdometerSamples.none)
     odometer_right: OdometerSamples = field(default_factory=OdometerSamples.none)
     fix: FixSamples = field(default_factory=FixSamples.none)
-    others: Mapping[str, Samples] = field(default_factory=dict)      # of OTHERS, by slot
+    others: Mapping[str, Samples] = field(default_factory=dict)      # of OTHER_SLOTS, by slot
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
 
@@ -63,12 +63,12 @@ class Leg:
 
     def rows(self, slot: str) -> Any:
         """Return the samples of a slot."""
-        rows = self.others.get(slot) if slot in OTHERS else getattr(self, slot)
-        return EMPTY[slot]() if rows is None else rows
+        rows = self.others.get(slot) if slot in OTHER_SLOTS else getattr(self, slot)
+        return NO_ROWS[slot]() if rows is None else rows
 
     def with_rows(self, **rows: Samples) -> 'Leg':
         """Return the leg with other samples in some slots."""
-        others = {slot: rows.pop(slot) for slot in OTHERS if slot in rows}
+        others = {slot: rows.pop(slot) for slot in OTHER_SLOTS if slot in rows}
         changed: dict[str, Any] = {'others': {**self.others, **others}, **rows}
         return replace(self, **changed)
 
@@ -82,7 +82,7 @@ class LegRecorder:
     """Collects blocks until a leg is closed; the result does not depend on their sizes."""
 
     def __init__(self) -> None:
-        self._rows = {slot: Rows(nothing) for slot, nothing in EMPTY.items()}
+        self._rows = {slot: Rows(no_rows) for slot, no_rows in NO_ROWS.items()}
         self.form = COUNTER
         self.form_right: OdometerForm | None = None
 
@@ -143,7 +143,8 @@ class LegRecorder:
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     """Return the part of a leg between two stamps; ``first_ns``: no IMU row before it."""
-    lead_ns = 10**9    # of odometer and fixes, for interpolation at the first row of the IMU
+    # odometer and fixes begin earlier, to be interpolated at the first row of the IMU
+    lead_ns = 10**9
     rows = {slot: _cut(leg.rows(slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
     rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
@@ -155,15 +156,15 @@ def _order_ns(stamp_ns: Ints, received_ns: Ints) -> Ints:
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
-def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
+def _cut(rows: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     """Return the rows between two stamps, and up to the first one after them."""
-    key = by_row(_order_ns, samples.stamp_ns, samples.received_ns)
-    after_ns = 600 * 10**9    # a first row later than that after a mark has no information on it
-    after = key[(key > stop_ns) & (key <= stop_ns + after_ns)]
+    time_ns = by_row(_order_ns, rows.stamp_ns, rows.received_ns)
+    latest_ns = stop_ns + 600 * 10**9    # later rows have no information on the mark
+    after = time_ns[(time_ns > stop_ns) & (time_ns <= latest_ns)]
     last_ns = after.min() if len(after) else stop_ns
-    keep = (key >= first_ns) & (key <= last_ns)
+    keep = (time_ns >= first_ns) & (time_ns <= last_ns)
     if keep.all():
-        return samples
+        return rows
     spans = runs(keep)
     # rows in order of time, the usual case, are a view and no copy
-    return take(samples, slice(*spans[0]) if len(spans) == 1 else keep)
+    return take(rows, slice(*spans[0]) if len(spans) == 1 else keep)

@@ -27,7 +27,7 @@ from odocal_ros.estimator.result.estimates import (
     OPTIONAL,
 )
 from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
-from odocal_ros.estimator.result.outcome import SCALES, with_model_floor
+from odocal_ros.estimator.result.outcome import IMPERFECTION_CONSTANTS, with_model_floor
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECTIONS, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
@@ -215,4 +215,5 @@ def _details(found: JointEstimate, value: Floats, C: Floats, sources: tuple[Sour
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
                          'between_legs': found.scatter,
                          'curvature': found.linearisation_error.tolist()},
-        **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}
+        **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])}
+           for i in IMPERFECTION_CONSTANTS}}

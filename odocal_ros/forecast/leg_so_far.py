@@ -5,7 +5,7 @@
 A leg while it is recorded: its faults, its profile of speed and yaw, and its running estimate.
 
 Faults are found by the functions that check a finished leg, in cell means, every few seconds in
-the worker process of the node. IMU gaps are found in the stamps at once, and are kept. Sigmas are
+the worker thread of the node. IMU gaps are found in the stamps at once, and are kept. Sigmas are
 predicted from the profile.
 """
 
@@ -152,10 +152,10 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
     if inside.sum() < 2:
         return 0.0
     times = t_fix[inside]
-    reckoned = np.interp(times, t, track.real) + 1j * np.interp(times, t, track.imag)
+    dead_reckoned = np.interp(times, t, track.real) + 1j * np.interp(times, t, track.imag)
     measured = fixes_n[inside, 0] + 1j * fixes_n[inside, 1]
     return float(np.angle(np.sum((measured - measured.mean())
-                                 * np.conj(reckoned - reckoned.mean()))))
+                                 * np.conj(dead_reckoned - dead_reckoned.mean()))))
 
 
 def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:

@@ -41,16 +41,16 @@ def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg
     """
     text = sentence(calibration)
     if parts and len(calibration.legs) > 1:
-        verdict = Verdict.worst(one.verdict for one in parts)
+        verdict = Verdict.worst(part.verdict for part in parts)
         sections = f' in {len(parts)} sections' if len(parts) > 1 else ''
-        text = (f'leg {leg_id}{sections}, {sum(one.distance for one in parts):.0f} m, '
+        text = (f'leg {leg_id}{sections}, {sum(part.distance for part in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
-    parts_of_answer = [text, within_limits]
+    sentences = [text, within_limits]
     for reason in cautions(calibration.reasons)[:MOST_REASONS]:
-        parts_of_answer += [str(reason), reason.remedy]
-    if advice and advice not in parts_of_answer:
-        parts_of_answer.append(f'Next: {advice}')
-    return calibration.verdict is not Verdict.REJECTED, _sentences(parts_of_answer)
+        sentences += [str(reason), reason.remedy]
+    if advice and advice not in sentences:
+        sentences.append(f'Next: {advice}')
+    return calibration.verdict is not Verdict.REJECTED, _sentences(sentences)
 
 
 def provisional_answer(at_stop: SessionView) -> str:
@@ -60,17 +60,17 @@ def provisional_answer(at_stop: SessionView) -> str:
     at_stop : view just before the stop mark. The answer has no verdict but *provisional*.
     """
     session, forecast = at_stop.session, at_stop.forecast
-    known = forecast.estimates if forecast else {}
+    estimates = forecast.estimates if forecast else {}
     estimate = 'there is no running estimate'
-    if any(e.value is not None for e in known.values()):
-        estimate = (f'the running estimate is {values_in_words(known)}, computed '
+    if any(e.value is not None for e in estimates.values()):
+        estimate = (f'the running estimate is {values_in_words(estimates)}, computed '
                     f'{at_stop.forecast_age_s:.0f} s before the end')
     faults = [f'The leg would be rejected: {reason}'
               for reason in at_stop.faults[:1] if at_stop.is_rejected_so_far]
-    of_all = ' of all legs' if session.legs else ''
+    combined = ' of all legs' if session.legs else ''
     return _sentences([
         f'provisional: leg {session.leg_id} is being computed; {estimate}', *faults,
-        f'The final result{of_all} with its verdict follows on ~/status and in the parameters '
+        f'The final result{combined} with its verdict follows on ~/status and in the parameters '
         'result.*; call ~/stop_leg again to wait for it'])
 
 
@@ -123,8 +123,8 @@ def hint(view: SessionView) -> str:
 
 def hint_action_first(view: SessionView) -> str:
     """Return the hint for a single line: in a leg the action comes before the estimate."""
-    fine = not (view.is_rejected_so_far or view.missing or view.clocks)
-    if view.session.state is State.RECORDING and fine:
+    has_problem = view.is_rejected_so_far or view.missing or view.clocks
+    if view.session.state is State.RECORDING and not has_problem:
         actions, facts = _recording_hint(view)
         return '; '.join([*(actions or ['drive on']), *facts])
     return hint(view)
@@ -162,10 +162,10 @@ def manoeuvres(view: SessionView) -> list[str]:
     """Return the missing manoeuvres of the leg, besides metres and standstill."""
     if view.session.state is not State.RECORDING:
         return []
-    required, least = [], view.leg.min_speed
-    if view.max_speed < least:
-        required.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
-                        f'({KMH * least:.0f} km/h)')
+    required, min_speed = [], view.leg.min_speed
+    if view.max_speed < min_speed:
+        required.append(f'{DRIVE}faster than leg.min_speed, {min_speed:.3g} m/s '
+                        f'({KMH * min_speed:.0f} km/h)')
     if view.config.reference.points and len(view.session.marks_of_leg()) < FEWEST_MARKS:
         required.append('call ~/mark at rest on each point')
     if view.two_wheels and 'smoother' in deciding_methods(view.session.config.method):
@@ -190,10 +190,11 @@ def _recording_hint(view: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint as two lists: actions, then facts."""
     metres, required = metres_to_go(view), manoeuvres(view)
     facts = list(map(str, view.faults[:1]))     # a caution, or a gap
-    slow = view.max_speed < view.leg.min_speed
-    if metres > 0 or slow:
+    is_slow = view.max_speed < view.leg.min_speed
+    if metres > 0 or is_slow:
         if metres > 0:
-            required = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in required)]
+            required = [f'drive {metres:.0f} m more',
+                        *(text.removeprefix(DRIVE) for text in required)]
         end = _end_text(view) if view.session.is_automatic else DRIVE_ON
         return [', '.join(required), end], facts
     if view.forecast is None:
@@ -227,11 +228,11 @@ def _end_text(view: SessionView) -> str:
 def advice_after_result(view: SessionView) -> str:
     """Return the advice after a result: the largest improvement, then the other quantities."""
     reasons, config = view.session.reasons, view.config
-    lacking = config.verdict.min_legs - len(view.session.legs)
-    if lacking > 0:
-        return f'drive {counted(lacking, "more leg")}'
-    if grave := cautions(reasons):
-        return grave[0].remedy
+    missing_legs = config.verdict.min_legs - len(view.session.legs)
+    if missing_legs > 0:
+        return f'drive {counted(missing_legs, "more leg")}'
+    if warnings := cautions(reasons):
+        return warnings[0].remedy
     save = '' if config.output.autosave or view.saved else 'call ~/save, or '
     text = ('drive on: legs start and end automatically' if config.leg.automatic else
             f'{save}drive another leg for a smaller sigma')

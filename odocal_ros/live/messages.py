@@ -40,9 +40,9 @@ def message_class(msgtype: str) -> Any:
     """Return the class of 'pkg/msg/Type', or raise BadConfig with the action."""
     match = MESSAGE_TYPE.fullmatch(msgtype)     # untrusted: it may be from the network
     try:
-        found = match and PathFinder.find_spec(match['package'])      # does not import it
-        if not (match and found and any(
-                Path(place, 'msg').is_dir() for place in found.submodule_search_locations or ())):
+        package = match and PathFinder.find_spec(match['package'])      # does not import it
+        folders = package.submodule_search_locations or () if package else ()
+        if not (match and any(Path(folder, 'msg').is_dir() for folder in folders)):
             raise ImportError
         return getattr(importlib.import_module(f'{match["package"]}.msg'), match['name'])
     except (ImportError, AttributeError):
@@ -66,29 +66,30 @@ def definition_of(kind: type) -> str:
 
 def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
     """Add the texts of a class and of all types that it uses."""
-    fields = {field: _in_msg(about) for field, about in kind.get_fields_and_field_types().items()}
-    texts[name] = ''.join(f'{whole} {field}\n' for field, (_, whole) in fields.items())
+    fields = {field: _msg_types(rclpy_type)
+              for field, rclpy_type in kind.get_fields_and_field_types().items()}
+    texts[name] = ''.join(f'{msg_type} {field}\n' for field, (_, msg_type) in fields.items())
     for base, _ in fields.values():
         if '/' in base and base not in texts:
             package, _, leaf = base.rpartition('/')
             _collect(getattr(importlib.import_module(f'{package}.msg'), leaf), base, texts)
 
 
-def _in_msg(about: str) -> tuple[str, str]:
+def _msg_types(rclpy_type: str) -> tuple[str, str]:
     """Return base type and type of a field in .msg: 'double[9]' is float64 and float64[9]."""
-    match = FIELD_TYPE.fullmatch(about)
+    match = FIELD_TYPE.fullmatch(rclpy_type)
     if match is None:
-        raise ValueError(f'a field of type {about}')
-    sequence, base, bound, longest, _, array = match.groups()
+        raise ValueError(f'a field of type {rclpy_type}')
+    sequence, base, bound, longest, _, count = match.groups()
     base = MSG_NAMES.get(base, base)
     text = base + (f'<={bound[1:-1]}' if bound else '')
     if sequence:
         return base, f'{text}[<={longest}]' if longest else f'{text}[]'
-    return base, text + (array or '')
+    return base, text + (count or '')
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
-    """A callback group that the executor skips while ``is_open`` is False."""
+    """Callback group that the executor skips while ``is_open`` is False: ``take`` reads then."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]

@@ -60,7 +60,7 @@ SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 
 def calibration_status(view: SessionView) -> DiagnosticStatus:
     """Return the content of ``~/status``; docs/interface.md describes each key."""
     session, results = view.session, view.results
-    hint, ok, found = answers.hint(view), answers.quantities_ok(view), view.observability
+    hint, ok, known = answers.hint(view), answers.quantities_ok(view), view.observability
     reasons = view.faults if session.state is State.RECORDING else session.reasons
     stage = view.stage if session.state is State.COMPUTING else Stage()
     keys = {
@@ -81,8 +81,8 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
         'required_yaw_sigma_deg': math.degrees(view.config.verdict.max_yaw_sigma),
         'manoeuvres': '; '.join(answers.manoeuvres(view)),
-        'observable': ', '.join(found.observable) if found else '',
-        'not_observable': '; '.join(found.not_observable) if found else '',
+        'observable': ', '.join(known.observable) if known else '',
+        'not_observable': '; '.join(known.not_observable) if known else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
         'saved': view.saved, 'save_trouble': view.save_trouble, 'lost': view.lost,
@@ -114,8 +114,8 @@ def current_value(view: SessionView, name: str) -> float:
     estimate = (view.forecast.estimates if view.forecast else {}).get(name.removesuffix('_sigma'))
     if estimate is None or estimate.value is None:
         return math.nan
-    found = estimate.sigma if name.endswith('_sigma') else estimate.value
-    return math.nan if found is None else float(found)
+    number = estimate.sigma if name.endswith('_sigma') else estimate.value
+    return math.nan if number is None else float(number)
 
 
 def level(view: SessionView) -> Any:
@@ -156,11 +156,11 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
     }[view.state]
     if view.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {view.restored}'
-    good = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
+    within_limits = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
     troubles = [f'{statement}: {trouble}' for statement, trouble in (
         ('the result is not saved', view.save_trouble),
         ('the journal cannot be written', view.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (state_text, *_changes(session), good, view.lost, hint,
+    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.lost, hint,
                                    _unused(session), *view.duplicate_publishers,
                                    losses_text(view.lost_messages), *troubles)))
 
@@ -225,16 +225,16 @@ class Publishing:
     """The publishers of the node, and its parameters ``result.*``."""
 
     def __init__(self, node: Node) -> None:
-        quiet = PublisherEventCallbacks(use_default_callbacks=False)
-        publish = partial(node.create_publisher, event_callbacks=quiet)
+        no_callbacks = PublisherEventCallbacks(use_default_callbacks=False)
+        publisher_of = partial(node.create_publisher, event_callbacks=no_callbacks)
         self._node = node
-        self._status = publish(DiagnosticArray, '~/status', LATCHED)
+        self._status = publisher_of(DiagnosticArray, '~/status', LATCHED)
         self.status_topic: str = self._status.topic_name      # resolved
-        self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
-        self._hint = publish(String, '~/hint', LATCHED)
-        self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
+        self._diagnostics = publisher_of(DiagnosticArray, '/diagnostics', 1)
+        self._hint = publisher_of(String, '~/hint', LATCHED)
+        self._plotted = {name: publisher_of(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
         self._last_messages: dict[Publisher, str] = {}        # last message of each
-        self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
+        self._paths = [publisher_of(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
         self._restored_results = self.results()      # published while no leg is kept
@@ -288,10 +288,10 @@ class Publishing:
             node = node.lstrip('/')      # with its namespace, to separate vehicles
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
-            input_status(f'{node}: {SLOT_NAMES.get(slot, slot)}', one.health, one.missing_reason(),
-                         one in needed, time.monotonic_ns())
-            for slot, one in recording.inputs.by_slot.items()
-            if one in needed or slot in recording.inputs.topics]))
+            input_status(f'{node}: {SLOT_NAMES.get(slot, slot)}', source.health,
+                         source.missing_reason(), source in needed, time.monotonic_ns())
+            for slot, source in recording.inputs.by_slot.items()
+            if source in needed or slot in recording.inputs.topics]))
 
     def _array(self, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
         array = DiagnosticArray(status=statuses)

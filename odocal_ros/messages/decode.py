@@ -190,7 +190,7 @@ class Reader:
                                               raw) if self._plan.is_known_type else None
             if view is None:
                 view = self._message_view(raw, deserialize)
-            if view is not None and self._plan.ready(view):
+            if view is not None and self._plan.complete(view):
                 self.unreadable += k
                 return k
             if view is not None:

@@ -167,7 +167,7 @@ class SensorPlan:
         self.columns = (*STAMP, *columns)
         self._build = build
 
-    def ready(self, view: View) -> bool:
+    def complete(self, view: View) -> bool:
         """Return True: nothing is determined by the first message."""
         return True
 

@@ -11,6 +11,7 @@ wheel, and their meaning.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral
+import re
 from typing import Any
 
 import numpy as np
@@ -45,8 +46,9 @@ class OdometerPlan:
     Fields to read from the messages of an odometer topic, and their meaning.
 
     Some of it is determined by the first message (does a JointState have positions? which of its
-    joints are wheels? is a field of an unknown type a whole number?); ``ready`` is called with
-    messages in order until it returns True.
+    joints are wheels? is a field of an unknown type an integer?): ``complete`` is called with
+    messages in order until it returns True. ``keys`` are the wheels in a message, joint names or
+    indices; ``form`` is the meaning of their values.
     """
 
     has_readings = True      # messages can be read as plain numbers
@@ -60,7 +62,7 @@ class OdometerPlan:
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
         self.unclear_reason = ''        # reason why the last message did not determine the wheels
-        self._check()
+        self._check_settings()
         has_key = _split_key(self.field)[1] or self.keys[0]
         self.selects_wheels = self._is_list() and not has_key
         if msgtype == JOINTS and not self.field:
@@ -74,7 +76,7 @@ class OdometerPlan:
             if len(self.fields) == 1 and not self.selects_wheels:
                 self._set_columns(self.field or self.fields[0])
 
-    def _check(self) -> None:
+    def _check_settings(self) -> None:
         """Raise an error for settings that must fail, before the first message."""
         if not self.is_known_type and not self.field and len(self.keys) < 2:
             raise BadData(
@@ -104,7 +106,7 @@ class OdometerPlan:
         base, _ = _split_key(self.field)
         return self.is_known_type and (not base or '[' in _value_types(self.msgtype)[base])
 
-    def ready(self, view: View) -> bool:
+    def complete(self, view: View) -> bool:
         """Complete the plan from a message; return False to repeat with the next one."""
         if self.columns:
             return True
@@ -123,22 +125,22 @@ class OdometerPlan:
 
     def _select_wheels(self, field: str, view: View) -> None:
         """Select the wheels among the values of a list, by their names."""
-        found = select_wheels(view.names, view.count(field))
-        if isinstance(found, str):
-            self.unclear_reason = found
+        choice = select_wheels(view.names, view.count(field))
+        if isinstance(choice, str):
+            self.unclear_reason = choice
             return
         side = {'odometer_right': 'right'}.get(
             self.slot, 'left' if self.odometer.own_topics else '')
         if side:
-            key = key_on_side(found, side)
+            key = key_on_side(choice, side)
             if not key:
-                self.unclear_reason = found.explanation
+                self.unclear_reason = choice.explanation
                 return
             self.keys = (key,)
         else:
-            self.keys = found.keys
+            self.keys = choice.keys
         self._set_columns(field)
-        self.form = replace(self.form, sides=found.sides, chosen=found.explanation)
+        self.form = replace(self.form, sides=choice.sides, chosen=choice.explanation)
 
     def _complete_unknown_type(self, view: MessageView) -> None:
         """Determine columns and meaning of an unknown type from its first message."""
@@ -159,8 +161,8 @@ class OdometerPlan:
     def _set_columns(self, field: str, kind: str = '') -> None:
         """Set columns and form for a field; ``kind`` of unknown types is that of their values."""
         self.form = self._odometer_form(field, kind)
-        is_whole = 'int' in (kind or self._kind(field))
-        dtype = np.int64 if is_whole else np.float64
+        is_integer = 'int' in (kind or self._kind(field))
+        dtype = np.int64 if is_integer else np.float64
         self.columns = STAMP * self.stamped + tuple(
             Column(dtype, 1, self._paths_of_wheel(field, key)) for key in self.keys)
 
@@ -172,15 +174,15 @@ class OdometerPlan:
         bits = 0
         if self.is_known_type:
             kind = self._kind(field)
-            bits = int(kind.lstrip('uintfloa'))
-        is_whole = 'int' in kind
+            bits = int(re.sub(r'\D', '', kind))      # such as 32 of uint32
+        is_integer = 'int' in kind
         joint = self.msgtype == JOINTS and _split_key(field)[0] in ('position', 'velocity')
         quantity = self.odometer.quantity
         if quantity == 'auto':
-            quantity = 'cumulative' if is_whole or joint and 'position' in field else 'rate'
+            quantity = 'cumulative' if is_integer or joint and 'position' in field else 'rate'
         modulus = (self.odometer.wrap or (2**bits if bits else 0)) * (
-            is_whole and quantity == 'cumulative')
-        unit = 'm/rad' if joint else 'm/pulse' if is_whole or quantity != 'rate' else '1'
+            is_integer and quantity == 'cumulative')
+        unit = 'm/rad' if joint else 'm/pulse' if is_integer or quantity != 'rate' else '1'
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:

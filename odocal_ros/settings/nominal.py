@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nominal values of the settings: scale, yaw mounting angle, and sensor errors of IMU grades."""
+"""Nominal values by the settings: scale factor, yaw mounting angle, errors of the IMU grade."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -64,9 +64,10 @@ def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
                      gyro_scale_error: float, accel_scale_error: float, misalignment: float,
                      gyro_by_force: float) -> Grade:
     """
-    Return the figures of a data sheet in SI units.
+    Return the grade with the figures of a data sheet, converted to SI units.
 
-    deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h); 1 twice; deg; deg/s/g.
+    Units: deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h); scale errors
+    relative; misalignment deg; gyro_by_force deg/s/g.
     """
     hour, root_hour = 3600.0, 60.0
     return Grade(
@@ -87,7 +88,7 @@ def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
 # Accelerometer scale: 3 % at most for a new consumer chip (MPU-6050); calibrated 0.3 %; combined
 # with fibre gyros some hundred ppm, with ring lasers a hundred. Columns: gyro noise, bias and walk
 # of the bias; the same of the accelerometer; scale errors of both; misalignment; g-sensitivity
-GRADES: dict[str, Grade] = {
+GRADES: dict[str, Grade] = {      # from the worst to the best
     'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01, 0.5, 0.06),
     'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3, 0.1, 0.01),
     'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4, 3e-4, 5e-4, 0.05,
@@ -132,8 +133,9 @@ def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuCon
     """
     if not variance:
         return imu
-    candidates = [dataclasses.replace(imu, grade=name) for name in GRADES][:list(GRADES).index(
-        imu.grade) + 1]
+    names = list(GRADES)
+    candidates = [dataclasses.replace(imu, grade=name)
+                  for name in names[:names.index(imu.grade) + 1]]
 
     def misfit(candidate: ImuConfig) -> float:
         grade = grade_of(candidate)

@@ -103,7 +103,7 @@ def test_velocity_errors_that_stay_promise_no_more():
     method = fitted(with_velocity(drive, slow), config)
     # neighbours have a correlation of 0.95: (1 + 0.95) / (1 - 0.95) = 39 count as one, less those
     # that the smoothing takes for motion
-    assert 10 < method.details['outside']['velocity']['alike'] < 80
+    assert 10 < method.details['external']['velocity']['rows_per_independent'] < 80
     assert off(method, drive, *BOTH) < 3.3
 
 
@@ -114,7 +114,7 @@ def test_velocity_errors_that_stay_promise_no_more():
     ({'velocity_scale_error': 0.02}, 'velocity_scale', 0.02, 0.005)])   # of a fused velocity
 def test_what_a_receiver_does_to_a_velocity_is_found_and_does_not_pull(error, name, true, sigma):
     drive, method = smoothed(**SHORT, velocity_sigma=SIGMA, **error)
-    found = method.details['outside']['velocity'][name]
+    found = method.details['external']['velocity'][name]
     assert abs(found['value'] - true) < 3.3 * found['sigma']
     assert found['sigma'] <= sigma
     assert off(method, drive, *BOTH) < 3.3
@@ -126,7 +126,7 @@ def test_a_delay_is_not_lost_in_vibration():
     leg = drive.leg()
     shake = 2.0 * np.random.default_rng(3).standard_normal(leg.imu.f_i.shape)
     leg = replace(leg, imu=changed(leg.imu, f_i=lambda f: np.add(f, shake, out=f)))
-    found = smooth(leg_of(leg, config), config).details['outside']['velocity']['velocity_delay']
+    found = smooth(leg_of(leg, config), config).details['external']['velocity']['velocity_delay']
     assert found['value'] == pytest.approx(0.3, abs=3.3 * found['sigma'])
     assert found['sigma'] < 0.08        # a third of the prior's
 
@@ -169,7 +169,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     both = 1 / np.hypot(1 / sigma, 1 / alone)
     assert 0.97 * both < sigma_of(method, 'yaw_mounting_angle') < 1.15 * both
     assert off(method, drive, *BOTH) < 3.3
-    assert method.details['outside']['heading']['source'].startswith(how[:3]) or how == 'topic'
+    assert method.details['external']['heading']['source'].startswith(how[:3]) or how == 'topic'
     shared = {s.name for s in method.sources if s.shared}
     assert 'heading' in shared
 

@@ -19,7 +19,7 @@ from odocal_ros.library.read_bag import journal_notes
 from odocal_ros.live import journal_writer
 from odocal_ros.live.journal import journal_text
 from odocal_ros.live.journal_writer import PreRoll
-from odocal_ros.live.messages import _in_msg, definition_of, message_class
+from odocal_ros.live.messages import _msg_types, definition_of, message_class
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, flat, with_settings
 
@@ -99,7 +99,7 @@ def test_a_replay_takes_the_topics_of_the_journal(tmp_path, capsys):
     ('sequence<pkg/Type>', 'pkg/Type', 'pkg/Type[]'), ('wstring', 'wstring', 'wstring'),
     ('sequence<boolean, 2>', 'bool', 'bool[<=2]'), ('pkg/Type[2]', 'pkg/Type', 'pkg/Type[2]')])
 def test_fields_are_written_as_in_a_msg_file(about, base, text):
-    assert _in_msg(about) == (base, text)
+    assert _msg_types(about) == (base, text)
 
 
 @pytest.mark.parametrize('msgtype', [

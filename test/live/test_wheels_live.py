@@ -105,7 +105,7 @@ def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
             found['value'], found['sigma']]
     assert four.status['left_right_ok'] == 'unknown'
     assert 'WHEELS_STEERED' in four.status['reasons']
-    seen = four.live['legs'][0]['methods']['smoother']['outside']['pressure']
+    seen = four.live['legs'][0]['methods']['smoother']['external']['pressure']
     assert seen['messages'] > 150       # means of a second
 
 

@@ -48,8 +48,8 @@ from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE
 
-# errors of IMU, receiver, tyres, body
-SCALES = range(layout.FIX_MOTION_TIME, layout.VELOCITY.start)
+# indices of the constants that are errors of IMU, receiver, tyres and body: in the details
+IMPERFECTION_CONSTANTS = range(layout.FIX_MOTION_TIME, layout.VELOCITY.start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class _Posterior:
 
 
 def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
-    """Return the result of a fit; it uses up ``fit.solved``."""
+    """Return the result of a fit; ``fit.solved`` cannot be used afterwards."""
     marginals = fit.solved.marginals()
     factor, reasons = find_mismatch(problem, fit, config)
     posterior = _posterior(problem, fit, factor)
@@ -78,7 +78,7 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     gyro_bias, bias_ratio = _estimate_gyro_bias(fit, marginals, factor)
     estimates |= of_wheels | gyro_bias
     ratio = {layout.CONSTANTS[i]: float(posterior.sigma_ratio[i])
-             for i in (*OPTIONAL, *SCALES)} | bias_ratio
+             for i in (*OPTIONAL, *IMPERFECTION_CONSTANTS)} | bias_ratio
     reasons += [*refusals, *wheel_reasons,
                 *_without_estimate(problem, fit, sigma, ratio, estimates)]
     reasons += assumed_noise_reasons(problem, fit.levels)
@@ -147,9 +147,10 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
 def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[str, float],
                       estimates: Mapping[str, Estimate]) -> list[Reason]:
     """Return the reason for constants without an estimate, but those of LEVER_ARM_OFF."""
-    named = {layout.CONSTANTS[i] for i in remarks.deviating_lever_arms(fit.state.constants, sigma)}
+    reported = {layout.CONSTANTS[i]
+                for i in remarks.deviating_lever_arms(fit.state.constants, sigma)}
     names = [name for name in ratio if name in estimates and estimates[name].value is None
-             and name not in named]
+             and name not in reported]
     return [not_observable_reason('this drive', names, problem.leg.origin.is_local)] \
         if names else []
 
@@ -187,15 +188,15 @@ def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     # a filter of unknown shape, or a late or held speed, also has errors at changes of speed
     level = '' if filtered or (sign > 0).any() else residuals.describe_slip_level(
         fit, marginals, count_m)
-    wheel_slips = tuple(s for s, one in zip(slips, sign, strict=True) if not one)
+    wheel_slips = tuple(slip for slip, is_other in zip(slips, sign, strict=True) if not is_other)
     return slips, [*filtered, *residuals.slip_reasons(wheel_slips, level), *travel_reasons(
         np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
 
 def with_model_floor(covariance: Floats) -> Floats:
     """Return the covariance plus the lower limit F^2 of model errors: docs/method.md (S31)."""
-    covariance, at = covariance.copy(), range(len(remarks.MODEL_FLOOR))
-    covariance[at, at] += remarks.MODEL_FLOOR**2
+    covariance, parameters = covariance.copy(), range(len(remarks.MODEL_FLOOR))
+    covariance[parameters, parameters] += remarks.MODEL_FLOOR**2
     return covariance
 
 
@@ -214,10 +215,10 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'f': K * state.forward,
         'noise': fit.levels.sigmas(),
         'iterations': fit.iterations, 'widened': float(factor),
-        'outside': _outside(problem, fit, sigma),
+        'external': _external_details(problem, fit, sigma),
         'posterior_to_prior': ratio,
         **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
-           for i in SCALES},
+           for i in IMPERFECTION_CONSTANTS},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': residuals.correlation(t_fix, fixes.r[:, :2]),
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
@@ -235,10 +236,10 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'key_biases': np.stack([state.gyro_bias, state.accel_bias])}
 
 
-def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
+def _external_details(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return details of the sensors besides IMU, odometer and fixes."""
     return {kind.name: {'messages': len(samples.t),
-                        'alike': problem.rows_per_independent.get(kind.name, 1.0),
+                        'rows_per_independent': problem.rows_per_independent.get(kind.name, 1.0),
                         **kind.details(samples, fit.state.constants, sigma)}
             for kind in EXTERNAL_FACTORS
             if (samples := problem.external.get(kind.name)) is not None}
