@@ -62,9 +62,9 @@ def choose(methods: Mapping[str, MethodResult],
     Also the methods that gave a value; if none did, the first usable one.   methods : by name.
     method_setting : the setting ``method``, or the methods that may give values.
     """
-    found = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))
-             if name in methods]
-    usable = [m for m in found if m.verdict is not Verdict.REJECTED] or found
+    results = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))
+               if name in methods]
+    usable = [m for m in results if m.verdict is not Verdict.REJECTED] or results
     estimates: dict[str, Estimate] = {}
     for method in usable:
         for name, estimate in method.estimates.items():
@@ -81,10 +81,10 @@ def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting:
                             | tuple[str, ...],
                             stated_codes: Iterable[Code] = ()) -> list[Reason]:
     """Return METHOD_REJECTED of rejected methods before a usable one, except stated_codes."""
-    found = [methods[name] for name in deciding_methods(method_setting) if name in methods]
-    sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
+    results = [methods[name] for name in deciding_methods(method_setting) if name in methods]
+    sound = [i for i, m in enumerate(results) if m.verdict is not Verdict.REJECTED]
     why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
-           for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
+           for m in results[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
     # a method without its data (a second wheel) is not reported
     return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r}',
                    f'{r.remedy} The values come from another method, which may not detect this '

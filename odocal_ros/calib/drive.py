@@ -139,7 +139,7 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
-    found = []
+    motions = []
     # shorter intervals cannot contain that distance
     for k in np.flatnonzero(end - begin > SLIDE_DISTANCE / FASTEST):
         # not at the end of the data: errors of the fixes of a parked vehicle move as far
@@ -147,8 +147,8 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
         motion_limit = max(GNSS_MOVES if is_no_slide else SLIDE_DISTANCE, 10 * fix_sigma)
         distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], motion_limit)
         if distance >= motion_limit:
-            found.append((distance, begin[k], end[k]))
-    return found
+            motions.append((distance, begin[k], end[k]))
+    return motions
 
 
 def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:

@@ -104,10 +104,10 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
           config: Config) -> tuple[tuple[str, float, float], ...]:
     """Return the gaps of IMU and odometer while the vehicle moves: (which, begin, end)."""
     travel = inputs.travel
-    found = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
-    found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
-              if travel.at(a) != travel.at(b)]      # some counters send nothing at rest
-    return tuple((name, float(a), float(b)) for name, a, b in found if a < span[1] and b > span[0])
+    gaps = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
+    gaps += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
+             if travel.at(a) != travel.at(b)]      # some counters send nothing at rest
+    return tuple((name, float(a), float(b)) for name, a, b in gaps if a < span[1] and b > span[0])
 
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:

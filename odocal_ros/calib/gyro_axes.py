@@ -94,37 +94,39 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
     axes, names = sensor_axes(up / np.linalg.norm(up))
-    found = by_course(inputs, located, w_i, axes, names)
-    if not found and inputs.has_accelerometer:
+    wrong_axes = by_course(inputs, located, w_i, axes, names)
+    if not wrong_axes and inputs.has_accelerometer:
         inverted = orientation and orientation.inward < min(
             INVERTED, -FAR_SIGMAS * orientation.inward_sigma)
         if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
-        found = by_gravity(inputs, located, w_i, f_i, axes, names)
+        wrong_axes = by_gravity(inputs, located, w_i, f_i, axes, names)
         if orientation and inverted:
-            return _inverted_turns(orientation, found, names)
-    if not found:
+            return _inverted_turns(orientation, wrong_axes, names)
+    if not wrong_axes:
         return ()
     action = ', '.join(
         f'negate angular_velocity.{sent}' if sent == true[-1] else
         f'publish angular_velocity.{sent} as {true[:-1]}angular_velocity.{true[-1]}'
-        for sent, true, _ in found)
-    if len(found) == 1 and found[0].published != found[0].true[-1]:
+        for sent, true, _ in wrong_axes)
+    if len(wrong_axes) == 1 and wrong_axes[0].published != wrong_axes[0].true[-1]:
         action += ', and check the other axes'
-    return (Reason(Code.GYRO_AXES, '; '.join(one.text for one in found),
+    return (Reason(Code.GYRO_AXES, '; '.join(one.text for one in wrong_axes),
                    f'Correct the IMU driver: {action}. {NO_ROTATION}'),)
 
 
-def _inverted_turns(orientation: ImuOrientation, found: list[WrongAxis],
+def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
             f'{orientation.inward:.2f} ± {orientation.inward_sigma:.1g} instead of 1)')
     level = [name[-1] for name in names[:2]]
-    wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
+    wrong = [axis for axis in level
+             if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
-        return (Reason(Code.IMU_AXES, f'{text}, and gravity rotates about {found[0].published} '
-                       f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
+        return (Reason(Code.IMU_AXES, f'{text}, and gravity rotates about '
+                       f'{wrong_axes[0].published} opposite to the gyro: '
+                       f'linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
                        + NO_ROTATION),)
     return (Reason(Code.GYRO_SIGN, f'{text}: the sign of angular_velocity.{names[2][-1]}, or of '

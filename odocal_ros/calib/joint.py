@@ -191,7 +191,7 @@ def scale_steps(marginals: Sequence[MarginalInformation], steps: Sequence[float]
 
     Arguments as for ``fit_jointly``. After a change, only later legs predict the scale.
     """
-    steps, found = np.array(steps, float), []
+    steps, changes = np.array(steps, float), []
     for j in range(1, len(marginals)):
         legs = LinkedLegs(marginals[:j + 1], drifting, steps[:j], angles)
         sigmas = float(legs.deviations()[j, legs.drifting])
@@ -201,5 +201,5 @@ def scale_steps(marginals: Sequence[MarginalInformation], steps: Sequence[float]
         legs = LinkedLegs(marginals[:j + 1], drifting, steps[:j], angles)
         x, _ = legs.solve()
         before, now = (x[legs.indices(k)[legs.drifting]] for k in (j - 1, j))
-        found.append(ScaleStep(j, float(now - before), sigmas))
-    return found
+        changes.append(ScaleStep(j, float(now - before), sigmas))
+    return changes

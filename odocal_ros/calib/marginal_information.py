@@ -171,7 +171,7 @@ def read_carried(content: dict[str, Any]) -> CarriedInformation:
 
 def _array(values: Any, shape: tuple[int, ...], null: float) -> Floats:
     """Return values as an array of a shape, ``null`` for None; raises ValueError otherwise."""
-    found = np.array([null if x is None else float(x) for x in np.ravel(values)])
-    if found.size != np.prod(shape) or np.isnan(found).any():
+    array = np.array([null if x is None else float(x) for x in np.ravel(values)])
+    if array.size != np.prod(shape) or np.isnan(array).any():
         raise ValueError(f'{np.size(values)} numbers; required: {shape}, or null')
-    return found.reshape(shape)
+    return array.reshape(shape)

@@ -58,16 +58,18 @@ class Mounting:
         return f'this drive does not determine which IMU axis points forward{by}'
 
 
-def remedy(found: Mounting) -> str:
+def remedy(estimate: Mounting) -> str:
     """Return the setting to make; the possible ones if the drive does not determine it."""
-    if found.C_bi is not None:
-        return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_listed(found.C_bi)}'"
-                + ", if the IMU's x axis points forward" * found.assumed + '.')
-    why = found.unclear[0].upper() + found.unclear[1:]
-    if found.forward_i is not None:
-        C = np.stack([found.forward_i, np.cross(found.up_i, found.forward_i), found.up_i])
+    if estimate.C_bi is not None:
+        return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_listed(estimate.C_bi)}'"
+                + ", if the IMU's x axis points forward" * estimate.assumed + '.')
+    why = estimate.unclear[0].upper() + estimate.unclear[1:]
+    if estimate.forward_i is not None:
+        left_i = np.cross(estimate.up_i, estimate.forward_i)
+        C = np.stack([estimate.forward_i, left_i, estimate.up_i])
         return f'{why}. Set imu.mounting_rpy to its angles, about {_listed(C, 2)} rad.'
-    upright = [C for C in _quarter_turns() if C[2] @ found.up_i > np.abs(found.up_i).max() - 1e-9]
+    upright = [C for C in _quarter_turns()
+               if C[2] @ estimate.up_i > np.abs(estimate.up_i).max() - 1e-9]
     by_axis = '; '.join(f'{"-+"[int(C[0].sum() > 0)]}{AXES[int(np.argmax(np.abs(C[0])))]}: '
                         f'{_listed(C)}' for C in upright)
     return (f'{why}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
@@ -86,9 +88,9 @@ def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
     """Return reasons, with the setting in IMU_AXES by the screened inputs."""
     if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
-    found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
-                     inputs.travel, 1.0)
-    return [replace(r, do=r.do or remedy(found)) if r.code is Code.IMU_AXES else r
+    estimate = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
+                        inputs.travel, 1.0)
+    return [replace(r, do=r.do or remedy(estimate)) if r.code is Code.IMU_AXES else r
             for r in reasons]
 
 
@@ -124,15 +126,15 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
     # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
     # accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later)
-    found = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
-    if found is None:
+    binned = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
+    if binned is None:
         return None, np.pi
-    A, F = found.onward + 1j * found.inward, found.force
+    A, F = binned.onward + 1j * binned.inward, binned.force
     fits = _angle(A, F), _angle(A.conj(), F)
     theta, sigma = next((fit for fit in fits if fit[1] <= MEANT_AXIS / 2), fits[0])
     if sigma > MEANT_AXIS / 2:
         return None, sigma
-    return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma
+    return np.cos(theta) * binned.e1 + np.sin(theta) * binned.e2, sigma
 
 
 def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:

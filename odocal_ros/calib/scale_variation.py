@@ -155,7 +155,7 @@ def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats)
     """
     known = np.flatnonzero(np.isfinite(parts.ratio) & (parts.ratio > 0))
     log, sigma = np.log(parts.ratio[known]), parts.sigma[known]
-    found = []      # (scatter over change, section of the change, factor)
+    candidates = []      # (scatter over change, section of the change, factor)
     for k in range(1, len(known) - 1):
         sides = [log[:k], log[k + 1:]]
         before, after = (np.median(side) for side in sides)
@@ -163,10 +163,10 @@ def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats)
         sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
         if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * sigma_of_change,
                                      scatter / SIDE_SCATTER):
-            found.append((scatter / abs(after - before), k, float(np.exp(before - after))))
-    if not found:
+            candidates.append((scatter / abs(after - before), k, float(np.exp(before - after))))
+    if not candidates:
         return ()
-    _, k, factor = min(found)
+    _, k, factor = min(candidates)
     begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], fix_distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
     if not 1 / MOST_DECODING < factor < MOST_DECODING:

@@ -68,9 +68,9 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     reasons += regression.counter_reasons(pair, ratio, width, max_deviation)
     residual = (pair.right - regressors @ x) * per_right
     events, slow_events = _find_events(pair, residual, per_right * (1 + ratio) / 2, width)
-    found, change = regression.find_ratio_change(
+    change_reasons, change = regression.find_ratio_change(
         _without_slips(pair, events), regressors, metres_per_unit, count)
-    reasons += found
+    reasons += change_reasons
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + slow_events)
     if change:
@@ -184,7 +184,7 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
 def _measure_jump(pair: WheelPair, residual: Floats,
                   windows: list[tuple[int, Floats, Floats, Bools]], a: int, b: int) -> Event:
     """Return the event in steps a to b, by its best window: (span, jump, limit, significant)."""
-    found = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
+    best = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
     for span, jump, limit, is_large in windows:
         low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
         at = low + np.flatnonzero(is_large[low:high])
@@ -192,9 +192,9 @@ def _measure_jump(pair: WheelPair, residual: Floats,
             k = int(at[np.argmax(np.abs(jump[at]))])
             # a longer window is better only if its jump is larger by more than its noise
             noise = limit[k] / WHOLE_DRIVE_SIGMAS
-            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * noise:
-                found = (float(jump[k]), float(limit[k]), k, span)
-    size, _, k, span = found
+            if abs(jump[k]) > abs(best[0]) + bool(best[1]) * noise:
+                best = (float(jump[k]), float(limit[k]), k, span)
+    size, _, k, span = best
     inner = residual[k:k + span + MEAN_STEPS]
     share = (inner - inner[:MEAN_STEPS].mean()) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0

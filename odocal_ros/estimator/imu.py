@@ -194,10 +194,11 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict
     if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
         return {}
     # people may get in and out, or load, during most of a stop: use the quarter with least motion
-    found = {name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
-                       MIN_NOISE.imu[name]**2)
-             for name, x in zip(('gyro', 'accel'), both, strict=True)}
-    return found if leg.has_accelerometer else {'gyro': found['gyro']}
+    variances = {
+        name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
+                  MIN_NOISE.imu[name]**2)
+        for name, x in zip(('gyro', 'accel'), both, strict=True)}
+    return variances if leg.has_accelerometer else {'gyro': variances['gyro']}
 
 
 def sample_noise(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:

@@ -150,7 +150,14 @@ def _times(step: Floats, signals: Floats) -> Floats:
 
 
 class _Chunk:
-    """Some intervals at once: sums from each interval's begin up to every step."""
+    """
+    Some intervals at once: sums from the start of an interval up to each of its steps.
+
+    Of n steps, in the axes of b at the start of their interval: R, v, p : attitude, velocity and
+    position at the start of the step.   step_v, step_p : single and double integral of the force
+    over it.   mean, twice : the same of R.   since : s, time to it.   Of K intervals: R_end, dv,
+    dp.
+    """
 
     def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
                  accel_bias: Floats, constants: Floats | None) -> None:
@@ -179,20 +186,18 @@ class _Chunk:
         q = quat_multiply(quat_from_rotvec(-rotate(self.G, gyro)),
                           quat_from_rotvec(imu.turn[rows]))
         q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
-        back = quat_conjugate(q[self.key[:-1]])[self.interval]
-        self.R = matrix_from_quat(quat_multiply(back, q[:-1]))
-        self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
+        to_start = quat_conjugate(q[self.key[:-1]])[self.interval]
+        self.R = matrix_from_quat(quat_multiply(to_start, q[:-1]))
+        self.R_end = matrix_from_quat(quat_multiply(to_start[self.key[1:] - 1], q[self.key[1:]]))
         # an error that rotates the step uniformly turns a force by its time since the start
-        self.grows = np.eye(3) + skew(self.turn) / 3
-        dv, dp, rotation = imu.dv[rows], imu.dp[rows], rotate(self.grows, gyro)
+        self.growth = np.eye(3) + skew(self.turn) / 3
+        dv, dp, rotation = imu.dv[rows], imu.dp[rows], rotate(self.growth, gyro)
         dv, dp = (dv - np.cross(rotation, dv - dp / dt) - rotate(self.G, accel),
                   dp - np.cross(rotation, dv * dt / 6) - rotate(self.GG, accel) * dt)
         self.step_v, self.step_p = rotate(self.R, dv), rotate(self.R, dp)
         self.v, self.dv = self._running(self.step_v)
         self.p, self.dp = self._running(self.v * dt + self.step_p)
-        # integrals of R over a step, single and double
         self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        # s, from the start of the interval to that of the step
         self.since = self.t[:-1] - self.t[self.key[:-1]][self.interval]
 
     def _gyro(self, x: Floats) -> Floats:
@@ -234,12 +239,13 @@ class _Chunk:
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
         dt, signals = self.dt[:, None], self.signals
         end, v, p = self.since[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
-        moment, grown = self.step_v - self.step_p / dt, self.R @ self.grows
+        moment, growing = self.step_v - self.step_p / dt, self.R @ self.growth
+        # rotation and force; velocity and position by rotations; position by forces
         self.sums = [self._before(*one) for one in (
             (self.mean, signals),
-            (_cross(v, self.mean) - _cross(moment, grown), signals[:, OF_GYRO]),
+            (_cross(v, self.mean) - _cross(moment, growing), signals[:, OF_GYRO]),
             (_cross(p + self.step_p - v * end, self.mean)
-             + _cross(moment * end - self.step_v * (dt / 6), grown), signals[:, OF_GYRO]),
+             + _cross(moment * end - self.step_v * (dt / 6), growing), signals[:, OF_GYRO]),
             (self.twice - self.mean * end[:, :, None], signals[:, OF_ACCEL]))]
 
     def _before(self, step: Floats, signals: Floats) -> Floats:
@@ -252,12 +258,13 @@ class _Chunk:
                  tau: Floats) -> tuple[Floats, ...]:
         """Return A to FF and the derivatives by the gyro, of errors in steps between (m,) cuts."""
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
-        turns, once, twice, late = (x[last] - x[first] for x in self.sums)
-        by_turn = self._gyro(turns[..., OF_GYRO])
-        once, force = self._gyro(once), turns[..., OF_ACCEL]
-        (A, F), (AA, FF) = self._accel(force), self._accel(force * tau[..., None] + late)
-        return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - once,
-                _cross(dp, by_turn) - once * tau - self._gyro(twice))
+        both, velocity, position, position_by_force = (x[last] - x[first] for x in self.sums)
+        by_turn, force = self._gyro(both[..., OF_GYRO]), both[..., OF_ACCEL]
+        velocity = self._gyro(velocity)
+        (A, F), (AA, FF) = self._accel(force), self._accel(
+            force * tau[..., None] + position_by_force)
+        return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - velocity,
+                _cross(dp, by_turn) - velocity * tau - self._gyro(position))
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""

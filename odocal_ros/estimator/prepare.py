@@ -157,13 +157,13 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma[layout.IMPERFECTIONS] = np.maximum(imperfection_sigmas(grade), layout.NO_ERROR)
     # at least the biases of the grade, also for a calibrated IMU: otherwise a bias would be
     # estimated as an axis error, and change the yaw of a tilted IMU
-    gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
+    gyro_bias, accel_bias = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
     # without latitude or north, the unknown Earth rate is a bias too
     if leg.origin.local_earth_rate:
         gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local_earth_rate.sigma_n)))
     # gravity times the scale error is a bias too
-    up = np.hypot(accel, grade.accel_scale_error * G)
-    accel_bias = np.maximum([accel, accel, up], 1e-6)
+    bias_up = np.hypot(accel_bias, grade.accel_scale_error * G)
+    accel_bias_sigma = np.maximum([accel_bias, accel_bias, bias_up], 1e-6)
     mean = np.zeros(layout.M)
     sigma[layout.LIFT] = LIFT_SIGMA
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
@@ -184,4 +184,4 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
         sigma[layout.ACCEL] = sigma[layout.PITCH] = layout.NO_ERROR
         if 'heading' not in leg.external:
             mean[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
-    return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, mean)
+    return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias_sigma, sigma, mean)

@@ -58,24 +58,24 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     order = np.argsort(times_ns, kind='stable')
     legs, times = [results[i] for i in order], np.asarray(times_ns)[order]
     leg_numbers = [(numbers or range(1, len(results) + 1))[i] for i in order]
-    found, changes = _fit(legs, times, config)
-    at = [found.names.index(name) for name in CONSTANTS]
+    joint, changes = _fit(legs, times, config)
+    at = [joint.names.index(name) for name in CONSTANTS]
     common = _common_sources(legs)
-    C = with_model_floor(found.covariance[np.ix_(at, at)])
+    C = with_model_floor(joint.covariance[np.ix_(at, at)])
     C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
-    fitted = FittedConstants(found.value[at], sigma, sigma / found.factor / found.prior_sigma[at])
+    fitted = FittedConstants(joint.value[at], sigma, sigma / joint.factor / joint.prior_sigma[at])
     wheels = wheel_result.combine_wheels(legs)
     estimates, refusals = _estimate(legs, fitted, wheels, config, local)
-    sources = _error_sources(found.relaxed_sigma[at] * found.factor, C, common)
+    sources = _error_sources(joint.relaxed_sigma[at] * joint.factor, C, common)
     # a pitch without a prior: some leg has an accelerometer
-    grade = grade_of(config.imu) if np.isinf(found.prior_sigma[at][PITCH]) else None
-    details = _details(found, fitted.value, C, sources, len(legs)) | {
+    grade = grade_of(config.imu) if np.isinf(joint.prior_sigma[at][PITCH]) else None
+    details = _details(joint, fitted.value, C, sources, len(legs)) | {
         'beside': additional_figures(fitted.value, C, grade)} | wheel_result.wheel_details(wheels)
     reasons = (*(_scale_change_reason(change, times, leg_numbers) for change in changes),
-               *_disagreement_reasons(found, leg_numbers), *refusals)
+               *_disagreement_reasons(joint, leg_numbers), *refusals)
     return MethodResult('smoother', reasons, estimates, PARAMETERS, sources, details,
-                        found.information)
+                        joint.information)
 
 
 def _fit(legs: Sequence[MethodResult], times_ns: Ints,
@@ -147,10 +147,10 @@ def _leg_name(number: int) -> str:
     return f'leg {number}' if number else 'the saved result'
 
 
-def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Reason, ...]:
+def _disagreement_reasons(joint: JointEstimate, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
-    J, reasons = len(found.deviation), list[Reason]()      # J : number of legs
-    unexplained = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
+    J, reasons = len(joint.deviation), list[Reason]()      # J : number of legs
+    unexplained = {name: joint.deviation[:, joint.names.index(name)] for name in joint.disputed}
     # parameters correlated with a disputed one differ as well
     worst = max((np.abs(z).max() for n, z in unexplained.items() if n in PARAMETERS), default=0.0)
     for name, z in unexplained.items():
@@ -163,22 +163,22 @@ def _disagreement_reasons(found: JointEstimate, numbers: list[int]) -> tuple[Rea
         reasons.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
-    if found.factor > 1:
-        in_others = ' in all parameters but scale, yaw and pitch' * bool(found.scatter)
+    if joint.factor > 1:
+        in_others = ' in all parameters but scale, yaw and pitch' * bool(joint.scatter)
         reasons.append(Reason(
-            Code.LEGS_DISAGREE, f'the scatter of {J} legs{in_others} is {found.factor:.1f} times '
-            f'their uncertainties; {_largest_deviation(found, numbers)}'))
+            Code.LEGS_DISAGREE, f'the scatter of {J} legs{in_others} is {joint.factor:.1f} times '
+            f'their uncertainties; {_largest_deviation(joint, numbers)}'))
     return tuple(reasons)
 
 
-def _largest_deviation(found: JointEstimate, numbers: list[int]) -> str:
+def _largest_deviation(joint: JointEstimate, numbers: list[int]) -> str:
     """Return the largest deviation of a constant without scatter between legs, as text."""
-    constants = [i for i, name in enumerate(found.names) if name not in found.scatter]
-    z = found.deviation[:, constants]
+    constants = [i for i, name in enumerate(joint.names) if name not in joint.scatter]
+    z = joint.deviation[:, constants]
     j, i = np.unravel_index(np.argmax(np.abs(z)), z.shape)
     # two legs have the same deviation from each other
     of_leg = f' of {_leg_name(numbers[j])}' * (len(z) > 2)
-    text = f'{found.names[constants[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
+    text = f'{joint.names[constants[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
     return text if abs(z[j, i]) > REMARK_SIGMAS else f'no parameter alone explains it: {text}'
 
 
@@ -205,15 +205,15 @@ def _error_sources(prior_sigma: Floats, C: Floats,
             Source('model', np.diag(MODEL_FLOOR)))
 
 
-def _details(found: JointEstimate, value: Floats, C: Floats, sources: tuple[Source, ...],
+def _details(joint: JointEstimate, value: Floats, C: Floats, sources: tuple[Source, ...],
              legs: int) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(C))
     return {
-        'legs_used': legs, 'widened': found.factor,
+        'legs_used': legs, 'widened': joint.factor,
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
         'correlation': correlations(C[:PARAMETER_COUNT, :PARAMETER_COUNT], PARAMETERS),
-        'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
-                         'between_legs': found.scatter,
-                         'curvature': found.linearisation_error.tolist()},
+        'disagreement': {'chi2': joint.chi2, 'freedom': joint.freedom,
+                         'between_legs': joint.scatter,
+                         'curvature': joint.linearisation_error.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])}
            for i in IMPERFECTION_CONSTANTS}}

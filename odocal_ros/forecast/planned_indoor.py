@@ -210,8 +210,8 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -
     known = replace(known_values(run, config), drift_length=robot.drift_length)
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
-    found = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)
-    return make_planar_result(found, '1', 0.0, config)
+    fit = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)
+    return make_planar_result(fit, '1', 0.0, config)
 
 
 def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
@@ -228,10 +228,10 @@ def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
         return float(robot.slip**2 * max(rows.sum(), 1) * MOTION_STEP / metres)
     table = (run.wheels.body_by_wheel**2).sum(1) * len(run.wheels.rows) / robot.wheels
     side = level(moving) * table[1] if robot.drive in settings.HOLONOMIC else NO_SIDE_SLIP
-    found = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
-             'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,
-             'white': 0.0 if robot.at_rests else 1.0, 'gyro': 1.0}
-    return {name: max(value, LEAST * LEVELS[name]) for name, value in found.items()}
+    levels = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
+              'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,
+              'white': 0.0 if robot.at_rests else 1.0, 'gyro': 1.0}
+    return {name: max(value, LEAST * LEVELS[name]) for name, value in levels.items()}
 
 
 def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:

@@ -91,10 +91,10 @@ def _format_difference(seconds: float) -> str:
     return f'{seconds:.3g} s' if days < 2 else f'{days:.0f} days'
 
 
-def scale_so_far(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+def scale_so_far(config: Config, form: OdometerForm | None, estimated: float = np.nan) -> float:
     """Return m per unit of the odometer, by the best value so far; 0 if unknown."""
-    if np.isfinite(found) and found > 0:
-        return float(found)
+    if np.isfinite(estimated) and estimated > 0:
+        return float(estimated)
     if form is None:
         return config.odometer.nominal_scale
     return nominal_scale(config, form.scale_unit)

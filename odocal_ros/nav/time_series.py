@@ -66,13 +66,13 @@ def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Fl
 def _at(times: Sequence[Floats], t: Floats, x: Floats,
         over: Callable[[Floats, Floats], Floats]) -> list[Floats]:
     """Return an integral of x at times; over : integral at the rows of consecutive pieces."""
-    found = [np.empty((len(each), *x.shape[1:])) for each in times]
+    integrals = [np.empty((len(each), *x.shape[1:])) for each in times]
     for parts in zip(*(enclosing_slices(each, t) for each in times), strict=True):
         rows = parts[0][1]
         integral = over(t[rows], x[rows])
-        for each, (where, _), out in zip(times, parts, found, strict=True):
+        for each, (where, _), out in zip(times, parts, integrals, strict=True):
             interpolated(each[where], t[rows], integral, out[where])
-    return found
+    return integrals
 
 
 def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:

@@ -104,37 +104,37 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
                       ' '.join(dict.fromkeys(remedy for _, remedy in explanations)))
 
 
-def decide_value(name: str, found: Estimate, low: float, high: float) -> ValueDecision:
+def decide_value(name: str, estimate: Estimate, low: float, high: float) -> ValueDecision:
     """Return the decision on an estimate; an angle is compared modulo one turn."""
-    value, sigma = found.value, found.sigma
+    value, sigma = estimate.value, estimate.sigma
     if value is None or sigma is None:
-        return ValueDecision(name, found, low, high, Decision.UNDECIDED)
-    if found.unit == 'rad':      # wrapped to within half a turn of the limits
+        return ValueDecision(name, estimate, low, high, Decision.UNDECIDED)
+    if estimate.unit == 'rad':      # wrapped to within half a turn of the limits
         middle = low if math.isinf(high) else high if math.isinf(low) else (low + high) / 2
         value = middle + float(wrap(value - middle))
     margin = min(value - low, high - value)
-    return ValueDecision(name, found, low, high, decide(value, sigma, low, high),
+    return ValueDecision(name, estimate, low, high, decide(value, sigma, low, high),
                          margin / LIMIT_SIGMAS if margin > 0 else None)
 
 
 def _explain_undecided(undecided: ValueDecision, reasons: tuple[Reason, ...]) -> tuple[str, str]:
     """Return the explanation why a value is undecided, and the remedy."""
-    name, found = undecided.name.replace('_', ' '), undecided.estimate
-    if found.value is None or found.sigma is None:
+    name, estimate = undecided.name.replace('_', ' '), undecided.estimate
+    if estimate.value is None or estimate.sigma is None:
         about = 'scale_factor' if undecided.name == 'scale_ratio' else undecided.name
         reason = next((r for r in reasons if REASON_ESTIMATES.get(r.code) == about), None)
         if undecided.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[undecided.name]).remedy
-    factor, unit = (math.degrees(1.0), ' deg') if found.unit == 'rad' else (1.0, '')
+    factor, unit = (math.degrees(1.0), ' deg') if estimate.unit == 'rad' else (1.0, '')
     if undecided.required_sigma is None:
         turn = math.tau if unit else math.inf
-        excess, limit = min(((math.remainder(found.value - x, turn), x) for x in (
+        excess, limit = min(((math.remainder(estimate.value - x, turn), x) for x in (
             undecided.low, undecided.high) if math.isfinite(x)), key=lambda pair: abs(pair[0]))
         return (f'{name} is {factor * (limit + excess):.5g}{unit}, beyond its limit of '
                 f'{factor * limit:.5g}{unit} by less than {LIMIT_SIGMAS:g} sigma (sigma '
-                f'{factor * found.sigma:.2g}{unit})', DRIVE_MORE[undecided.name].remedy)
-    legs = math.ceil((found.sigma / undecided.required_sigma)**2)
-    return (f'{name} is within its limits, but its sigma is {factor * found.sigma:.2g}{unit}; the '
-            f'limit is {factor * undecided.required_sigma:.2g}{unit} (needs about {legs} '
+                f'{factor * estimate.sigma:.2g}{unit})', DRIVE_MORE[undecided.name].remedy)
+    legs = math.ceil((estimate.sigma / undecided.required_sigma)**2)
+    return (f'{name} is within its limits, but its sigma is {factor * estimate.sigma:.2g}{unit}; '
+            f'the limit is {factor * undecided.required_sigma:.2g}{unit} (needs about {legs} '
             'times as many such legs)', DRIVE_MORE[undecided.name].remedy)

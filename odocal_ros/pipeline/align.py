@@ -121,10 +121,10 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
         ends - 0.5, *inputs.travel.t[[0, -1]])
     level = level_in_motion(t[pick], inputs.f_b[pick], q_0b,
                             speed / np.maximum(inside, 1e-3), latitude, grade)
-    found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
-                   f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
-                   f'(± {np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
-    return level, (found,)
+    reason = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
+                    f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
+                    f'(± {np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
+    return level, (reason,)
 
 
 def _noise_reasons(noise: float, grade: nominal.Grade) -> tuple[Reason, ...]:

@@ -69,8 +69,9 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     leg, inputs = screened.leg, screened.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
-        prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
-        return leg_result(leg, inputs, found) if prepared is None else run_leg(prepared, progress)
+        prepared, refusals = prepare(leg, inputs, config, reasons, alignment, holdout)
+        return leg_result(leg, inputs, refusals) if prepared is None else run_leg(
+            prepared, progress)
 
     if not screened.usable:
         return leg_result(leg, inputs, screened.reasons)
@@ -95,8 +96,8 @@ def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:
 def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
     """Return a leg with its usable inputs, z of b up, and the reasons of the screening."""
     config = settings_by_frame(leg.fix, config)
-    leg, inputs, found = screen_aligned(leg, config)
-    reasons = (*notes, *found)
+    leg, inputs, screening_reasons = screen_aligned(leg, config)
+    reasons = (*notes, *screening_reasons)
     missing = missing_data_reasons(leg, inputs)
     if missing or not len(inputs.t_fix):
         known = {r.code for r in reasons}

@@ -210,7 +210,7 @@ def _imu_rotation(estimates: Mapping[str, Estimate], C_bi: Floats | None,
 
 def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
     """Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle."""
-    found = []
+    differences = []
     estimates = [(number, leg_estimates(leg)) for number, leg in numbered]
     scales = [scale for scale in _values_by_leg('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
@@ -222,8 +222,8 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
     extremes = _significant_extremes(scales)
     if extremes and (excess := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
         low, high = extremes
-        found.append(f'the scale of leg {high.leg} is {100 * excess:.1f} % above '
-                     f'that of leg {low.leg}')
+        differences.append(f'the scale of leg {high.leg} is {100 * excess:.1f} % above '
+                           f'that of leg {low.leg}')
     yaws = _values_by_leg('yaw_mounting_angle', estimates)
     # of a reversed IMU they are near +-180 deg
     extremes = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
@@ -231,10 +231,10 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
     # rad, 5 deg: mountings bend less
     if extremes and (excess := extremes[1].value - extremes[0].value) > 0.087:
         low, high = extremes
-        found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(excess):.1f} deg above '
-                     f'that of leg {low.leg}')
-    return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: larger than changes of one vehicle '
-                   'with one mounting'),) if found else ()
+        differences.append(f'the yaw mounting of leg {high.leg} is {math.degrees(excess):.1f} deg '
+                           f'above that of leg {low.leg}')
+    return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(differences)}: larger than changes of one '
+                   'vehicle with one mounting'),) if differences else ()
 
 
 class _LegValue(NamedTuple):

@@ -142,9 +142,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS_EFFORT / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
-    found = [*reasons_on_data(runs, prepared), *choice.disagreements(methods)]
-    found += choice.rejected_method_reasons(methods, selected_method,
-                                            {r.code for r in (*prepared.reasons, *found)})
+    reasons = [*reasons_on_data(runs, prepared), *choice.disagreements(methods)]
+    reasons += choice.rejected_method_reasons(methods, selected_method,
+                                            {r.code for r in (*prepared.reasons, *reasons)})
     estimates, _ = choice.choose(methods, selected_method)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
@@ -156,16 +156,16 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
             prepared = checked_with_scale(
                 prepared, estimates.get(AS_SENT, scale).value or scale.value)
         track_fields, track_reasons = track_results(prepared, paths)
-        found += track_reasons
+        reasons += track_reasons
         for name, run in runs.items():
             if run.paths is not None:
                 check, track_reasons = path_check(prepared, run.paths.after)
                 methods[name] = replace(run.result, details=run.result.details | check)
-                found += track_reasons
+                reasons += track_reasons
     # outlier fixes are reported once, by the first method or track
-    of_outliers = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
-    found = [r for k, r in enumerate(found) if k not in of_outliers[1:]]
-    return leg_result(leg, inputs, (*prepared.reasons, *found), methods,
+    of_outliers = [k for k, r in enumerate(reasons) if r.code is Code.BAD_ROWS_DROPPED]
+    reasons = [r for k, r in enumerate(reasons) if k not in of_outliers[1:]]
+    return leg_result(leg, inputs, (*prepared.reasons, *reasons), methods,
                       deciding=choice.deciding_methods(selected_method),
                       distance=prepared.distance, path_ratio=prepared.path_ratio, **track_fields)
 

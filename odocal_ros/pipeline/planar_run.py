@@ -46,8 +46,8 @@ def is_planar(leg: Leg, config: settings.Config) -> bool:
 def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
                progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
-    inputs, found = screen(leg, config, check_faults=False)
-    reasons = [*notes, *(r for r in found if r.code not in IMU_CODES)]
+    inputs, screening_reasons = screen(leg, config, check_faults=False)
+    reasons = [*notes, *(r for r in screening_reasons if r.code not in IMU_CODES)]
     progress(Stage(PLANAR))
     run, missing = _make_run(inputs, config)
     if run is None:
@@ -181,9 +181,9 @@ def known_values(run: planar.Run, config: settings.Config) -> planar.PriorKnowle
         run.t[-1] - run.t[0]))
 
 
-def _tracks(run: planar.Run, found: planar.Fit) -> dict[str, Any]:
+def _tracks(run: planar.Run, fit: planar.Fit) -> dict[str, Any]:
     """Return path length, track and positions as fields of LegResult."""
-    pose = found.pose
+    pose = fit.pose
     flat = np.column_stack([pose[:, :2], np.zeros(len(pose))])
     step = np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1)
     return {'distance': float(step.sum()), 'track_n': flat,

@@ -114,11 +114,11 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         lag = np.bincount(group, _lag(imu)) / count
         return np.interp(seconds(arrival_ns), arrival, lag)
     order = np.argsort(arrival_ns, kind='stable')
-    times_ns, found = arrival_ns[order], np.empty(len(order))
+    times_ns, lags = arrival_ns[order], np.empty(len(order))
     for where, rows in enclosing_slices(times_ns, imu.received_ns):
-        found[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
-                                        _lag(take(imu, rows)))
-    return found
+        lags[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
+                                       _lag(take(imu, rows)))
+    return lags
 
 
 def _may_be_clock_step(stamp_ns: Ints) -> Bools:

@@ -100,12 +100,12 @@ class _EvenTimes:
 
     def all(self, t: Floats) -> Floats:
         """Return the times of all rows with stamps t, strictly rising: (n,) s."""
-        found, last = work_array(len(t)), -np.inf
+        even_times, last = work_array(len(t)), -np.inf
         for piece in chunks(len(t)):
             rows = np.arange(piece.start, piece.stop)
             times = np.maximum.accumulate(np.maximum(self.at(t, rows) - LEAST_STEP * rows, last))
-            found[piece], last = times + LEAST_STEP * rows, times[-1]
-        return found
+            even_times[piece], last = times + LEAST_STEP * rows, times[-1]
+        return even_times
 
 
 def _is_smoother(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> bool:

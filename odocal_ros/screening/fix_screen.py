@@ -208,16 +208,17 @@ def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
     positions of the antenna by odometer and gyro, m, with any first heading, scale within 30 %.
     """
     spans = _dead_reckoned_spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
-    found = np.zeros(len(t_fix), bool)
+    is_reckoned = np.zeros(len(t_fix), bool)
     for begin, end, _ in spans:
-        found |= (t_fix >= begin) & (t_fix < end)
+        is_reckoned |= (t_fix >= begin) & (t_fix < end)
     if not spans:
-        return found, ()
+        return is_reckoned, ()
     listed = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
                        for begin, end, jump in spans[:SPANS_LISTED])
     more = f' and {len(spans) - SPANS_LISTED} more' * (len(spans) > SPANS_LISTED)
-    return found, (Reason(Code.FIXES_DEAD_RECKONED, 'fixes were dead-reckoned at '
-                          f'{listed}{more}: {int(found.sum())} of {len(t_fix)} fixes not used'),)
+    return is_reckoned, (Reason(
+        Code.FIXES_DEAD_RECKONED, f'fixes were dead-reckoned at {listed}{more}: '
+        f'{int(is_reckoned.sum())} of {len(t_fix)} fixes not used'),)
 
 
 def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,

@@ -110,11 +110,11 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     t : (n,) s, rising.   x : (n, k) values.   min_step : smallest step of a spike from row to row.
     All False if so many rows jump that it is normal for the sensor.
     """
-    found = np.zeros(len(x), bool)
+    is_outlier = np.zeros(len(x), bool)
     steps = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
     large = np.flatnonzero(steps > min_step)
     if not len(large):
-        return found
+        return is_outlier
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
     end = -1
     most_jumps = 2000    # jumps that are tested
@@ -125,8 +125,8 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
         returned = np.abs(x[i + 2:stop] - x[i]).max(axis=1) <= RETURN_SHARE * steps[i]
         if returned.any():
             end = i + 2 + int(np.argmax(returned))
-            found[i + 1:end] = True
-    return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
+            is_outlier[i + 1:end] = True
+    return is_outlier if is_outlier.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
 def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
@@ -207,7 +207,7 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
 def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                        imu: ImuConfig) -> tuple[Reason, ...]:
     """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
-    found = []
+    saturated = []
     for sensor, x_i, scale, unit, min_limit in (
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
@@ -221,11 +221,11 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                     continue
                 following = extreme(x, where=inside(x, limit), initial=none)
                 if count > TIMES_NEXT * np.count_nonzero(x == following):
-                    found.append((count, float(t_imu[at_limit.argmax()]),
-                                  f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
-    if not found:
+                    saturated.append((count, float(t_imu[at_limit.argmax()]),
+                                      f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
+    if not saturated:
         return ()
-    count, t, words = max(found)
-    others = f'; other axis limits reached: {len(found) - 1}' if len(found) > 1 else ''
+    count, t, words = max(saturated)
+    others = f'; other axis limits reached: {len(saturated) - 1}' if len(saturated) > 1 else ''
     return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
                    f't = {t:.1f} s{others}'),)

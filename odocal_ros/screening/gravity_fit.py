@@ -144,8 +144,8 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
     for _ in range(WEIGHTING_PASSES):
         used = weight / weight.mean()
         inverse = np.linalg.inv(np.einsum('k,kij->ij', used, normal) + rounding)
-        found = inverse @ (used @ right)
-        residual = force - X @ (found / scale)
+        solution = inverse @ (used @ right)
+        residual = force - X @ (solution / scale)
         variance = (np.abs(residual)**2).mean(axis=1)
         weight = 1 / np.maximum(variance + np.median(variance), 1e-12)
     score = used[:, None] * (adjoint @ residual[..., None])[..., 0] / scale
@@ -153,7 +153,7 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
     sigma = np.sqrt((influence**2).sum(axis=0) * n / (n - p))
     share = np.einsum('ij,kjl,li->ki', inverse, used[:, None, None] * normal, inverse).real[:, :3]
     segments = share.sum(axis=0)**2 / np.maximum((share**2).sum(axis=0), 1e-300)
-    return GravityFit(found[:3] / scale[:3], sigma, segments)
+    return GravityFit(solution[:3] / scale[:3], sigma, segments)
 
 
 def _integral(rate: Complexes) -> Complexes:

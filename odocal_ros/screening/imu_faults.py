@@ -92,20 +92,20 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
     return ()
 
 
-def forward_turn_reasons(found: Accelerations | None) -> tuple[Reason, ...]:
+def forward_turn_reasons(binned: Accelerations | None) -> tuple[Reason, ...]:
     """Return IMU_AXES if the forward direction changes between two tenths of the leg."""
-    if found is None:
+    if binned is None:
         return ()
-    edges = np.linspace(0, len(found.t), 11).astype(int)
+    edges = np.linspace(0, len(binned.t), 11).astype(int)
     turns = []      # sigma and angle, deg, begin and end, s
     for a, b in zip(edges[1:-2], edges[2:-1], strict=True):
-        sides = orientation_of(found[:a]), orientation_of(found[b:])
+        sides = orientation_of(binned[:a]), orientation_of(binned[b:])
         if sides[0] is None or sides[1] is None:
             continue
         turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
         sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
         if LEAST_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
-            turns.append((sigma, -turn_deg, float(found.t[a]), float(found.t[b])))
+            turns.append((sigma, -turn_deg, float(binned.t[a]), float(binned.t[b])))
     if not turns:
         return ()
     sigma, turn_deg, begin, end = min(turns)      # the most certain one

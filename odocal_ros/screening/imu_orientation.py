@@ -105,19 +105,19 @@ def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | Non
 
 def estimate_orientation(inputs: Inputs, metres_per_unit: float) -> ImuOrientation | None:
     """Return the IMU orientation in the vehicle, None if the drive does not determine it."""
-    found = accelerations(inputs, metres_per_unit)
-    return None if found is None else orientation_of(found)
+    binned = accelerations(inputs, metres_per_unit)
+    return None if binned is None else orientation_of(binned)
 
 
-def orientation_of(found: Accelerations) -> ImuOrientation | None:
+def orientation_of(binned: Accelerations) -> ImuOrientation | None:
     """
     Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
 
     force = (gain[0] onward + gain[1] i inward), complex; the argument of gain[0] is the forward
     direction. With its own gain, the sign of the gyro has no effect.
     """
-    force = found.force
-    design = np.stack([found.onward, 1j * found.inward], -1)
+    force = binned.force
+    design = np.stack([binned.onward, 1j * binned.inward], -1)
     normal = design.conj().T @ design
     if len(design) < ORIENTATION_BINS or np.linalg.cond(normal) > 1e9:
         return None
@@ -131,28 +131,31 @@ def orientation_of(found: Accelerations) -> ImuOrientation | None:
     least_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1
     if sigma > largest_sigma or not least_gain < abs(gain[0]) < largest_gain:
         return None
-    forward = gain[0].real * found.e1 + gain[0].imag * found.e2
+    forward = gain[0].real * binned.e1 + gain[0].imag * binned.e2
     return ImuOrientation(float(-np.arctan2(forward[1], forward[0])), float(sigma),
                           float((gain[1] / gain[0]).real), float(inward_sigma))
 
 
-def corrected_forward_axis(found: ImuOrientation | None, f: Floats) -> Floats:
+def corrected_forward_axis(orientation: ImuOrientation | None, f: Floats) -> Floats:
     """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
     yaw, pitch = mounting_from_forward(f)
     least_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
-    if found is None or abs(float(wrap(found.yaw - yaw))) < max(least_difference, 3 * found.sigma):
+    if orientation is None or abs(float(wrap(orientation.yaw - yaw))) < max(
+            least_difference, 3 * orientation.sigma):
         return f
-    return np.linalg.norm(f) * forward_b(found.yaw, pitch)
+    return np.linalg.norm(f) * forward_b(orientation.yaw, pitch)
 
 
-def orientation_reasons(found: ImuOrientation | None, nominal_yaw: float) -> tuple[Reason, ...]:
+def orientation_reasons(orientation: ImuOrientation | None,
+                        nominal_yaw: float) -> tuple[Reason, ...]:
     """Return IMU_AXES or ODOMETER_REVERSED if the yaw of the IMU is far from nominal, rad."""
-    if found is None:
+    if orientation is None:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
-    difference = abs(float(wrap(found.yaw - nominal)))
-    direction = DIRECTIONS[round(found.yaw / (np.pi / 2)) % 4]
-    yaw_text = f'{np.rad2deg(found.yaw):+z.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
+    difference = abs(float(wrap(orientation.yaw - nominal)))
+    direction = DIRECTIONS[round(orientation.yaw / (np.pi / 2)) % 4]
+    yaw_deg, sigma_deg = np.rad2deg([orientation.yaw, orientation.sigma])
+    yaw_text = f'{yaw_deg:+z.0f} deg, ± {max(sigma_deg, 1):.0f}'
     if nominal:
         yaw_text += f', nominal {np.rad2deg(nominal):+z.0f}'
     observed = f'accelerations point {direction} in the IMU frame (yaw mounting {yaw_text})'
@@ -162,7 +165,7 @@ def orientation_reasons(found: ImuOrientation | None, nominal_yaw: float) -> tup
                        'IMU x axis points backwards, or the whole leg was driven in reverse with '
                        'an unsigned counter'),)
     axes_limit = np.deg2rad(75.0)    # beyond any intended mounting
-    if difference < axes_limit + 3 * found.sigma:
+    if difference < axes_limit + 3 * orientation.sigma:
         return ()
     return (Reason(Code.IMU_AXES, f'{observed}: the body frame is not forward-left-up'),)
 

@@ -130,13 +130,14 @@ def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
 def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     """Return the interval, times on the smoothest rhythm, True if travel is smoother on it."""
     # of equally smooth ones the first is used, by medians: that of the earliest rows has steps
-    found = [(_unevenness(t, even, travel), interval, even) for interval in reversed(intervals(t))
-             for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
-    lowest = min(ratio for ratio, _, _ in found)
+    candidates = [
+        (_unevenness(t, even, travel), interval, even) for interval in reversed(intervals(t))
+        for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
+    lowest = min(ratio for ratio, _, _ in candidates)
     smoother_ratio, equal_ratio = 0.9, 1.1    # judgement: limits of the ratio, over that of others
     is_smoother = lowest < smoother_ratio
     _, interval, even = next(
-        x for x in found if x[0] <= equal_ratio * lowest) if is_smoother else found[-1]
+        x for x in candidates if x[0] <= equal_ratio * lowest) if is_smoother else candidates[-1]
     return interval, even, is_smoother
 
 

@@ -102,10 +102,10 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
             'bias')
     if left_out:
         text += f'; {" and ".join(left_out)} are not used'
-    found = Reason(Code.LOCAL_FRAME, text)
+    reason = Reason(Code.LOCAL_FRAME, text)
     if not np.isnan(leg.fix.latitude).all():
-        return leg, (found,)
-    return leg, (found, Reason(
+        return leg, (reason,)
+    return leg, (reason, Reason(
         Code.FIXES_UNUSABLE, f'all {len(leg.fix.latitude)} positions are NaN or more than '
         f'{LARGEST_FRAME / 1000:g} km from the origin of their frame, as map coordinates are',
         'Publish positions in a frame with its origin near the site.'))

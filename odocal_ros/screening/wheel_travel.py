@@ -135,14 +135,14 @@ def correct_rollovers(
     do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
     # judgement: few counters roll over so often; values of two counters alternate
     two_publishers = times > 0.1 * len(step)
-    found = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '
-                   f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
-                   f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
-                   + '. Check for two publishers on the topic if the counter cannot roll over so '
-                   'often' * two_publishers, do)
+    reason = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '
+                    f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
+                    f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
+                    + '. Check for two publishers on the topic if the counter cannot roll over so '
+                    'often' * two_publishers, do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
-    return (replace(samples, value=value), (found,),
+    return (replace(samples, value=value), (reason,),
             *((t[span.rows], uncertain_sigma) if span.sigma else (none, none)))
 
 

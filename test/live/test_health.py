@@ -259,7 +259,7 @@ def test_scale_for_the_hint_comes_from_what_is_known_best():
     assert scale_so_far(config, speed) == 1.0
     named = with_settings(config, {'odometer.nominal_scale': 0.019})
     assert scale_so_far(named, COUNTER) == 0.019
-    assert scale_so_far(named, COUNTER, found=0.0188) == 0.0188
+    assert scale_so_far(named, COUNTER, estimated=0.0188) == 0.0188
 
 
 def test_clocks_are_compared_between_rows_that_arrived_together():

@@ -71,8 +71,8 @@ def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], 
         change = float((np.abs(solution.constants) / sigma).max())
         converged = change < CONVERGED and max(map(abs, level_steps.values())) < CONVERGED
         after_pass(passes, change)
-    found = fit_at(run, known, state, c, levels, first_gains, prior, student_weights)
-    return replace(found, passes=passes, converged=converged, swapped=initial.swapped)
+    result = fit_at(run, known, state, c, levels, first_gains, prior, student_weights)
+    return replace(result, passes=passes, converged=converged, swapped=initial.swapped)
 
 
 def fit_at(run: Run, known: PriorKnowledge, state: Floats, c: Floats, levels: dict[str, float],

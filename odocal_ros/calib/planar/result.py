@@ -72,15 +72,15 @@ def _select_quantities(constants: tuple[str, ...], config: Config) -> dict[str, 
     """Return the quantities that the constants of a fit give, with one for each wheel."""
     # omni and mecanum wheels have half of the width: the lever
     other_width = 'track_width' if 'wheel_1' in constants else 'rotation_lever'
-    found = {name: quantity for name, quantity in QUANTITIES.items()
-             if quantity.needs in constants and name != other_width}
+    quantities = {name: quantity for name, quantity in QUANTITIES.items()
+                  if quantity.needs in constants and name != other_width}
     wheels = [name for name in constants if name.startswith('wheel_')]
     for constant, wheel in zip(wheels, config.odometer.names(len(wheels)), strict=False):
-        found[f'scale_factor_{wheel}'] = Quantity(
+        quantities[f'scale_factor_{wheel}'] = Quantity(
             constant, lambda c, constant=constant: c[constant],  # type: ignore[misc]
             SCALE_SIGMA_LIMIT, Code.PARAMETER_NOT_DETERMINED,
             'straights, turns and sideways motion')
-    return found
+    return quantities
 
 
 class Value(NamedTuple):

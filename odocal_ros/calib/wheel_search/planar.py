@@ -162,17 +162,17 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
     """
     sets = np.atleast_2d(np.asarray(sets, dtype=float))
     m = len(sets)
-    found = {f.name: np.full(m, np.nan) for f in fields(Scores)}
+    columns = {f.name: np.full(m, np.nan) for f in fields(Scores)}
     for rows, d2 in squared_distances(leg, sets):
-        found['loss'][rows] = loss(d2, leg.sigma, robust)
-        found['rms'][rows] = np.sqrt(d2.mean(axis=1))
+        columns['loss'][rows] = loss(d2, leg.sigma, robust)
+        columns['rms'][rows] = np.sqrt(d2.mean(axis=1))
         np.sqrt(d2, out=d2)
-        found['max'][rows], found['mean'][rows] = d2.max(axis=1), d2.mean(axis=1)
+        columns['max'][rows], columns['mean'][rows] = d2.max(axis=1), d2.mean(axis=1)
     if course and len(leg.pieces):
         difference = course_differences(leg, sets)
-        found['course_mean'] = np.angle(np.exp(1j * difference).mean(axis=1))
-        found['course_rms'] = np.sqrt((difference**2).mean(axis=1))
-    return Scores(**found)
+        columns['course_mean'] = np.angle(np.exp(1j * difference).mean(axis=1))
+        columns['course_rms'] = np.sqrt((difference**2).mean(axis=1))
+    return Scores(**columns)
 
 
 def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:

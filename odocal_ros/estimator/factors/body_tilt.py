@@ -21,8 +21,8 @@ HILL_INTERVALS = 5
 
 def moving_mean(x: Floats) -> Floats:
     """Return moving means over HILL_INTERVALS: (K,)."""
-    around = np.ones(HILL_INTERVALS)
-    return np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
+    window = np.ones(HILL_INTERVALS)
+    return np.convolve(x, window, 'same') / np.convolve(np.ones(len(x)), window, 'same')
 
 
 class BodyTilt:
@@ -42,9 +42,9 @@ class BodyTilt:
         self.rate_n, self.level_left = rotate(C, mean_rate), level_left(C @ state.forward)
         about_level = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T
         # about the left axis of the vehicle, which differs on banked ground
-        about_own = np.einsum('ki,ki->k', self.rate_n, C @ left) * T
+        about_left = np.einsum('ki,ki->k', self.rate_n, C @ left) * T
         self.pitch_increments = np.stack(
-            [about_level, about_level - moving_mean(about_level), about_own - about_level,
+            [about_level, about_level - moving_mean(about_level), about_left - about_level,
              mean_rate @ up * T], -1)
         # nose down about a point ahead, the odometer goes up
         lifts = (C @ up)[:, :, None] * self.pitch_increments[:, None]

@@ -89,12 +89,12 @@ class SlowError(factor.Factor):
         first, first_variance = s[0]**2 / self.variance, marginals[0][i, i] / self.variance
         squares = square.sum(axis=0) + first
         expected = redundancy.sum(axis=0) + (1 - first_variance)
-        found = {'slow': (float(squares[:2].sum()), float(expected[:2].sum())),
-                 'slow_up': (float(squares[2]), float(expected[2]))}
+        components = {'slow': (float(squares[:2].sum()), float(expected[:2].sum())),
+                      'slow_up': (float(squares[2]), float(expected[2]))}
         if not self.time_is_fixed:
-            found['correlation_time'] = self._time(
+            components['correlation_time'] = self._time(
                 r * s[:-1] + both - a * before, square - redundancy, first + first_variance - 1)
-        return found
+        return components
 
     def _variances(self, marginals: JointMarginals) -> tuple[Floats, Floats, Floats]:
         """Return (co)variances of the error before, it and that after, driving noise: (K, 3)."""

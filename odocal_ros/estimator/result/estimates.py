@@ -80,11 +80,11 @@ def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
     value, sigma = fitted.value, fitted.sigma
     is_informed = fitted.sigma_ratio < INFORMED_SHARE
     K, relative = float(np.exp(value[layout.LN_K])), float(sigma[layout.LN_K])
-    found, reasons = unknown_estimates(scale_unit), list[Reason]()
+    estimates, reasons = unknown_estimates(scale_unit), list[Reason]()
     if relative <= SCALE_LIMIT:
-        found['scale_factor'] = Estimate(K, K * relative, scale_unit)
+        estimates['scale_factor'] = Estimate(K, K * relative, scale_unit)
         if nominal:
-            found['scale_ratio'] = Estimate(K / nominal, K / nominal * relative, '1')
+            estimates['scale_ratio'] = Estimate(K / nominal, K / nominal * relative, '1')
     else:
         reasons.append(Reason(
             Code.SCALE_NOT_DETERMINED, f'scale uncertainty is {100 * relative:.0f} %, too large '
@@ -95,12 +95,12 @@ def estimate_constants(fitted: FittedConstants, scale_unit: str, nominal: float,
                            ('pitch_mounting_angle', layout.PITCH, value[layout.PITCH])):
         # a configured mounting angle is not determined by the drive
         if fitted.factor * sigma[i] <= limit and is_informed[i]:
-            found[name] = Estimate(float(angle), float(sigma[i]), 'rad')
+            estimates[name] = Estimate(float(angle), float(sigma[i]), 'rad')
     for i in OPTIONAL:
         if is_informed[i]:
             name = layout.CONSTANTS[i]
-            found[name] = Estimate(float(value[i]), float(sigma[i]), UNITS[name])
-    return found, reasons + _angle_reasons(fitted, limit, config)
+            estimates[name] = Estimate(float(value[i]), float(sigma[i]), UNITS[name])
+    return estimates, reasons + _angle_reasons(fitted, limit, config)
 
 
 def configured_constants(leg: SmootherLeg) -> Floats:

@@ -285,9 +285,9 @@ def find_quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float
 def _step(x: Floats) -> float:
     """Return the largest quantisation step of the columns of a signal, 0 if there is none."""
     rows = thinned(x, SAMPLES)
-    found = 0.0
+    largest = 0.0
     for column in rows.T:
         values = np.unique(np.round(column / FINEST))
         if 2 < len(values) < len(rows) / SAMPLES_PER_VALUE:
-            found = max(found, float(np.median(np.diff(values))) * FINEST)
-    return found
+            largest = max(largest, float(np.median(np.diff(values))) * FINEST)
+    return largest

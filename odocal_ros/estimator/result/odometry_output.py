@@ -168,9 +168,9 @@ class TwistNoise:
         In (m/s)^2 and (rad/s)^2, mean of the legs; the turn rate is NaN if it is not measured.
         speed, turn_rate : m/s, rad/s.
         """
-        found: Floats = np.mean([self._of_leg(leg, abs(speed), abs(turn_rate))
-                                 for leg in self.legs], axis=0)
-        return found
+        mean: Floats = np.mean([self._of_leg(leg, abs(speed), abs(turn_rate))
+                                for leg in self.legs], axis=0)
+        return mean
 
     def _of_leg(self, leg: dict[str, Any], v: float, w: float) -> Floats:
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
@@ -222,8 +222,8 @@ class TwistNoise:
 
     def _known(self, name: str) -> tuple[float, float]:
         """Return value and sigma of an estimate, 0 if it is not determined."""
-        found = self.estimates.get(name)
-        return (found.value or 0.0, found.sigma or 0.0) if found else (0.0, 0.0)
+        estimate = self.estimates.get(name)
+        return (estimate.value or 0.0, estimate.sigma or 0.0) if estimate else (0.0, 0.0)
 
 
 def twist_noise(calibration: Calibration) -> TwistNoise | None:

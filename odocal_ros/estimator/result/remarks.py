@@ -228,11 +228,11 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
                                          strict=True):
             if i not in deviating:
                 continue
-            found = value + c[i]
-            text = f'{found:+z.2f} ± {sigma[i]:.2f} m'
+            estimated = value + c[i]
+            text = f'{estimated:+z.2f} ± {sigma[i]:.2f} m'
             # not among the estimates
             rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
-            if abs(found) > reach:
+            if abs(estimated) > reach:
                 texts.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 action = 'Ignore the estimate of {}: another error causes it.'
             elif any(arm):

@@ -85,7 +85,7 @@ def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
 def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
     """Return residuals and sigmas of odometer, gyro and accelerometer: (K, 3) each."""
     motion = fit.weighted[MotionRows]
-    found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
+    parts_by_kind: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
     T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
     for some in blocks(len(motion.r)):
         root = np.linalg.inv(motion.whiten[some])
@@ -95,9 +95,10 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
                                  ('gyro', PHI, transpose(C_end[some]) * per_T),
                                  ('accelerometer', V, transpose(C[some]) * per_T)):
             variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, rows, rows], axes)
-            found[name].append(((axes @ raw[:, rows])[:, :, 0], np.sqrt(variance)))
+            parts_by_kind[name].append(((axes @ raw[:, rows])[:, :, 0], np.sqrt(variance)))
     out = {name: (np.concatenate([value for value, _ in parts]),
-                  np.concatenate([sigma for _, sigma in parts])) for name, parts in found.items()}
+                  np.concatenate([sigma for _, sigma in parts]))
+           for name, parts in parts_by_kind.items()}
     value, sigma = out['odometer']
     absent = sigma**2 > ABSENT_VARIANCE / 2
     return out | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}

@@ -60,30 +60,30 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     names : of the wheels.   wheels : by name, empty if unknown.   scale : of their mean.
     """
     names = list(names)
-    found = unknown_wheels(names, scale.unit)
+    estimates = unknown_wheels(names, scale.unit)
     if scale.value is None or scale.sigma is None:
-        return found, []
+        return estimates, []
     limit = levels.INFORMED_SHARE * (config.wheels.radius_range or levels.TYRE_SPREAD)
     # errors of left and right are opposite: that of right over left is twice that of either
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
         known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
         pair = 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
-        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of {pair} {known}; the '
-                              f'limit is {100 * limit:.2g} %. The factors of the wheels are not '
-                              'stated')]
+        return estimates, [Reason(
+            Code.WHEELS_NOT_SEPARABLE, f'the ratio of {pair} {known}; the limit is '
+            f'{100 * limit:.2g} %. The factors of the wheels are not stated')]
     for name, wheel in wheels.items():
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
-        found[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
+        estimates[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
     reasons = _departing(wheels)
     for width, (left, right) in _widths(names).items():
-        found[width], width_reasons = _track_width(wheels[left], wheels[right],
-                                                   config.odometer.track_width)
+        estimates[width], width_reasons = _track_width(wheels[left], wheels[right],
+                                                       config.odometer.track_width)
         reasons += width_reasons
-        if (left, right) != SIDES and found[width].value is not None:
-            found |= _places({name: wheels[name] for name in (left, right)})
-    return found, reasons
+        if (left, right) != SIDES and estimates[width].value is not None:
+            estimates |= _places({name: wheels[name] for name in (left, right)})
+    return estimates, reasons
 
 
 def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -94,10 +94,10 @@ def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
     """Return the positions of the wheels of an axle, m to the left and ahead of the mean."""
-    found = {f'lateral_position_{name}': Estimate(wheel.y, wheel.y_sigma, 'm')
-             for name, wheel in axle.items()}
-    return found | {f'forward_position_{name}': Estimate(wheel.x, wheel.x_sigma, 'm')
-                    for name, wheel in axle.items() if wheel.x is not None}
+    estimates = {f'lateral_position_{name}': Estimate(wheel.y, wheel.y_sigma, 'm')
+                 for name, wheel in axle.items()}
+    return estimates | {f'forward_position_{name}': Estimate(wheel.x, wheel.x_sigma, 'm')
+                        for name, wheel in axle.items() if wheel.x is not None}
 
 
 def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:

@@ -234,10 +234,10 @@ def fit_line(data: Increments) -> Line:
     for _ in range(TAIL_ROUNDS):
         simplex = log_levels + np.concatenate([np.zeros((1, len(log_levels))), -2 * np.eye(
             len(log_levels))])
-        found = minimize(_minus_log_likelihood, log_levels, args=(data, factor),
-                         method='Nelder-Mead', options={
-                             'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
-        log_levels = found.x
+        minimum = minimize(_minus_log_likelihood, log_levels, args=(data, factor),
+                           method='Nelder-Mead', options={
+                               'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
+        log_levels = minimum.x
         x, covariance, _, banded, root = _solve(log_levels, data, factor)
         z = _leave_one_out(banded, root, data.y - data.X @ x)
         before, factor = factor, np.maximum(factor * (z / TAIL_SIGMAS)**2, 1.0)
