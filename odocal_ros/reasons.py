@@ -169,8 +169,9 @@ class Code(Enum):
     YAW_NOT_SEPARABLE = CAUTION, ('Provide a heading that is independent of the odometer: '
                                   'alignment.heading with alignment.heading_sigma, a '
                                   'dual-antenna heading topic, or a gyrocompass-grade gyro.')
-    GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
-                                    'longer standstill, or another heading source.')
+    GYROCOMPASS_REFUSED = CAUTION, ('Use a longer standstill or another heading source. If the '
+                                    'gyro is better than configured, set imu.grade or '
+                                    'imu.gyro_bias.')
     HEADING_UNAVAILABLE = CAUTION, ('Check the topic or setting of the heading source, or set '
                                      'alignment.heading_source to auto.')
     PITCH_NOT_DETERMINED = NOTE, ('Use positions with height: ellipsoidal height of a receiver, '
@@ -179,9 +180,9 @@ class Code(Enum):
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
-    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. Reduce the '
-                                      'largest error of the budget: use RTK, a better IMU, or a '
-                                      'wheel that is not driven. The limit is '
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine legs. Reduce the largest '
+                                      'error of the budget: use RTK or other accurate positions, '
+                                      'a better IMU, or a wheel that is not driven. The limit is '
                                       'verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '

@@ -115,7 +115,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'vibration above half the rate of the IMU is aliased to low frequencies.',
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
-        'this. Noise levels are estimated with it.',
+        'this. The noise levels include these samples.',
         Code.IMU_BIAS_STEP: 'The bias of the gyro or of the accelerometer changes within a second '
         'or two by more than 10 times its usual change: a knock, a strained board or a change of '
         'the supply. The bias is estimated before and after; values and sigmas hold.',

@@ -33,13 +33,18 @@ def format_change(change: float) -> str:
     return f'{round(100 * change, 4):+z.3g} %'
 
 
-def with_limit(value: float, limit: float, unit: str) -> str:
-    """Return 'VALUE; the limit is LIMIT', with the digits of VALUE that show which is larger."""
+def differing(value: float, limit: float) -> str:
+    """Return a value with two digits, or with those that show it differs from its limit."""
     digits = range(2, 7)
     limits = [significant(limit, n) for n in digits]
     texts = [significant(value, n) for n in digits]
-    return (f'{next((text for text in texts if text not in limits), texts[-1])} {unit}; '
-            f'the limit is {float(significant(limit, 3)):.7g} {unit}')
+    return next((text for text in texts if text not in limits), texts[-1])
+
+
+def with_limit(value: float, limit: float, unit: str) -> str:
+    """Return 'VALUE; the limit is LIMIT'."""
+    return (f'{differing(value, limit)} {unit}; the limit is '
+            f'{float(significant(limit, 3)):.7g} {unit}')
 
 
 def relative_with_limit(relative: float, limit: float) -> str:

@@ -102,8 +102,9 @@ def _imu_statements(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str
 
 
 def _odometer_statements(_topic: dict[str, Any], odometer: dict[str, Any]) -> Iterator[str]:
-    what = {'cumulative': 'running count', 'increment': 'counts since the previous message',
-            'rate': 'speed'}[odometer['quantity']]
+    is_angle = odometer['scale_unit'] == 'm/rad'
+    what = {'cumulative': 'running angle' if is_angle else 'running count', 'rate': 'speed',
+            'increment': 'counts since the previous message'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
     unit += '/s' * (odometer['quantity'] == 'rate')
     if odometer['minimum'] is None:
@@ -111,7 +112,7 @@ def _odometer_statements(_topic: dict[str, Any], odometer: dict[str, Any]) -> It
         return
     if odometer['quantity'] == 'rate' and odometer.get('not_following'):
         what = 'one component of a velocity, not the speed along the path of the fixes'
-    form = '.5g' if odometer['quantity'] == 'rate' else '.12g'
+    form = '.5g' if odometer['quantity'] == 'rate' else '.6g' if is_angle else '.12g'
     yield f'{what}: {odometer["minimum"]:{form}} to {odometer["maximum"]:{form}} {unit}'
     if odometer['meaning']:
         yield f'follows the fixes as a {what} only: --set {odometer["meaning"]}'
@@ -123,8 +124,9 @@ def _fix_statements(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]
     status = ', '.join(f'{count} {STATUS.get(value, "status " + value)}'
                        for value, count in fix['status'].items())
     if fix['sigma']:
-        sigma = (f'sigma {fix["sigma"]["median"]:.2f} m '
-                 f'({fix["sigma"]["minimum"]:.2f} to {fix["sigma"]["maximum"]:.2f})')
+        median, least, most = (f'{fix["sigma"][key]:.2f}'
+                               for key in ('median', 'minimum', 'maximum'))
+        sigma = f'sigma {median} m' + f' ({least} to {most})' * (least != most)
     else:
         sigma = 'no covariance'
     partly = f', covariance in {fix["covariance_known"]} of {topic["count"]}' \
@@ -144,7 +146,7 @@ def _timing_statements(topic: dict[str, Any], timing: dict[str, Any]) -> Iterato
     elif abs(delay := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
         where = 'after' if delay > 0 else 'before'
         yield (f'messages are recorded {abs(delay):.3f} s {where} the time in their header '
-               f'(spread {timing["header_to_bag_spread"]:.3f} s)')
+               f'(1 sigma: {timing["header_to_bag_spread"]:.3f} s)')
     if timing['whole_seconds']:
         yield ('warning: all stamps are whole seconds, without the fraction: correct the driver, '
                'or use arrival times (such as odometer.arrival_time)')
@@ -222,7 +224,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
     else:
         uncertainty = whole_degrees(mounting['forward_sigma'])
         source = ('forward direction from accelerations and turns, uncertainty '
-                  f'{uncertainty} deg (1 sigma); the measured mounting differs by '
+                  f'{uncertainty} deg (1 sigma); the measured mounting differs from it by '
                   f'{math.degrees(mounting["deviation"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else \
         'imu.mounting_rpy is correct to the nearest quarter turn:'

@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
 LABELS = tables.LABELS | {'scale_ratio': 'ratio to nominal',
-                          'scale_factor_as_sent': 'scale factor of the speed as sent'}
+                          'scale_factor_as_sent': 'scale factor of the raw speed'}
 UNDETERMINED = 'not determined'
 # reasons about the data of a leg
 DATA_CODES = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,

@@ -108,7 +108,7 @@ def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
                            f'({texts.deviation_text(ratio.value, ratio.sigma)})'))
     as_sent = texts.finite_estimate(estimates, result.AS_SENT)
     if as_sent.value is not None:
-        lines.append(_line('  of speed as sent', _scale_text(as_sent)))
+        lines.append(_line('  of the raw speed', _scale_text(as_sent)))
     lines.append(_path_ratio_line(calibration, scale, as_sent))
     for name, label in _angles_of(estimates).items():
         angle = texts.finite_estimate(estimates, name)
@@ -178,7 +178,7 @@ def _path_ratio_line(calibration: result.Calibration, scale: result.Estimate,
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     path = sum(distance for _, distance in ratios)
     factor, label = (
-        (scale, 'scale factor') if as_sent.value is None else (as_sent, 'factor as sent'))
+        (scale, 'scale factor') if as_sent.value is None else (as_sent, 'factor of the raw speed'))
     if not factor.value or not path:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / path

@@ -199,7 +199,8 @@ def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
     count = int((is_outlier & between).sum())
     return ~is_outlier, (Reason(
         Code.BAD_ROWS_DROPPED, f'{count} of {int(between.sum())} fixes are more than '
-        f'{limit_m:.0f} m from the track; not used in the check'),) * bool(count)
+        f'{limit_m:.0f} m from the track; not used in the check',
+        'Check the receiver and its sky view, or the localisation.'),) * bool(count)
 
 
 def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],

@@ -272,7 +272,7 @@ def test_the_ratio_of_a_truncated_speed_is_beside_the_factor_of_what_is_sent(goo
     text = screen(replace(good, estimates=good.estimates | estimates,
                           legs=(replace(good.legs[0], path_ratio=0.9947, distance=1000.0),)))
     line = next(x for x in text.splitlines() if 'path ratio' in x)
-    assert line.endswith('0.9947   fixes / odometer, +0.0 % from the factor as sent')
+    assert line.endswith('0.9947   fixes / odometer, +0.0 % from the factor of the raw speed')
 
 
 def test_each_source_has_its_size_and_share_in_the_units_people_use():

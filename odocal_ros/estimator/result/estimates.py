@@ -11,6 +11,7 @@ import numpy as np
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.mounting import FAR_YAW
+from odocal_ros.calib.number_text import differing
 from odocal_ros.calib.result import Estimate, MethodResult, name_antenna, unknown_values
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
@@ -176,7 +177,8 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
             'too little acceleration, or too few turns' if sigma[layout.YAW] > limit else
             'the model errors, see the other warnings')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
-                              f'{np.rad2deg(factor * sigma[layout.YAW]):.2f} deg{limit_text}. '
+                              f'{differing(*np.rad2deg([factor * sigma[layout.YAW], limit]))} '
+                              f'deg{limit_text}. '
                               f'Likely cause: {cause}'))
     elif deviation > REVERSED_YAW:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
@@ -189,7 +191,7 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
     if sigma[layout.PITCH] > limit / factor:
         reasons.append(Reason(
             Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
-            f'{np.rad2deg(factor * sigma[layout.PITCH]):.2f} deg{limit_text}',
+            f'{differing(*np.rad2deg([factor * sigma[layout.PITCH], limit]))} deg{limit_text}',
             'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in changed_angles else
             'Drive longer, with stops and starts. Accurate heights, or z of poses, also help.'))
     return reasons

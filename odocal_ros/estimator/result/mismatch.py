@@ -13,7 +13,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from odocal_ros.calib.number_text import significant
+from odocal_ros.calib.number_text import differing
 from odocal_ros.data.arrays import Array, by_row, Floats, thinned
 from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
@@ -77,8 +77,8 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
     if noisy and not worse:
-        contradictions[f'IMU noise is {significant(excess)} times that of its grade (limit '
-                       f'{WORSE_THAN_GRADE:g}) and may not be white'] = remedy
+        contradictions[f'IMU noise is {differing(excess, WORSE_THAN_GRADE)} times that of its '
+                       f'grade (limit {WORSE_THAN_GRADE:g}) and may not be white'] = remedy
     contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
                                 float(fit.state.constants[HEADING]))
@@ -100,7 +100,8 @@ def _noise_over_grade(problem: Problem, level: dict[str, float],
     configured, used = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
-    texts = [f'{NAMES[name]} noise is {significant(level[name] / configured[name])}'
+    texts = [f'{NAMES[name]} noise is '
+             f'{differing(level[name] / configured[name], WORSE_THAN_GRADE)}'
              for name in sensors if level[name] > WORSE_THAN_GRADE * configured[name]]
     remedy = find_noise_cause(problem, level, [
         name for name in sensors
@@ -122,7 +123,8 @@ def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
     for name in _sensors(problem):
         bias, sigma, sold = biases[name]
         if np.max(np.abs(bias) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE:
-            texts.append(f'{NAMES[name]} bias is {significant(np.max(np.abs(bias) / sigma))}')
+            texts.append(f'{NAMES[name]} bias is '
+                         f'{differing(np.max(np.abs(bias) / sigma), WORSE_THAN_GRADE)}')
     return texts
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from odocal_ros.calib.budget import HEIGHT_UNKNOWN
+from odocal_ros.calib.number_text import differing
 from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
@@ -86,9 +87,8 @@ class ErrorBeyondFit(NamedTuple):
 def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[ErrorBeyondFit]:
     """Return the errors that the fit does not contain; sigma : (M,) of the constants."""
     by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
-    leg = problem.leg
-    by_height = 0.0 if leg.origin.is_local or not np.isnan(leg.fixes_n[:, 2]).all() \
-        else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
+    has_height = problem.leg.origin.is_local or not np.isnan(problem.leg.fixes_n[:, 2]).all()
+    by_height = 0.0 if has_height else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
     # which of the two values a later drive has is unknown
     of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
                  for step in fit.constant_steps
@@ -146,9 +146,9 @@ def _noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
     if factor <= FIX_NOISE_LIMIT:
         return []
-    return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
-                   f'{factor:.1f} times as large as their covariance states (limit '
-                   f'{FIX_NOISE_LIMIT:g})',
+    text = (f'fix errors (white and time-correlated) are {differing(factor, FIX_NOISE_LIMIT)} '
+            f'times as large as their covariance states (limit {FIX_NOISE_LIMIT:g})')
+    return [Reason(Code.FIXES_NOISIER_THAN_SAID, text,
                    POSE_COVARIANCE_REMEDY if problem.leg.origin.is_local else '')]
 
 

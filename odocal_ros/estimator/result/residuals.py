@@ -172,7 +172,7 @@ def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
     """Return WHEEL_SLIP with times and sizes; level : of ``describe_slip_level``."""
     texts, listed = [], 3
     if slips:
-        singles = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
+        singles = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s for {s.duration:.0f} s'
                    for s in slips[:listed]]
         more = f' and {len(slips) - listed} more' if len(slips) > listed else ''
         texts.append('wheel slip, travel of the wheel minus travel of the vehicle: '
