@@ -135,15 +135,15 @@ class BagFile:
         """Count the messages by a scan, for files whose index is missing or wrong."""
         counts: Counter[int] = Counter()
         start_ns, end_ns = 2**63 - 1, 0
-        for key, time_ns in self._scan():
-            counts[key] += 1
+        for number, time_ns in self._scan():
+            counts[number] += 1
             start_ns, end_ns = min(start_ns, time_ns), max(end_ns, time_ns)
         self._set_counts(counts, start_ns, end_ns)
 
     def _set_counts(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
         self.start_ns, self.end_ns = start_ns, end_ns
-        self._channels = {key: replace(channel, count=counts.get(key, 0))
-                          for key, channel in self._channels.items()}
+        self._channels = {number: replace(channel, count=counts.get(number, 0))
+                          for number, channel in self._channels.items()}
         self.count = sum(channel.count for channel in self._channels.values())
 
     @property
@@ -167,21 +167,21 @@ def _next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
     """Return the next messages of a stream; {} at its end."""
     # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
     # tuples takes as long as the reading itself)
-    found: dict[str, tuple[list[int], list[bytes]]] = {}
-    messages, size = BATCH_MESSAGES, 2**24      # bytes of them
+    lists: dict[str, tuple[list[int], list[bytes]]] = {}
+    messages_left, bytes_left = BATCH_MESSAGES, 2**24
     for channel, time_ns, raw in stream:
         try:
-            times, raws = found[channel.topic]
+            times, raws = lists[channel.topic]
         except KeyError:
-            times, raws = found[channel.topic] = [], []
+            times, raws = lists[channel.topic] = [], []
         times.append(time_ns)
         raws.append(raw)
-        messages -= 1
-        size -= len(raw)
-        if messages <= 0 or size <= 0:
+        messages_left -= 1
+        bytes_left -= len(raw)
+        if messages_left <= 0 or bytes_left <= 0:
             break
     return {topic: (np.array(times, np.int64), RawMessages.of(raws))
-            for topic, (times, raws) in found.items()}
+            for topic, (times, raws) in lists.items()}
 
 
 def group_overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:

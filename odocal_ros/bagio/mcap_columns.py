@@ -60,15 +60,15 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
     number, size = 0, 1           # the first block is one chunk, which is often sufficient
     while number < len(index):
         block, number = _read_block(index, number, size, read_chunks)
-        found = _columns(block, is_known, scan, report_damage)
+        columns = _columns(block, is_known, scan, report_damage)
         if len(channels) < len(known_channels):
-            found = found.take(is_requested[found.channel])
-        found = _by_time(_join(later, found) if later else found)
-        end = int(np.searchsorted(found.time_ns, index[number].start_ns)) if number < len(
-            index) else len(found.time_ns)
-        later = found.take(slice(end, None)) if end < len(found.time_ns) else None
+            columns = columns.take(is_requested[columns.channel])
+        columns = _in_order(_join(later, columns) if later else columns)
+        end = int(np.searchsorted(columns.time_ns, index[number].start_ns)) if number < len(
+            index) else len(columns.time_ns)
+        later = columns.take(slice(end, None)) if end < len(columns.time_ns) else None
         if end:
-            yield _batch(found.take(slice(end)), channels)
+            yield _batch(columns.take(slice(end)), channels)
         size = BLOCK + int(later.raws.size.sum() if later else 0)
 
 
@@ -92,24 +92,24 @@ def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
              report_damage: ReportDamage) -> Columns:
     """Return the messages of chunks; of one with an unexpected layout by a sequential scan."""
     chunks = [chunk for chunk in block if isinstance(chunk, Chunk)]
-    found = _columns_by_index(chunks, known_channels)
+    columns = _columns_by_index(chunks, known_channels)
     parts = []
     for chunk in block:
         try:
             if isinstance(chunk, Damaged):
                 raise chunk
-            if found is None:
+            if columns is None:
                 parts.append(_columns_by_index([chunk], known_channels)
                              or _columns_of_messages(scan(chunk)))
         except Damaged as error:
             report_damage(error)
-    return found or _join(*parts)
+    return columns or _join(*parts)
 
 
-def _table(keys: Collection[int]) -> Bools:
-    """Return a table of all channel numbers, True for those in ``keys``."""
+def _table(channel_numbers: Collection[int]) -> Bools:
+    """Return a table of all possible channel numbers, True for the given ones."""
     table = np.zeros(2**16, bool)
-    table[list(keys)] = True
+    table[list(channel_numbers)] = True
     return table
 
 
@@ -194,19 +194,20 @@ def _join(*parts: Columns) -> Columns:
                     np.concatenate([raws.size for raws in packed])))
 
 
-def _by_time(found: Columns) -> Columns:
-    if (found.time_ns[1:] >= found.time_ns[:-1]).all():
-        return found
-    return found.take(np.argsort(found.time_ns, kind='stable'))
+def _in_order(columns: Columns) -> Columns:
+    """Return messages in order of time."""
+    if (columns.time_ns[1:] >= columns.time_ns[:-1]).all():
+        return columns
+    return columns.take(np.argsort(columns.time_ns, kind='stable'))
 
 
-def _batch(found: Columns, channels: Mapping[int, Channel]) -> Batch:
+def _batch(columns: Columns, channels: Mapping[int, Channel]) -> Batch:
     """Return messages by topic, which may have several channels."""
     batch: Batch = {}
     for topic in dict.fromkeys(channel.topic for channel in channels.values()):
-        of_topic = [found.channel == key for key, channel in channels.items()
-                    if channel.topic == topic]
-        rows = np.flatnonzero(np.logical_or.reduce(of_topic))
+        masks = [columns.channel == channel_number
+                 for channel_number, channel in channels.items() if channel.topic == topic]
+        rows = np.flatnonzero(np.logical_or.reduce(masks))
         if len(rows):
-            batch[topic] = found.time_ns[rows], found.raws.take(rows)
+            batch[topic] = columns.time_ns[rows], columns.raws.take(rows)
     return batch

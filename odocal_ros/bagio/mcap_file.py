@@ -20,7 +20,7 @@ from odocal_ros.bagio.bag_file import BagFile, Batch, Channel, FileBytes, FORMAT
 from odocal_ros.bagio.mcap_columns import batches
 from odocal_ros.safe_io.limits import Allowance, Damaged, LATEST_NS
 
-Entry = tuple[int, int, bytes]     # time, channel, message
+Entry = tuple[int, int, bytes]     # time, ns, number of the channel, message
 
 
 class McapFile(BagFile):
@@ -69,17 +69,17 @@ class McapFile(BagFile):
             raise Damaged(mcap.INDEX_DAMAGED)
         if crc and zlib.crc32(data[start:-len(mcap.MAGIC) - 4]) != crc:
             raise Damaged(mcap.INDEX_DAMAGED)
-        found = None
+        statistics = None
         for op, body, _ in mcap.records_of(data[start:-mcap.FOOTER_SIZE]):
             if op in (mcap.SCHEMA, mcap.CHANNEL):
                 self._add_definition(op, body)
             elif op == mcap.CHUNK_INDEX:
                 self._chunks.append(mcap.chunk_index_of(body))
             elif op == mcap.STATISTICS:
-                found = mcap.statistics_of(body)
-        if found is None or found[0] and not (self._chunks and self._schemas):
+                statistics = mcap.statistics_of(body)
+        if statistics is None or statistics[0] and not (self._chunks and self._schemas):
             return False
-        count, start_ns, end_ns, counts = found
+        count, start_ns, end_ns, counts = statistics
         if not 0 <= start_ns <= end_ns < LATEST_NS and count:
             raise Damaged(mcap.INDEX_DAMAGED)
         self._chunks = mcap.ordered_chunks(self._chunks, start)
@@ -92,8 +92,8 @@ class McapFile(BagFile):
         self._allowance.restart()
         entries = self._by_time(channels) if self._chunks else (
             entry for entry in self._scan_records() if entry[1] in channels)
-        for time_ns, key, raw in entries:
-            yield channels[key], time_ns, raw
+        for time_ns, number, raw in entries:
+            yield channels[number], time_ns, raw
         self._recount()
 
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
@@ -174,36 +174,37 @@ class McapFile(BagFile):
         entries = (entry for chunk in self._chunks
                    for entry in self._messages_of(chunk, self._channels)
                    ) if self._chunks else self._scan_records()
-        return ((key, time_ns) for time_ns, key, _ in entries)
+        return ((number, time_ns) for time_ns, number, _ in entries)
 
     def _scan_records(self) -> Iterator[Entry]:
         """Yield every message from the first record on, chunk by chunk."""
-        for op, body, whole in mcap.records_of(self._file, len(mcap.MAGIC)):
+        for op, body, is_complete in mcap.records_of(self._file, len(mcap.MAGIC)):
             try:
                 if op == mcap.CHUNK:
-                    chunk = mcap.unpack_chunk(body, 0, len(body), self._allowance, cut=not whole)
-                    yield from self._messages_by_scan(chunk, cut=not whole)
+                    chunk = mcap.unpack_chunk(body, 0, len(body), self._allowance,
+                                              is_truncated=not is_complete)
+                    yield from self._messages_by_scan(chunk, is_truncated=not is_complete)
                 elif op == mcap.MESSAGE:
-                    key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
-                    if key not in self._channels or time_ns >= LATEST_NS:
+                    number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
+                    if number not in self._channels or time_ns >= LATEST_NS:
                         raise Damaged('a damaged record')
-                    yield time_ns, key, body[mcap.MESSAGE_HEAD.size:]
+                    yield time_ns, number, body[mcap.MESSAGE_HEAD.size:]
                 elif op in (mcap.SCHEMA, mcap.CHANNEL):
                     self._add_definition(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
                 self.damage = self.damage or (
                     str(error) if isinstance(error, Damaged) else 'a damaged record')
 
-    def _messages_by_scan(self, chunk: mcap.Chunk, cut: bool = False) -> list[Entry]:
+    def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
-        found = self._entries(bytes(chunk.records), cut)
+        found = self._entries(bytes(chunk.records), is_truncated)
         found.sort(key=itemgetter(0))
         if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
                 chunk.end_ns, chunk.start_ns):
             raise Damaged(mcap.CHUNK_DAMAGED)
         return found
 
-    def _entries(self, records: bytes, cut: bool) -> list[Entry]:
+    def _entries(self, records: bytes, is_truncated: bool) -> list[Entry]:
         """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
         found = []
         channels, head, offset, end = self._channels, mcap.RECORD.unpack_from, 0, len(records)
@@ -215,10 +216,10 @@ class McapFile(BagFile):
             if op == mcap.MESSAGE:
                 if size < mcap.MESSAGE_HEAD.size:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, offset + 9)
-                if key not in channels or time_ns >= LATEST_NS:
+                number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, offset + 9)
+                if number not in channels or time_ns >= LATEST_NS:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append((time_ns, key, records[offset + 31:stop]))
+                found.append((time_ns, number, records[offset + 31:stop]))
             elif op in (mcap.SCHEMA, mcap.CHANNEL):
                 try:
                     self._add_definition(op, records[offset + 9:stop])
@@ -227,23 +228,23 @@ class McapFile(BagFile):
             else:       # not allowed in a chunk
                 raise Damaged(mcap.CHUNK_DAMAGED)
             offset = stop
-        if offset != end and not cut:
+        if offset != end and not is_truncated:
             raise Damaged(mcap.CHUNK_DAMAGED)
         return found
 
     def _add_definition(self, op: int, body: bytes) -> None:
-        (key,) = struct.unpack_from('<H', body)
+        (number,) = struct.unpack_from('<H', body)
         if op == mcap.SCHEMA:
             name, offset = mcap.text_at(body, 2)
             form, offset = mcap.text_at(body, offset)
             text, _ = mcap.text_at(body, offset)
-            self._schemas[key] = name, (FORMATS.get(form, ''), text)
-        elif key not in self._channels:
+            self._schemas[number] = name, (FORMATS.get(form, ''), text)
+        elif number not in self._channels:
             topic, offset = mcap.text_at(body, 4)
             form, _ = mcap.text_at(body, offset)
             (schema,) = struct.unpack_from('<H', body, 2)
             name, definition = self._schemas.get(schema, ('', ('', '')))
-            self._channels[key] = Channel(topic, name, 0, form, definition)
+            self._channels[number] = Channel(topic, name, 0, form, definition)
 
     def close(self) -> None:
         self._file.close()

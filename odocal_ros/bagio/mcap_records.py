@@ -24,7 +24,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS 
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
 CHUNK_DAMAGED = 'a damaged chunk'
-MOST_CUT = 2**26        # judgement: bytes used of a chunk that is truncated by the end of the file
+MOST_TRUNCATED = 2**26    # judgement: bytes used of a chunk that the end of the file truncates
 # first fields of the records: opcode and size of each record; channel, sequence and times of a
 # message; times, size and checksum of a chunk; times, offset and size of a chunk in the index
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
@@ -58,7 +58,7 @@ def records_of(data: bytes | FileBytes, offset: int = 0) -> Iterator[tuple[int, 
         stop = offset + 9 + size
         complete = stop <= len(data)
         if op in USED and complete or op == CHUNK:      # also a truncated last chunk
-            end = stop if complete else min(stop, offset + 9 + MOST_CUT)
+            end = stop if complete else min(stop, offset + 9 + MOST_TRUNCATED)
             yield op, data[offset + 9:end], complete
         offset = stop
 
@@ -70,7 +70,7 @@ def chunk_index_of(body: bytes) -> ChunkIndex:
     stop = INDEX_HEAD.size + 4 + length
     pairs = body[INDEX_HEAD.size + 4:stop]
     return ChunkIndex(start_ns, end_ns, offset, size,
-                      frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
+                      frozenset(number for number, _ in struct.iter_unpack('<HQ', pairs)),
                       int.from_bytes(body[stop:stop + 8], 'little'),
                       int.from_bytes(body[-8:], 'little'))
 
@@ -81,13 +81,13 @@ def ordered_chunks(chunks: Sequence[ChunkIndex], end: int) -> list[ChunkIndex]:
 
     Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
-    chunks, found, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
+    chunks, ordered, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
     for chunk, after in zip(chunks, [*(c.offset for c in chunks[1:]), end], strict=True):
         if chunk.offset < offset or chunk.size < 9 or chunk.offset + chunk.size > end:
             raise Damaged(INDEX_DAMAGED)
         offset = chunk.offset + chunk.size
-        found.append(chunk._replace(index_size=min(chunk.index_size, max(after - offset, 0))))
-    return sorted(found)
+        ordered.append(chunk._replace(index_size=min(chunk.index_size, max(after - offset, 0))))
+    return sorted(ordered)
 
 
 def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
@@ -123,11 +123,12 @@ class Chunk(NamedTuple):
 
 
 def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
-                 cut: bool = False) -> Chunk:
+                 is_truncated: bool = False) -> Chunk:
     """
     Return the chunk of a record, or raise Damaged.
 
-    begin, stop : range of the record's content in the data.   cut : the file ends within it.
+    begin, stop : range of the record's content in the data.   is_truncated : the file
+    ends within it.
     """
     body = memoryview(data)[begin:stop]
     try:
@@ -140,7 +141,8 @@ def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
         raise
     except Exception:    # each compression has its own error
         raise Damaged(CHUNK_DAMAGED) from None
-    if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
+    if not is_truncated and (
+            len(records) != size or crc and zlib.crc32(records) != crc):
         raise Damaged(CHUNK_DAMAGED)
     if packing:
         return Chunk(records, 0, len(records), start_ns, end_ns)

@@ -72,8 +72,9 @@ class Bag:
             if len(types) > 1:
                 self._sentences.append(f'{topic} has messages of {len(types)} types '
                                        f'({", ".join(types)}); the most frequent is used')
-        best = {topic: max(types.items(), key=itemgetter(1)) for topic, types in counts.items()}
-        return {topic: TopicInfo(topic, *best[topic]) for topic in sorted(best)}
+        most_frequent = {topic: max(types.items(), key=itemgetter(1))
+                         for topic, types in counts.items()}
+        return {topic: TopicInfo(topic, *most_frequent[topic]) for topic in sorted(counts)}
 
     @property
     def notes(self) -> tuple[Reason | str, ...]:
@@ -88,7 +89,7 @@ class Bag:
             if not part.damage:
                 continue
             span = metadata.file_spans.get(part.recorded_path.name) or (
-                metadata.whole if len(self._parts) == 1 else None)
+                metadata.bag_span if len(self._parts) == 1 else None)
             note = f'{part.recorded_path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
                 reasons.append(f'{note}, but all {span.count} messages were read')
@@ -97,7 +98,7 @@ class Bag:
                 reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
                                       'read'))
                 continue
-            span = span or (metadata.whole if after is None else None)
+            span = span or (metadata.bag_span if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
             lost = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
@@ -106,7 +107,7 @@ class Bag:
                        'the end is there, messages before it are missing')
             reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                   f'{seconds:.1f} s were read; {missing}'))
-        lost = (metadata.whole.end_ns - self.end_ns) * 1e-9 if metadata.whole else 0.0
+        lost = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
         if not reasons and lost > LEAST_LOSS:
             reasons.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
                                   'listed in metadata.yaml, are missing'))
@@ -128,25 +129,25 @@ class Bag:
                             f'{indented_list(list(self.topics))}')
         deserialize = {topic: self._types.deserializer(self.topics[topic].msgtype)
                        for topic in readers}
-        used = dict.fromkeys(readers, 0)
+        row_counts = dict.fromkeys(readers, 0)
         for batch in self._batches(readers.keys()):
             for topic, (times, raws) in batch.items():
                 for slot, block in readers[topic].rows(raws, times, deserialize[topic]):
-                    used[topic] += len(block.stamp_ns)
+                    row_counts[topic] += len(block.stamp_ns)
                     feed(slot, block)
             if progress:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
         _check_has_messages(self.name, self._source, self._parts)  # reading finds damaged chunks
         for topic, reader in readers.items():
-            self._add_notes(topic, reader, used[topic])
+            self._add_notes(topic, reader, row_counts[topic])
 
-    def _add_notes(self, topic: str, reader: RowReader, used: int) -> None:
+    def _add_notes(self, topic: str, reader: RowReader, row_count: int) -> None:
         """Add a note on messages without a row; raise BadData if none has a row."""
         if not reader.unreadable:
             return
         count = self.topics[topic].count
-        if not used:
+        if not row_count:
             raise BadData(f'{topic}: none of its {count} messages can be used: {reader.trouble}')
         self._reader_notes.append(Reason(
             Code.BAD_ROWS_DROPPED, f'{reader.unreadable} of {count} messages of {topic} were '
@@ -203,7 +204,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     """
     with ExitStack() as stack:
         try:
-            bag = _opened(Path(path), stack)
+            bag = _open_parts(Path(path), stack)
         except PermissionError as error:
             raise BadBag(f'{error.filename or path}: no permission to read it') from None
         except OSError as error:
@@ -211,27 +212,27 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
         yield bag
 
 
-def _opened(path: Path, stack: ExitStack) -> Bag:
+def _open_parts(path: Path, stack: ExitStack) -> Bag:
     source, types = find_source(path), Types()
     if foreign := source.metadata.foreign_formats:
         raise BadBag(f'{path}: its serialization format is {foreign!r}, only cdr is supported; '
                      'convert the bag with ros2 bag convert')
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
     parts: list[BagFile] = []
-    lost = []
+    errors = []
     total = sum(path.stat().st_size for path in source.files if is_file(path))
     for path in source.files:
         try:
             part = _open_file(path, folder, total, types)
         except BadBag as error:
-            lost.append(error)
+            errors.append(error)
             continue
         stack.callback(part.close)
         parts.append(part)
     if not parts:
-        raise lost[0]
+        raise errors[0]
     bag_notes = tuple(Reason(Code.BAG_TRUNCATED, f'{error}; the other files are read')
-                      for error in lost)
+                      for error in errors)
     formats = {c.serialization for part in parts for c in part.channels if c.count}
     if formats and not formats & {'cdr', 'ros1'}:
         raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '

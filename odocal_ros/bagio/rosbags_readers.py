@@ -48,10 +48,10 @@ def parse_definition(msgtype: str, form: str, text: str) -> dict[str, Any]:
         return get_types_from_msg(text, msgtype)
     parts = [part.split('\n', 1)[1] for part in text.split(IDL_SEPARATOR)[1:]] if text.startswith(
         f'{IDL_SEPARATOR}IDL: ') else [text]
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     for part in parts:
-        found.update(get_types_from_idl(strip_idl(part)))
-    return found
+        types.update(get_types_from_idl(strip_idl(part)))
+    return types
 
 
 def strip_idl(text: str) -> str:
@@ -86,15 +86,15 @@ def time_limit(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def late(*_: Any) -> None:
+    def raise_timeout(*_: Any) -> None:
         raise TimeoutError(f'it takes longer than {seconds:g} s')
-    before = signal.signal(signal.SIGALRM, late)
+    previous_handler = signal.signal(signal.SIGALRM, raise_timeout)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous_handler)
 
 
 class Types:
@@ -148,10 +148,10 @@ class Types:
             with time_limit(limits.PARSE_SECONDS * limit_factor()):
                 known = self._store.fielddefs
                 parsed = parse_definition(msgtype, form, text)
-                found = {name: fields for name, fields in parsed.items() if name not in known}
-                limits.check(_count_elements(msgtype, known | found), limits.MESSAGE_VALUES,
+                new = {name: fields for name, fields in parsed.items() if name not in known}
+                limits.check(_count_elements(msgtype, known | new), limits.MESSAGE_VALUES,
                              f'{msgtype}: a message', 'values')
-                self._store.register(found)
+                self._store.register(new)
         except (MemoryError, LimitReached):
             raise
         except Exception as error:   # a parser's errors
@@ -196,10 +196,10 @@ class Rosbag1File(BagFile):
             raise
         except Exception as error:   # rosbags and its dependencies raise many exceptions
             raise self._unreadable(error) from None
-        found = self._reader.connections
+        connections = self._reader.connections
         self._channels = {c.id: Channel(c.topic, c.msgtype, c.msgcount, 'ros1', (
-            c.msgdef.format.name.lower(), c.msgdef.data)) for c in found}
-        self.count = sum(c.msgcount for c in found)
+            c.msgdef.format.name.lower(), c.msgdef.data)) for c in connections}
+        self.count = sum(c.msgcount for c in connections)
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         if self.count and not 0 <= self.start_ns <= self.end_ns < LATEST_NS:
             raise self._unreadable(ValueError('invalid start or end time'))
@@ -208,16 +208,16 @@ class Rosbag1File(BagFile):
         reader = _reader(path)
         reader.open()
         from rosbags.rosbag1.reader import decompressors
-        names = {known: name for name, known in decompressors.items()}
-        for at, chunk in reader.chunks.items():
-            reader.chunks[at] = chunk._replace(decompressor=partial(
+        names = {function: name for name, function in decompressors.items()}
+        for position, chunk in reader.chunks.items():
+            reader.chunks[position] = chunk._replace(decompressor=partial(
                 self._allowance.unpack, PACKINGS[names[chunk.decompressor]]))
         return reader
 
     def _unreadable(self, error: Exception) -> BadBag:
         # an error of rosbags may contain the one that it is raised from, as a tuple
         cause = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
-        cause = cause if ' ' in cause else 'damaged records'      # a key, or nothing
+        cause = cause if ' ' in cause else 'damaged records'      # one word says nothing
         return BadBag(f"{self.path}: cannot be read ({cause}); try 'rosbag reindex' on it")
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
@@ -252,13 +252,13 @@ def _reader(path: Path) -> Any:
     """Return a reader of rosbags whose index is limited to the size of the file."""
     with require_rosbags('a rosbag1 file'):
         from rosbags.rosbag1 import Reader
-    most = path.stat().st_size
+    file_size = path.stat().st_size
 
     class Bounded(io.BufferedReader):
         """File whose reads are limited to the size of the file."""
 
         def read(self, size: int | None = -1) -> bytes:
-            return super().read(min(size, most) if size and size > 0 else size)
+            return super().read(min(size, file_size) if size and size > 0 else size)
 
     class File(type(Path())):     # type: ignore[misc]
         """A path that opens a Bounded file."""
@@ -269,13 +269,13 @@ def _reader(path: Path) -> Any:
     class Counted(Reader):
         """Reader that limits the bytes read for the index."""
 
-        left = most
+        bytes_left = file_size
 
         def read_index_data(self, pos: int, indexes: Any) -> None:
             assert self.bio
             begin = self.bio.tell()
             super().read_index_data(pos, indexes)
-            self.left -= self.bio.tell() - begin
-            if self.left < 0:
+            self.bytes_left -= self.bio.tell() - begin
+            if self.bytes_left < 0:
                 raise ValueError('its index contains a cycle')
     return Counted(File(path))

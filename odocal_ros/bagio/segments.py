@@ -34,7 +34,7 @@ def part_name(first: int, last: int) -> str:
     return f'part_{first:06}.mcap' if first == last else f'part_{first:06}-{last:06}.mcap'
 
 
-def whole_name(folder: Path, number: int = 0) -> str:
+def joined_name(folder: Path, number: int = 0) -> str:
     """Return the name of the file with all segments (0), or of one added to it later."""
     return f'{folder.name}_{number}.mcap'
 
@@ -46,8 +46,8 @@ def without_joined(files: Sequence[Path]) -> list[Path]:
     if any(path.name.endswith('_0.mcap') for path in others):
         return others      # all are joined, and metadata.yaml was not yet written
     spans = [(int(m[1]), int(m[2])) for m in numbers.values() if m and m[2]]
-    return [path for path, m in numbers.items() if not m or m[2] or not any(
-        first <= int(m[1]) <= last for first, last in spans)]
+    return [path for path, match in numbers.items() if not match or match[2] or not any(
+        first <= int(match[1]) <= last for first, last in spans)]
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class SegmentedBag:
         self.folder = folder
         self.channels: dict[int, Channel] = {}   # by number, as in chunks
         self.segments: list[Segment] = []
-        self.extra: list[Segment] = []           # added to the finished bag
+        self.added: list[Segment] = []           # files added to the finished bag
 
     @property
     def size(self) -> int:
-        return _size((*self.segments, *self.extra))
+        return _size((*self.segments, *self.added))
 
     @property
     def unjoined_size(self) -> int:
@@ -104,7 +104,7 @@ class SegmentedBag:
         """
         if room is None or self.size <= room:
             try:
-                self.segments = [self._write(whole_name(self.folder), 0, self.segments[-1].last,
+                self.segments = [self._write(joined_name(self.folder), 0, self.segments[-1].last,
                                              _chunks_of(self.segments))]
             except OSError:
                 self._write_metadata()
@@ -117,8 +117,8 @@ class SegmentedBag:
 
     def add(self, chunks: Sequence[PackedChunk]) -> None:
         """Add messages to the finished bag, as a file of its own."""
-        number = len(self.extra) + 1
-        self.extra.append(self._write(whole_name(self.folder, number), 0, 0, chunks))
+        number = len(self.added) + 1
+        self.added.append(self._write(joined_name(self.folder, number), 0, 0, chunks))
         self._write_metadata()
 
     def _join(self, segments: list[Segment]) -> None:
@@ -135,7 +135,7 @@ class SegmentedBag:
 
     def _write_metadata(self) -> None:
         path = self.folder / 'metadata.yaml'
-        write_text(path, _metadata([*self.segments, *self.extra], self.channels))
+        write_text(path, _metadata([*self.segments, *self.added], self.channels))
 
 
 def _size(segments: Iterable[Segment]) -> int:
@@ -150,14 +150,15 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[PackedChunk]:
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
     import yaml
     written = [f.written for f in files]
-    counts: Counter[int] = sum((one.counts for one in written), Counter())
+    counts: Counter[int] = sum((file.counts for file in written), Counter())
     text: str = yaml.safe_dump({'rosbag2_bagfile_information': {
         'version': 9, 'storage_identifier': 'mcap',
-        **_span(min(one.start_ns for one in written), max(one.end_ns for one in written), counts),
+        **_span(min(file.start_ns for file in written),
+                max(file.end_ns for file in written), counts),
         'topics_with_message_count': [
             {'topic_metadata': {'name': c.topic, 'type': c.msgtype, 'serialization_format': 'cdr',
                                 'offered_qos_profiles': [], 'type_description_hash': ''},
-             'message_count': counts[key]} for key, c in channels.items()],
+             'message_count': counts[number]} for number, c in channels.items()],
         'compression_format': '', 'compression_mode': '',
         'relative_file_paths': [f.path.name for f in files],
         'files': [{'path': f.path.name, **_span(*f.written[1:])} for f in files],

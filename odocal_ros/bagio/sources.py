@@ -47,7 +47,7 @@ class BagMetadata:
     """
 
     file_names: tuple[str, ...] = ()
-    whole: Span | None = None       # of the bag
+    bag_span: Span | None = None
     file_spans: Mapping[str, Span] = field(default_factory=dict)      # by name of the file
     foreign_formats: str = ''
     fault: str = ''
@@ -75,17 +75,17 @@ def find_source(path: Path) -> Source:
     if path.name == 'metadata.yaml':
         path = path.parent
     if path.is_dir():
-        return _folder(path)
+        return _source_of_folder(path)
     metadata_path = path.parent / 'metadata.yaml'
     metadata = _read_metadata(metadata_path) if metadata_path.exists() else BagMetadata()
     if path.name not in metadata.file_names:
         return Source(_stem(path), (path,))
-    whole = metadata.file_spans.get(path.name) or (
-        metadata.whole if metadata.file_names == (path.name,) else None)
-    return Source(_stem(path), (path,), metadata=replace(metadata, whole=whole, file_spans={}))
+    span = metadata.file_spans.get(path.name) or (
+        metadata.bag_span if metadata.file_names == (path.name,) else None)
+    return Source(_stem(path), (path,), metadata=replace(metadata, bag_span=span, file_spans={}))
 
 
-def _folder(path: Path) -> Source:
+def _source_of_folder(path: Path) -> Source:
     """Return the source of a folder: files of metadata.yaml that exist, or all files of bags."""
     metadata_path = path / 'metadata.yaml'
     metadata = _read_metadata(metadata_path) if metadata_path.exists() else None
@@ -116,11 +116,11 @@ def _folder(path: Path) -> Source:
 
 def _distinct(files: list[Path]) -> list[Path]:
     """Return the files without links to an earlier one, so that each is read once."""
-    found: dict[tuple[int, int], Path] = {}
+    by_inode: dict[tuple[int, int], Path] = {}
     for file in files:
         status = file.stat()
-        found.setdefault((status.st_dev, status.st_ino), file)
-    return list(found.values())
+        by_inode.setdefault((status.st_dev, status.st_ino), file)
+    return list(by_inode.values())
 
 
 def _hint_on_subfolders(path: Path) -> str:

@@ -18,7 +18,7 @@ from odocal_ros.bagio import mcap_write, segments
 from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_write import pack, read_chunks, write_file
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.segments import JOURNAL, part_name, SegmentedBag, whole_name
+from odocal_ros.bagio.segments import joined_name, JOURNAL, part_name, SegmentedBag
 from odocal_ros.errors import BadBag
 from odocal_ros.safe_io.atomic_files import PART
 
@@ -179,7 +179,7 @@ def test_a_mark_is_added_to_a_finished_bag(tmp_path, room, metadata):
     bag.finish(room)
     late, more = second(7)
     bag.add(late)
-    assert (bag.folder / whole_name(bag.folder, 1)).exists()
+    assert (bag.folder / joined_name(bag.folder, 1)).exists()
     if not metadata:
         (bag.folder / 'metadata.yaml').unlink()
     assert read(bag.folder) == {topic: messages[topic] + more[topic] for topic in messages}
