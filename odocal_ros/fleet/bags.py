@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags of vehicles: from a manifest, folders, globs, or URLs that fsspec supports."""
+"""
+The bags of a fleet, and the vehicle of each.
+
+In: a manifest (a table), or folders, globs and URLs that fsspec supports. Out: ``FleetBag`` of
+each bag; a remote one is copied while it is read.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -27,11 +27,11 @@ GIB = 2**30           # definition: bytes
 
 
 def _byte_count(text: str) -> int:
-    found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
-    if not found or not float(found[1]):
+    match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
+    if not match or not float(match[1]):
         raise argparse.ArgumentTypeError(f'{text}: required: a size such as 2G or 500M')
     units = {'': 1, 'K': 2**10, 'M': 2**20, 'G': GIB}
-    return int(float(found[1]) * units[found[2]])
+    return int(float(match[1]) * units[match[2]])
 
 
 def _positive_count(text: str) -> int:
@@ -193,4 +193,4 @@ def _data_frame(client: Any, jobs: Sequence[Any]) -> Any:
     store = RowStore(jobs[0].folder)
     files = {i: store.path(outcome.key) for i, outcome in computed_rows(client, jobs)}
     rows = zip(jobs, read_rows(files[i] for i in sorted(files)), strict=True)
-    return pd.DataFrame([row for job, of_bag in rows for row in table_rows(job.bag, of_bag)])
+    return pd.DataFrame([row for job, bag_row in rows for row in table_rows(job.bag, bag_row)])

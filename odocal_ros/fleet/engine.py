@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Dask: local processes or an existing cluster; submits tasks and yields their results."""
+"""
+Dask as the engine of a fleet: local processes or an existing cluster.
+
+In: a function and its arguments for each task. Out: results and errors, as the tasks end.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -64,14 +64,14 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
         groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
                            str(folder / 'vehicles') if files else '')
                   for k, group in enumerate(_grouped(jobs))]
-        rows_of_group: dict[int, list[dict[str, Any]]] = {}
+        rows_by_group: dict[int, list[dict[str, Any]]] = {}
         keys = [Path(group.part).stem + parts.name for group in groups]
         for k, rows, error in task_results(client, compute_group, groups, 'vehicles', keys):
             if error is not None:
                 raise error
-            rows_of_group[k] = rows
+            rows_by_group[k] = rows
         vehicles = tables.compare_with_model(
-            [row for k in sorted(rows_of_group) for row in rows_of_group[k]])
+            [row for k in sorted(rows_by_group) for row in rows_by_group[k]])
         tables.write_table(folder / tables.LEGS, tables.leg_schema(),
                            tables.part_batches(sorted(parts.glob('*.parquet'))))
         tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
@@ -87,7 +87,7 @@ def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
     least_bags = 500
     for job in jobs:
         group.append(job)
-        if sum(len(one.bags) for one in group) >= least_bags:
+        if sum(len(entry.bags) for entry in group) >= least_bags:
             yield tuple(group)
             group = []
     if group:

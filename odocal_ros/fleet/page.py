@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fleet.html: the results of a fleet as one page that needs no network."""
+"""
+fleet.html: the results of a fleet as one page that needs no network.
+
+In: the rows of vehicles.parquet and legs.parquet. Out: figures by vehicle model and over time, and
+tables of models and vehicles, the worst first.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -56,8 +61,8 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
         keep = np.union1d(style.even_rows(len(x), MOST_POINTS // len(models)),
                           np.flatnonzero(outlier))
         position = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
-        for which, colour in ((~outlier, style.BLUE), (outlier, style.RED)):
-            shown = keep[which[keep]]
+        for mask, colour in ((~outlier, style.BLUE), (outlier, style.RED)):
+            shown = keep[mask[keep]]
             ax.errorbar(position[shown], deviation[shown], error[shown], fmt='o', ms=3, lw=0.8,
                         color=colour)
         points += [(position[i], deviation[i]) for i in keep]
@@ -130,14 +135,14 @@ def _read_points(path: Path, known: set[str],
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
-        every = max(1, file.metadata.num_rows // MOST_POINTS)
+        stride = max(1, file.metadata.num_rows // MOST_POINTS)
         points, k = [], 0
         for batch in file.iter_batches(columns=columns, batch_size=10_000, use_threads=False):
             for row in batch.to_pylist():
                 k += 1
                 vehicle = row['vehicle']
                 if row['scale_factor'] is None or row['verdict'] == 'rejected' \
-                        or vehicle not in known or vehicle not in shown and k % every:
+                        or vehicle not in known or vehicle not in shown and k % stride:
                     continue
                 points.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
                                row['scale_factor_sigma'] or 0.0))
@@ -179,23 +184,24 @@ def _model_row(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, A
             continue
         values = population(*(np.array([row[key] for row in known], float)
                               for key in (name, f'{name}_sigma')))
-        few = len(known) < FEWEST_VEHICLES
+        has_few = len(known) < FEWEST_VEHICLES
         if name == 'scale_factor':
-            cells += [f'{_mean_text(values, few)} {unit}',
-                      '-' if few else f'{100 * values.spread / values.mean:.2f} %']
+            cells += [f'{_mean_text(values, has_few)} {unit}',
+                      '-' if has_few else f'{100 * values.spread / values.mean:.2f} %']
         else:
-            cells += [_mean_text(values, few, DEG, signed=True),
-                      '-' if few else f'{DEG * values.spread:.2f}']
+            cells += [_mean_text(values, has_few, DEG, signed=True),
+                      '-' if has_few else f'{DEG * values.spread:.2f}']
     outliers = sorted(row['vehicle'] for row in rows if row['outlier'])
-    more = f' and {len(outliers) - 20} more' if len(outliers) > 20 else ''
+    others_text = f' and {len(outliers) - 20} more' if len(outliers) > 20 else ''
     return {'model': model, 'vehicles': len(rows), 'cells': cells,
-            'outliers': ', '.join(outliers[:20]) + more}
+            'outliers': ', '.join(outliers[:20]) + others_text}
 
 
-def _mean_text(values: Population, few: bool, factor: float = 1.0, signed: bool = False) -> str:
+def _mean_text(values: Population, has_few: bool, factor: float = 1.0,
+               signed: bool = False) -> str:
     """Return the mean of a model as text, without sigma if there are too few vehicles."""
     text = with_sigma(values.mean, values.sigma, factor, signed)
-    return text.partition(' ±')[0] if few else text
+    return text.partition(' ±')[0] if has_few else text
 
 
 def _vehicle_row(row: dict[str, Any]) -> dict[str, Any]:

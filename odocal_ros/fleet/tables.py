@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables legs.parquet and vehicles.parquet: rows, columns, comparison by model, writing."""
+"""
+The tables legs.parquet and vehicles.parquet of a fleet: their columns and rows, and writing.
+
+Each vehicle is compared with those of its model; the table of vehicles begins with the worst.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC
@@ -55,10 +59,10 @@ def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
 
 def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
     """Return the legs of a bag's row as rows of a table; of a failed bag a row without values."""
-    of_bag = {'status': row.status, 'reason': row.reason}
-    return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
+    bag_cells = {'status': row.status, 'reason': row.reason}
+    return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | bag_cells
             for k, leg in enumerate(legs_from_text(row.legs), 1)] or [
-        {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **of_bag}]
+        {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **bag_cells}]
 
 
 def utc(stamp_ns: int) -> datetime:

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a vehicle from the rows of its bags: changes, calibration, pass or fail."""
+"""
+The result of a vehicle of a fleet: changes, calibration since the last change, pass or fail.
+
+In: the rows of its bags in the data set, with their legs. Out: its rows of the tables of vehicles
+and legs, and its calibration.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -50,12 +55,12 @@ class DrivenLeg:
 def driven_legs(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
     """Return the legs of rows by time, with unique bag names as in replay; bags : by path."""
     legs = [legs_from_text(row.legs) for row in rows]
-    entries = [{'bag': next((leg.bag for leg in of_bag), row.bag)}
-               for row, of_bag in zip(rows, legs, strict=True)]
+    entries = [{'bag': next((leg.bag for leg in bag_legs), row.bag)}
+               for row, bag_legs in zip(rows, legs, strict=True)]
     with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
     km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
-          for row, of_bag in zip(rows, legs, strict=True) for _ in of_bag]
-    return sorted(map(DrivenLeg, with_names, km), key=lambda one: one.leg.start_ns)
+          for row, bag_legs in zip(rows, legs, strict=True) for _ in bag_legs]
+    return sorted(map(DrivenLeg, with_names, km), key=lambda entry: entry.leg.start_ns)
 
 
 @dataclass(frozen=True)
@@ -79,15 +84,15 @@ class ValueHistory:
 
 def history_of(name: str, driven: Sequence[DrivenLeg], config: Config) -> ValueHistory:
     """Return the history of a value; a scale is compared by its logarithm."""
-    known = []
-    for k, one in enumerate(driven):
-        e = one.estimates.get(name)
-        if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
-            known.append((k, e.value, one.leg.methods[e.method]))
-    if not known:
+    usable = []
+    for k, entry in enumerate(driven):
+        e = entry.estimates.get(name)
+        if entry.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
+            usable.append((k, e.value, entry.leg.methods[e.method]))
+    if not usable:
         return ValueHistory()
     is_scale = name == 'scale_factor'
-    numbers, values, methods = (list(column) for column in zip(*known, strict=True))
+    numbers, values, methods = (list(column) for column in zip(*usable, strict=True))
     value = np.array(values)
     y = np.log(value / value[0]) if is_scale else np.asarray(wrap(value - value[0]))
     independent, shared = _errors(name, methods)
@@ -123,7 +128,7 @@ def rejecting_reasons(leg: LegResult) -> list[Reason]:
             if r.code.severity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
-def rejected_state(rejected: Sequence[DrivenLeg]) -> Reason:
+def rejected_state_reason(rejected: Sequence[DrivenLeg]) -> Reason:
     """Return the reason for an unknown current state: the last legs are all rejected."""
     last = rejecting_reasons(rejected[-1].leg)[0]
     since = f'{utc(rejected[0].leg.start_ns):%Y-%m-%d}'
@@ -172,22 +177,22 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, driven, config) for name in MAIN_VALUES}
     # first legs of the periods without changes
-    starts = sorted({0}.union(*(past.first_after_change for past in histories.values())))
+    starts = sorted({0}.union(*(values.first_after_change for values in histories.values())))
     current = driven[starts[-1]:]
-    calibration = combine([one.leg for one in current], config, imu=known_imu(config))
-    rejected = driven[1 + max((k for k, one in enumerate(driven)
-                               if one.leg.verdict is not Verdict.REJECTED), default=-1):]
+    calibration = combine([entry.leg for entry in current], config, imu=known_imu(config))
+    rejected = driven[1 + max((k for k, entry in enumerate(driven)
+                               if entry.leg.verdict is not Verdict.REJECTED), default=-1):]
     if len(rejected) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(
-            calibration, reasons=(rejected_state(rejected), *calibration.reasons))
+            calibration, reasons=(rejected_state_reason(rejected), *calibration.reasons))
     row |= _current_state(calibration, config, driven, starts) | _changes(histories, driven) \
         | {'rejected_for': ' '.join(dict.fromkeys(
-            r.code.name for one in driven for r in rejecting_reasons(one.leg))),
+            r.code.name for entry in driven for r in rejecting_reasons(entry.leg))),
            'rejected_since': utc(rejected[0].leg.start_ns) if rejected else None}
     since = current[0].leg.start_ns
     row |= {'current_bags': [r.bag for r in done if r.start_ns >= since or r is done[-1]],
             'report': None}
-    legs = [_leg_row(job, k, one, starts, histories) for k, one in enumerate(driven)]
+    legs = [_leg_row(job, k, entry, starts, histories) for k, entry in enumerate(driven)]
     inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
                    for r in done)
     return Vehicle(row, legs, calibration, config, inputs)
@@ -210,7 +215,7 @@ def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
 def _current_state(calibration: Calibration, config: Config, driven: Sequence[DrivenLeg],
                    starts: Sequence[int]) -> dict[str, Any]:
     """Return the calibration since the last change."""
-    legs = [one.leg for one in driven]
+    legs = [entry.leg for entry in driven]
     acceptance = accept(calibration, config)
     return value_cells(calibration.estimates) | {
         'legs': len(legs), 'legs_good': sum(g.verdict is not Verdict.REJECTED for g in legs),
@@ -229,15 +234,15 @@ def _current_state(calibration: Calibration, config: Config, driven: Sequence[Dr
 def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
     changes = []
-    for name, past in histories.items():
-        for change in past.by_date.changes:
-            before, after = (driven[past.legs[k]].leg for k in (change.leg - 1, change.leg))
+    for name, values in histories.items():
+        for change in values.by_date.changes:
+            before, after = (driven[values.legs[k]].leg for k in (change.leg - 1, change.leg))
             changes.append({
                 'value': name, 'after': iso(before.start_ns), 'by': iso(after.start_ns),
-                'leg': past.legs[change.leg] + 1,
+                'leg': values.legs[change.leg] + 1,
                 'size': math.expm1(change.size) if name == 'scale_factor' else change.size,
                 'sigma': change.sigma, 'unit': '1' if name == 'scale_factor' else 'rad'})
-    outliers = {k + 1 for past in histories.values() for k in past.outlier_legs}
+    outliers = {k + 1 for values in histories.values() for k in values.outlier_legs}
     by_date, by_distance = histories['scale_factor'].by_date, histories['scale_factor'].by_distance
     return {'changes': json.dumps(sorted(changes, key=lambda change: change['by'])),
             'odd_legs': ' '.join(map(str, sorted(outliers))),
@@ -246,9 +251,9 @@ def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) ->
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
-def _leg_row(job: VehicleJob, k: int, one: DrivenLeg, starts: Sequence[int],
+def _leg_row(job: VehicleJob, k: int, entry: DrivenLeg, starts: Sequence[int],
              histories: dict[str, ValueHistory]) -> dict[str, Any]:
     model = next((b.model for b in job.bags if b.model), '')
-    return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
+    return leg_row(job.vehicle, model, k + 1, entry.odometer_km, entry.leg) | {
         'period': sum(start <= k for start in starts),
-        'odd': any(k in past.outlier_legs for past in histories.values())}
+        'odd': any(k in values.outlier_legs for values in histories.values())}

@@ -41,7 +41,7 @@ class AutomaticLegs(LegCompletion):
         super().__init__(*args)
         self._search: LegSearch | None = None
         self._search_settings: LegConfig | None = None      # the settings of the search
-        self._counted_ns = 0                  # start of the leg whose distance is counted
+        self._progress_start_ns = 0           # start of the leg whose distance is measured
         self._logged_changes: set[str] = set()      # changes of the scale that were logged
         self._recording.block_listener = self._receive
 
@@ -63,29 +63,29 @@ class AutomaticLegs(LegCompletion):
         settings = leg if leg.automatic else None
         if settings == self._search_settings:
             return
-        before, self._search_settings = self._search_settings, settings
+        previous, self._search_settings = self._search_settings, settings
         self._search = LegSearch(self._config()) if settings else None
-        if settings and before is None:
+        if settings and previous is None:
             self._load_carried()
 
     def _load_carried(self) -> None:
         """Continue with the information that earlier runs of the node stored in ``latest``."""
-        found = stored_in(output_root(self._config(), self._node_name) / LATEST)
-        if not found or not found.carried:
+        stored = stored_in(output_root(self._config(), self._node_name) / LATEST)
+        if not stored or not stored.carried:
             return
-        reason = _foreign_result_reason(found, self._config())
+        reason = _foreign_result_reason(stored, self._config())
         if reason:
-            self._log.warning(f'{found.name} is not continued: {reason}')
+            self._log.warning(f'{stored.name} is not continued: {reason}')
         else:
-            self.session.carried = found.carried
-            self._log.info(f'continues {found.name}: {found.carried.legs} legs, the last of '
-                           f'{iso(found.carried.last_ns)}')
+            self.session.carried = stored.carried
+            self._log.info(f'continues {stored.name}: {stored.carried.legs} legs, the last of '
+                           f'{iso(stored.carried.last_ns)}')
 
     def _control_automatic_leg(self, search: LegSearch) -> None:
         """Start or end a leg if the search has found its begin or its end."""
         session, span, newest = self.session, search.spans[0], search.spans[-1]
-        if session.state is not State.RECORDING and newest.start_ns != self._counted_ns:
-            self._counted_ns = newest.start_ns      # the leg before may still be computed
+        if session.state is not State.RECORDING and newest.start_ns != self._progress_start_ns:
+            self._progress_start_ns = newest.start_ns      # the leg before may still be computed
             self._recording.progress.begin_leg()
         if session.state is State.FAILED and session.has_open_leg and session.is_automatic:
             self._drop_leg(lost=session.trouble)
@@ -123,11 +123,11 @@ class AutomaticLegs(LegCompletion):
                 self._log.warning(f'{reason}. {reason.remedy}')
 
 
-def _foreign_result_reason(found: Stored, config: Config) -> str:
+def _foreign_result_reason(stored: Stored, config: Config) -> str:
     """Return the reason why a result is not of this vehicle and mounting, as text, or ''."""
-    if found.vehicle != config.vehicle:
-        return f'it belongs to vehicle {found.vehicle!r}'
-    if list(found.config.get('imu.mounting_rpy', ())) != list(config.imu.mounting_rpy):
+    if stored.vehicle != config.vehicle:
+        return f'it belongs to vehicle {stored.vehicle!r}'
+    if list(stored.config.get('imu.mounting_rpy', ())) != list(config.imu.mounting_rpy):
         return 'imu.mounting_rpy has changed'
     return ''
 
@@ -186,14 +186,15 @@ class Operation(AutomaticLegs):
         session, view = self.session, self.view()
         if view.lost:
             raise Refused(view.lost)
-        good = quantities_text(answers.quantities_ok(view))
+        within_limits = quantities_text(answers.quantities_ok(view))
         if session.calibration is not None:
-            success, text = answers.result_answer(session.calibration, within_limits=good,
+            success, text = answers.result_answer(session.calibration, within_limits=within_limits,
                                                   advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
             form = self._recording.inputs.form
-            return answers.restored_answer(session.restored, form.scale_unit if form else '', good)
+            return answers.restored_answer(session.restored, form.scale_unit if form else '',
+                                           within_limits)
         raise Refused('no leg is running and there is no result yet: call ~/start_leg first')
 
     def cancel_leg(self) -> tuple[bool, str]:
@@ -203,7 +204,7 @@ class Operation(AutomaticLegs):
         return True, text
 
     def undo_leg(self) -> tuple[bool, str] | Future:
-        remaining = [one for leg in self.session.begin_undo() for one in leg.results]
+        remaining = [result for leg in self.session.begin_undo() for result in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
         self._saver.withdraw(self.session.start_ns)

@@ -81,8 +81,8 @@ class Inputs:
     def leading(self) -> Input:
         """Return the topic whose stamps set the marks: the IMU, or else the odometer."""
         imu = self.by_slot['imu']
-        leads = self._needs_imu or imu.newest_ns
-        return imu if leads else self.by_slot['odometer']
+        is_leading = self._needs_imu or imu.newest_ns
+        return imu if is_leading else self.by_slot['odometer']
 
     def missing(self, config: Config) -> list[str]:
         """Return the causes that prevent a leg, one line per missing topic."""
@@ -124,9 +124,9 @@ class Inputs:
 
 def _used_inputs(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
-    by_marks = bool(config.reference.points)    # the positions are those of marks
+    uses_marks = bool(config.reference.points)    # the positions are those of marks
     return {slot: types_of(slot, config.odometer) for slot in config.inputs
-            if not (slot == 'fix' and by_marks)}
+            if not (slot == 'fix' and uses_marks)}
 
 
 class Recording:
@@ -155,11 +155,11 @@ class Recording:
     def _no_progress(self) -> Progress:
         return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
-    def decode_new_messages(self, config: Config, found_scale: float) -> None:
+    def decode_new_messages(self, config: Config, known_scale: float) -> None:
         """
         Decode the messages since the last call, in blocks.
 
-        found_scale : scale factor of an earlier result or estimate, for the distance; NaN without.
+        known_scale : scale factor of an earlier result or estimate, for the distance; NaN without.
         """
         fix = self.inputs.by_slot.get('fix')
         static = fix.static if fix else None     # a TF reference has two topics
@@ -180,7 +180,7 @@ class Recording:
                     continue
                 if not source.plausible.all():     # the recorder keeps all: the pipeline screens
                     block = take(block, source.plausible)
-                self._distribute(slot, block, config, found_scale)
+                self._distribute(slot, block, config, known_scale)
             if not self.has_time_jumped:     # after a jump: no sample of an earlier leg
                 self._store_messages(source, raws, sent_ns)
 
@@ -189,8 +189,8 @@ class Recording:
         self.recorder.feed('fix', block)
         self._distribute('fix', block, config, 0.0)
 
-    def _distribute(self, slot: str, block: Samples, config: Config, found_scale: float) -> None:
-        self.progress.feed(slot, block, config, self.inputs.form, found_scale)
+    def _distribute(self, slot: str, block: Samples, config: Config, known_scale: float) -> None:
+        self.progress.feed(slot, block, config, self.inputs.form, known_scale)
         if self.block_listener is not None:
             self.block_listener(slot, block)
 
@@ -214,8 +214,8 @@ class Recording:
         """Return the other slots that the messages of a topic fill: more wheels, other IMUs."""
         if source.slot == 'imu':
             return ('imu_other',)
-        several = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
-        return WHEELS[1:] if several else ()
+        has_one_topic = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
+        return WHEELS[1:] if has_one_topic else ()
 
     @property
     def newest_ns(self) -> int:

@@ -113,7 +113,7 @@ class Layout:
     texts: dict[str, list[str]] = field(default_factory=dict)
     # ranges of the common bytes (encoding, lengths, texts), and their content
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
-    values: list[bytes] = field(default_factory=list)
+    fixed_bytes: list[bytes] = field(default_factory=list)
     size: int = 4       # bytes of a message
     _adjacent: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
 
@@ -161,7 +161,7 @@ class Layout:
         None if a path is missing, or if the paths of a field are not adjacent.
         """
         runs = [self._places(tuple(paths)) if paths else None for paths in columns]
-        single_runs = [found[0] for found in runs if found is not None and len(found) == 1]
+        single_runs = [run[0] for run in runs if run is not None and len(run) == 1]
         return None if len(single_runs) < len(runs) else np.dtype({
             'names': [str(k) for k in range(len(single_runs))], 'itemsize': self.size,
             'formats': [(run.dtype, (run.width,)) for run in single_runs],
@@ -176,8 +176,9 @@ class Layout:
             offset=offset) for kind, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:
-        return self.size <= len(raw) and all(
-            raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
+        """Return True if a message has this layout."""
+        return self.size <= len(raw) and all(raw[a:b] == expected for (a, b), expected in zip(
+            self.fixed, self.fixed_bytes, strict=True))
 
 
 _latest_layouts: dict[str, Layout] = {}      # by message type: most topics have only one
@@ -185,35 +186,35 @@ _latest_layouts: dict[str, Layout] = {}      # by message type: most topics have
 
 def _adjacent_values(places: Sequence[tuple[int, str] | None]) -> list[AdjacentValues] | None:
     """Return values by offset and type, adjacent ones joined; None if one is missing."""
-    found: list[tuple[slice, str, int]] = []      # bytes, type and number of values
+    joined: list[tuple[slice, str, int]] = []      # bytes, type and number of values
     for place in places:
         if place is None:
             return None
         offset, dtype = place
-        span, kind, count = found[-1] if found else (slice(0), '', 0)
+        span, kind, count = joined[-1] if joined else (slice(0), '', 0)
         stop = offset + np.dtype(dtype).itemsize
         if kind == dtype and span.stop == offset:
-            found[-1] = slice(span.start, stop), kind, count + 1
+            joined[-1] = slice(span.start, stop), kind, count + 1
         else:
-            found.append((slice(offset, stop), dtype, 1))
+            joined.append((slice(offset, stop), dtype, 1))
     return [AdjacentValues(span, np.dtype(kind), np.dtype((np.void, span.stop - span.start)), n)
-            for span, kind, n in found]
+            for span, kind, n in joined]
 
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     """Return the layout of one message, which may be longer; None if it has none."""
     if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
         return None
-    before = _latest_layouts.get(msgtype)
-    if before and before.fits(raw):
-        return before
+    latest = _latest_layouts.get(msgtype)
+    if latest and latest.fits(raw):
+        return latest
     scan = _LayoutScan(raw)
     layout = scan.layout
     try:
-        scan.fields(SCHEMAS[msgtype], '')
+        scan.scan_fields(SCHEMAS[msgtype], '')
     except (struct.error, ValueError):
         return None
-    layout.values = [raw[a:b] for a, b in layout.fixed]
+    layout.fixed_bytes = [raw[a:b] for a, b in layout.fixed]
     _latest_layouts[msgtype] = layout
     return layout
 
@@ -230,7 +231,7 @@ def damaged_field(msgtype: str, raw: bytes) -> str:
     """Return the field in which a message ends or has an impossible length; '' if unknown."""
     scan = _LayoutScan(raw)
     try:
-        scan.fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
+        scan.scan_fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
     except (struct.error, ValueError):
         return scan.path
     return ''
@@ -242,29 +243,29 @@ class _LayoutScan:
     def __init__(self, raw: bytes) -> None:
         self.raw, self.path, self.layout = raw, '', Layout()
 
-    def fields(self, schema: Sequence[str], prefix: str) -> None:
+    def scan_fields(self, schema: Sequence[str], prefix: str) -> None:
         for line in schema:
             kind, path = line.split()
             self.path = prefix + path
             base, _, size = kind.partition('[')
-            count = 1 if not size else self.length() if size == ']' else int(size[:-1])
-            self.value(base, prefix + path, count, listed=bool(size))
+            count = 1 if not size else self.read_length() if size == ']' else int(size[:-1])
+            self.scan_value(base, prefix + path, count, is_list=bool(size))
 
-    def value(self, kind: str, path: str, count: int, listed: bool = False) -> None:
+    def scan_value(self, kind: str, path: str, count: int, is_list: bool = False) -> None:
         layout = self.layout
         if kind == 'string':
-            texts = [self.text(listed) for _ in range(count)]
-            if listed:
+            texts = [self.scan_text(is_list) for _ in range(count)]
+            if is_list:
                 layout.texts[path] = texts
         elif kind == 'dim':
             for i in range(count):
-                self.fields(_DIM, f'{path}[{i}].')
+                self.scan_fields(_DIM, f'{path}[{i}].')
         else:
             size = np.dtype(NUMPY_TYPES[kind]).itemsize
             if count:
                 self.align(size)
             offset = self.advance(size * count)
-            if listed:
+            if is_list:
                 layout.lists[path] = offset, NUMPY_TYPES[kind], count
             else:
                 layout.places[path] = offset, NUMPY_TYPES[kind]
@@ -280,7 +281,7 @@ class _LayoutScan:
     def align(self, size: int) -> None:
         self.layout.size += (4 - self.layout.size) % size      # relative to byte 4
 
-    def length(self) -> int:
+    def read_length(self) -> int:
         self.align(4)
         offset = self.advance(4)
         length: int = struct.unpack_from('<I', self.raw, offset)[0]
@@ -289,9 +290,9 @@ class _LayoutScan:
         self.layout.fixed.append((offset, offset + 4))
         return length
 
-    def text(self, keep: bool) -> str:
+    def scan_text(self, keep: bool) -> str:
         """Skip a string; return it if ``keep``: the layout includes its content."""
-        length = self.length()
+        length = self.read_length()
         begin = self.advance(length)
         if not keep:
             return ''

@@ -101,10 +101,10 @@ class Reader:
             if other is not None:
                 raws = RawMessages.of(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
-        found = self._rows(raws, received_ns, deserialize)
+        pairs = self._rows(raws, received_ns, deserialize)
         if self.by_arrival:
-            found = [(slot, replace(block, stamp_ns=block.received_ns)) for slot, block in found]
-        return found if other is None else [*found, ('imu_other', other)]
+            pairs = [(slot, replace(block, stamp_ns=block.received_ns)) for slot, block in pairs]
+        return pairs if other is None else [*pairs, ('imu_other', other)]
 
     def readings(self, raws: Sequence[bytes], received_ns: Sequence[int],
                  deserialize: Deserialize) -> list[tuple[str, list[Reading]]]:
