@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from odocal_ros.estimator.factors.odometer import as_rolled, REACH
+from odocal_ros.estimator.factors.odometer import as_rolled, STENCIL_REACH
 from odocal_ros.estimator.imu import ImuSteps, STEP
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.state import (
@@ -171,8 +171,8 @@ T = 0.4                                 # s
 FINE = np.arange(-5.0, 65.0, 1e-3)
 AT = np.arange(0.0, 60.0, 0.1)
 ANGLE = BEAT * T
-# of derivatives by differences over REACH, and of the next orders of the filters below
-ROUNDING = SWING * (ANGLE**2 * (BEAT * REACH)**2 * (1 / 24 + ANGLE / 48)
+# of derivatives by differences over STENCIL_REACH, and of the next orders of the filters below
+ROUNDING = SWING * (ANGLE**2 * (BEAT * STENCIL_REACH)**2 * (1 / 24 + ANGLE / 48)
                     + 0.175 * ANGLE**4 + 0.5 * ANGLE**5)
 
 
@@ -208,8 +208,8 @@ def test_the_derivative_by_the_square_is_half_the_acceleration(square):
     found = (rolled(travel(FINE), T, square + h) - rolled(travel(FINE), T, square - h)) / (2 * h)
     lag, angle = np.sqrt(max(square, 0.0)), BEAT * (AT + T)
     expected = SWING * BEAT**2 * (np.sin(angle) - BEAT * lag * np.cos(angle)) / 2
-    # differences over REACH; about zero the third moment is that of T^2 = h
-    loose = SWING * BEAT**4 * REACH**2 * (1 / 24 + BEAT * lag / 32) \
+    # differences over STENCIL_REACH; about zero the third moment is that of T^2 = h
+    loose = SWING * BEAT**4 * STENCIL_REACH**2 * (1 / 24 + BEAT * lag / 32) \
         + SWING * BEAT**3 * np.sqrt(h)
     np.testing.assert_allclose(found, expected, atol=loose)
 
