@@ -181,8 +181,8 @@ class Code(Enum):
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine legs. Reduce the largest '
-                                      'error of the budget: use RTK or other accurate positions, '
-                                      'a better IMU, or a wheel that is not driven. The limit is '
+                                      'error of the budget: better positions (RTK), a better IMU, '
+                                      'a wheel that is not driven. The limit is '
                                       'verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '
