@@ -17,7 +17,7 @@ from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
 from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_TYPE
-from odocal_ros.live.journal_leg import Plan
+from odocal_ros.live.journal_leg import JournalPlan
 from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.recording import PREROLL_MARGIN_S
@@ -121,7 +121,7 @@ class Journal:
         self._hand_over()       # earlier messages are pre-roll
         now_ns = self._clock.now().nanoseconds
         self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
-        self._writer.submit(self._writer.begin, Plan(
+        self._writer.submit(self._writer.begin, JournalPlan(
             session.leg_id, output_root(config, self._node) / 'journal',
             f'{iso(now_ns).replace(":", "-")}_leg_{session.leg_id}',
             journal_text(config, session.leg_id, session.start_ns, topics, self._node),

@@ -26,23 +26,23 @@ HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 def journal_folders(root: Path) -> list[Path]:
     """Return the folders of journals, the oldest first."""
-    found = []
+    dated = []
     with suppress(FileNotFoundError):
         for folder in root.iterdir():
             with suppress(OSError):
                 if not folder.is_symlink():
-                    found.append(((folder / JOURNAL).stat().st_mtime_ns, folder))
-    return [folder for _, folder in sorted(found)]
+                    dated.append(((folder / JOURNAL).stat().st_mtime_ns, folder))
+    return [folder for _, folder in sorted(dated)]
 
 
 def clear_empty(root: Path) -> None:
     """Remove journals without data: their nodes were killed early, or the disk was full."""
     for folder in list(root.iterdir()):
         with suppress(OSError):
-            named = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
-            old = named and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
+            is_journal = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
+            is_old = is_journal and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
             # these files never contain a message
-            if old and all(path.name == JOURNAL or path.name.endswith(PART)
+            if is_old and all(path.name == JOURNAL or path.name.endswith(PART)
                            for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
 
@@ -93,7 +93,7 @@ def _in_use(folder: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Plan:
+class JournalPlan:
     """Folder, settings and size limit of a leg's journal."""
 
     leg_id: int
@@ -111,7 +111,7 @@ class LegJournal:
     journal ends with the data written so far, and the trouble stays.
     """
 
-    def __init__(self, plan: Plan, channels: dict[int, Channel],
+    def __init__(self, plan: JournalPlan, channels: dict[int, Channel],
                  chunks: list[PackedChunk]) -> None:
         self.plan = plan
         self.trouble = ''
@@ -119,7 +119,7 @@ class LegJournal:
         self._waiting = chunks        # the pre-roll is written with the start mark, not before
         self._bag: SegmentedBag | None = None
         self._lock: TextIO | None = None
-        self._others = 0              # bytes of the other journals
+        self._other_bytes = 0              # bytes of the other journals
         self._is_closed = False       # given up, or finished
         self.late: list[PackedChunk] = []  # marks that came after the end, not written yet
 
@@ -133,7 +133,7 @@ class LegJournal:
             return
         self._waiting += chunks
         if self._waiting:
-            self._try(self._write)
+            self._attempt(self._write)
         if self.trouble and not self._is_closed and sum(
                 chunk.size for chunk in self._waiting) > WAITING_BYTES:
             self._give_up(f'{self.trouble}; no further attempt in this leg')
@@ -143,7 +143,7 @@ class LegJournal:
         if not self._is_closed:
             self.put([])
             if self._bag is not None and not self._waiting:
-                self._try(self._finish)
+                self._attempt(self._finish)
             elif self._bag is not None and not self._bag.segments:     # nothing was written
                 shutil.rmtree(self._bag.folder, ignore_errors=True)
                 self._bag = None
@@ -162,7 +162,7 @@ class LegJournal:
         if bag is None or not bag.segments or not bag.folder.exists():
             self.late = []         # there is nothing to replay
         elif self.late:
-            self._try(self._add_late)
+            self._attempt(self._add_late)
 
     def _add_late(self) -> None:
         assert self._bag is not None
@@ -175,10 +175,10 @@ class LegJournal:
         # joining files, this one included, temporarily needs their size twice
         size = 2 * sum(chunk.size for chunk in self._waiting) + HEADS_BYTES
         size += self._bag.unjoined_size
-        if self._others + self._bag.size + size > self.plan.limit:
-            taken = make_room(self.plan.root, self.plan.limit, size)
-            self._others = taken - self._bag.size
-            if taken + size > self.plan.limit:
+        if self._other_bytes + self._bag.size + size > self.plan.limit:
+            used_bytes = make_room(self.plan.root, self.plan.limit, size)
+            self._other_bytes = used_bytes - self._bag.size
+            if used_bytes + size > self.plan.limit:
                 self._give_up(f'{self.plan.root}: the journals reach their limit of '
                               f'{self.plan.limit} bytes; raise journal.max_bytes')
                 return
@@ -190,7 +190,7 @@ class LegJournal:
         root = self.plan.root
         root.mkdir(parents=True, exist_ok=True)
         clear_empty(root)
-        self._others = make_room(root, self.plan.limit)
+        self._other_bytes = make_room(root, self.plan.limit)
         folder = new_folder(root, self.plan.name)
         try:
             write_text(folder / JOURNAL, self.plan.settings)
@@ -204,15 +204,15 @@ class LegJournal:
 
     def _finish(self) -> None:
         assert self._bag is not None
-        taken = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
-        self._bag.finish(room=self.plan.limit - taken - HEADS_BYTES)
+        used_bytes = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
+        self._bag.finish(room=self.plan.limit - used_bytes - HEADS_BYTES)
 
     def _give_up(self, trouble: str) -> None:
         self.trouble, self._is_closed, self._waiting = trouble, True, []
 
-    def _try(self, act: Callable[[], object]) -> None:
+    def _attempt(self, write: Callable[[], object]) -> None:
         try:
-            act()
+            write()
         except OSError as error:
             where = error.filename or self.plan.root
             self.trouble = (f'{where}: {error.strerror or error}; free disk space or set '

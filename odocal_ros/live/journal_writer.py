@@ -16,7 +16,7 @@ from typing import Any
 
 from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_write import pack, PackedChunk
-from odocal_ros.live.journal_leg import LegJournal, Plan
+from odocal_ros.live.journal_leg import JournalPlan, LegJournal
 from odocal_ros.live.messages import definition_of
 
 ALWAYS_NS = 1      # definition: stamp of static messages
@@ -133,7 +133,7 @@ class JournalWriter:
         """Discard the pre-roll, after a jump of time."""
         self._preroll.clear()
 
-    def begin(self, plan: Plan) -> None:
+    def begin(self, plan: JournalPlan) -> None:
         """Open the journal of a leg; its pre-roll is written with the first mark."""
         self.finish()
         self._leg = LegJournal(plan, self._channels, self._preroll.chunks())

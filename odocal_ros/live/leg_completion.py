@@ -126,7 +126,7 @@ class LegCompletion:
         jump = 'time jumped back (a bag restarted, or a clock was set)'
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
-            self._drop_leg(lost='time jumped back')
+            self._drop_leg(drop_cause='time jumped back')
             self._log.warning(self._lost_leg_text())
         else:
             self._log.warning(f'{jump}: all samples so far are dropped')
@@ -158,7 +158,7 @@ class LegCompletion:
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            stage=self._computing.stage, saved=self._saver.saved, lost=self._lost_leg_text(),
+            stage=self._computing.stage, saved=self._saver.saved, lost_leg=self._lost_leg_text(),
             save_trouble=self._saver.trouble, journal=self._journal.folder,
             journal_trouble=self._journal.trouble, has_received=recording.has_received(),
             is_local=recording.is_local, has_imu=not inputs.without_imu)
@@ -278,13 +278,13 @@ class LegCompletion:
     def _lost_leg_text(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
-        return session.lost and (
-            f'leg {session.leg_id} was cancelled: {session.lost}; '
+        return session.drop_cause and (
+            f'leg {session.leg_id} was cancelled: {session.drop_cause}; '
             f'{self._data_location(session.start_ns)}; call ~/start_leg for a new leg')
 
-    def _drop_leg(self, text: str = '', lost: str = '') -> None:
-        """Drop the open leg; text : answer for waiting callers.   lost : cause, if automatic."""
-        self.session.cancel(lost)
+    def _drop_leg(self, text: str = '', drop_cause: str = '') -> None:
+        """Drop the open leg; text : answer for callers.   drop_cause : if automatic."""
+        self.session.cancel(drop_cause)
         self._running_estimate.end()
         self._close_by_ns = self._snapshot = self._view_at_stop = None
         self._computing.drop()

@@ -88,7 +88,7 @@ class AutomaticLegs(LegCompletion):
             self._progress_start_ns = newest.start_ns      # the leg before may still be computed
             self._recording.progress.begin_leg()
         if session.state is State.FAILED and session.has_open_leg and session.is_automatic:
-            self._drop_leg(lost=session.trouble)
+            self._drop_leg(drop_cause=session.failure)
         elif session.state is State.RECORDING:
             if session.is_automatic and span.stop_ns:
                 search.spans.popleft()
@@ -106,8 +106,8 @@ class AutomaticLegs(LegCompletion):
         if self._search is not None:
             self._search.restart(self.session.stop_ns, at_rest=False)
 
-    def _drop_leg(self, text: str = '', lost: str = '') -> None:
-        super()._drop_leg(text, lost)
+    def _drop_leg(self, text: str = '', drop_cause: str = '') -> None:
+        super()._drop_leg(text, drop_cause)
         if self._search is not None:
             self._search.restart(self._recording.newest_ns, at_rest=True)
 
@@ -184,8 +184,8 @@ class Operation(AutomaticLegs):
 
     def _last_result(self) -> tuple[bool, str]:
         session, view = self.session, self.view()
-        if view.lost:
-            raise Refused(view.lost)
+        if view.lost_leg:
+            raise Refused(view.lost_leg)
         within_limits = quantities_text(answers.quantities_ok(view))
         if session.calibration is not None:
             success, text = answers.result_answer(session.calibration, within_limits=within_limits,

@@ -85,7 +85,7 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'not_observable': '; '.join(known.not_observable) if known else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
-        'saved': view.saved, 'save_trouble': view.save_trouble, 'lost': view.lost,
+        'saved': view.saved, 'save_trouble': view.save_trouble, 'lost': view.lost_leg,
         'automatic': _automatic(view), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': view.journal, 'journal_trouble': view.journal_trouble,
@@ -125,11 +125,11 @@ def level(view: SessionView) -> Any:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not view.has_received:
         return DiagnosticStatus.STALE
-    unused = view.session.unused
+    unused = view.session.unused_reason
     has_warning = (
         state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
-        or view.missing or view.clocks or view.journal_trouble or view.save_trouble or view.lost
-        or view.faults or view.duplicate_publishers or _changes(view.session)
+        or view.missing or view.clocks or view.journal_trouble or view.save_trouble
+        or view.lost_leg or view.faults or view.duplicate_publishers or _changes(view.session)
         or unused and unused.code not in SHORT_MOVE_CODES)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
@@ -152,7 +152,7 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
         'computing': f'Computing leg {session.leg_id}',
         'calibrated': f'Calibrated from {legs}, {session.verdict()}',
         'rejected': 'Rejected',
-        'failed': f'Failed: {session.trouble}',
+        'failed': f'Failed: {session.failure}',
     }[view.state]
     if view.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {view.restored}'
@@ -160,8 +160,8 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
     troubles = [f'{statement}: {trouble}' for statement, trouble in (
         ('the result is not saved', view.save_trouble),
         ('the journal cannot be written', view.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.lost, hint,
-                                   _unused(session), *view.duplicate_publishers,
+    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.lost_leg,
+                                   hint, _unused(session), *view.duplicate_publishers,
                                    losses_text(view.lost_messages), *troubles)))
 
 
@@ -171,7 +171,7 @@ def _changes(session: Session) -> list[str]:
 
 
 def _unused(session: Session) -> str:
-    return f'a leg was not used: {session.unused}' if session.unused else ''
+    return f'a leg was not used: {session.unused_reason}' if session.unused_reason else ''
 
 
 def _automatic(view: SessionView) -> str:

@@ -92,10 +92,10 @@ class Session:
         self.legs: list[KeptLeg] = []
         self.calibration: Calibration | None = None
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
-        self.trouble = ''   # why the computation of the open leg failed
-        self.lost = ''      # why the last leg was dropped automatically
+        self.failure = ''   # why the computation of the open leg failed
+        self.drop_cause = ''      # why the last leg was dropped automatically
         self.is_automatic = False      # leg.automatic started the last leg
-        self.unused: Reason | None = None      # why the last automatic leg is not used
+        self.unused_reason: Reason | None = None      # why the last automatic leg is not used
         # information of released legs, and of those of earlier runs of the node
         self.carried: CarriedInformation | None = None
         self.marks: list[FloorMark] = []       # on reference.points, since the last leg's pre-roll
@@ -123,8 +123,8 @@ class Session:
         self._last_id += 1
         self.leg_id, self.start_ns, self.stop_ns = self._last_id, mark_ns, 0
         self.config, self.is_automatic = config, is_automatic
-        self.state, self.event, self.trouble = State.RECORDING, 'started', ''
-        self.lost = ''
+        self.state, self.event, self.failure = State.RECORDING, 'started', ''
+        self.drop_cause = ''
         first_ns = mark_ns - round(config.leg.preroll * 1e9)
         self.marks = [mark for mark in self.marks if mark.stamp_ns >= first_ns]
 
@@ -150,7 +150,7 @@ class Session:
     def retry(self, config: Config) -> None:
         """Compute a failed leg again, under the configuration now in force."""
         self.config = config
-        self.state, self.trouble = State.COMPUTING, ''
+        self.state, self.failure = State.COMPUTING, ''
 
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg; ``calibration`` combines all kept legs."""
@@ -158,29 +158,29 @@ class Session:
         if len(self.legs) > LEGS_HELD:
             old = self.legs[-LEGS_HELD - 1]
             self.legs[-LEGS_HELD - 1] = replace(
-                old, results=tuple(one.numbers() for one in old.results))     # no track
-        self.unused = None
+                old, results=tuple(result.numbers() for result in old.results))     # no track
+        self.unused_reason = None
         self.settle(calibration)
 
     def drop_unusable(self, reason: Reason) -> None:
         """Drop the computed automatic leg, which is not usable."""
-        self.event, self.unused = 'cancelled', reason
+        self.event, self.unused_reason = 'cancelled', reason
         self.settle(self.calibration)
 
     def set_carried(self, carried: CarriedInformation | None, released: int) -> None:
         """Release this number of the oldest kept legs; ``carried`` has their information."""
         self.carried, self.legs = carried, self.legs[released:]
 
-    def fail(self, trouble: str) -> None:
+    def fail(self, failure: str) -> None:
         """Record that the computation failed; the leg stays open."""
-        self.state, self.trouble = State.FAILED, trouble
+        self.state, self.failure = State.FAILED, failure
 
-    def cancel(self, lost: str = '') -> None:
-        """Drop the open leg; ``lost``: the cause if it is dropped automatically."""
+    def cancel(self, drop_cause: str = '') -> None:
+        """Drop the open leg; ``drop_cause``: if it is dropped automatically."""
         if not self.has_open_leg:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
                           'leg')
-        self.event, self.lost = 'cancelled', lost
+        self.event, self.drop_cause = 'cancelled', drop_cause
         self.settle(self.calibration)
 
     def begin_undo(self) -> list[KeptLeg]:
@@ -191,7 +191,7 @@ class Session:
         if not self.legs:
             raise Refused('no leg to undo')
         self.mark_undone(self.legs.pop())
-        self.lost = ''
+        self.drop_cause = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None
         return self.legs
@@ -202,9 +202,9 @@ class Session:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
                           'before ~/reset')
         dropped, self.legs = self.legs, []
-        self.calibration, self.state, self.trouble = None, State.IDLE, ''
-        self.restored, self.lost = None, ''
-        self.carried = self.unused = None
+        self.calibration, self.state, self.failure = None, State.IDLE, ''
+        self.restored, self.drop_cause = None, ''
+        self.carried = self.unused_reason = None
         return dropped
 
     def mark_undone(self, leg: KeptLeg) -> None:
@@ -229,7 +229,7 @@ class Session:
 
     def settle(self, calibration: Calibration | None) -> None:
         """Set the combined result of the kept legs, None without one; no leg is open then."""
-        self.calibration, self.trouble = calibration, ''
+        self.calibration, self.failure = calibration, ''
         if calibration is None:
             self.state = State.IDLE
         elif calibration.verdict is Verdict.REJECTED:
@@ -262,7 +262,7 @@ class SessionView:
     forecast_age_s: float = nan                 # since its newest sample
     stage: Stage = Stage()                      # progress of the computation
     saved: str = ''                             # folder of the newest saved result
-    lost: str = ''                              # why a leg was dropped automatically
+    lost_leg: str = ''                          # text on a leg that was dropped automatically
     save_trouble: str = ''                      # why the newest result is not saved
     journal: str = ''                           # folder of the newest leg's journal
     journal_trouble: str = ''                   # why it cannot be written

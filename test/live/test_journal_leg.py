@@ -20,10 +20,10 @@ from odocal_ros.live.journal_leg import (
     clear_empty,
     folder_size,
     journal_folders,
+    JournalPlan,
     LegJournal,
     lock_journal,
     make_room,
-    Plan,
 )
 
 SECOND = 10**9
@@ -32,7 +32,7 @@ CHUNKS = 6
 
 
 def journal(root, name=NAME, limit=10**9):
-    return LegJournal(Plan(1, root, name, 'a: 1\n', limit),
+    return LegJournal(JournalPlan(1, root, name, 'a: 1\n', limit),
                       {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
 
 

@@ -134,9 +134,9 @@ def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
     assert (session.state, session.event, session.has_open_leg) == (
         State.CALIBRATED, 'cancelled', False)
     assert session.calibration is before
-    assert session.unused.text == '30 m'
+    assert session.unused_reason.text == '30 m'
     drive_leg(session, 70, is_automatic=True)
-    assert session.unused is None
+    assert session.unused_reason is None
 
 
 @pytest.fixture(scope='module')
