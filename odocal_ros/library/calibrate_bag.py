@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One calibration from bags: ``odocal replay`` as a function."""
+"""One calibration from one or several bags of a vehicle: ``odocal replay`` as a function."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     for duplicate in repeated:
         notes.note(f'{duplicate} is given twice; it is read once')
     if len(paths) > 1:
-        check_all_bags(paths, lambda one: _check_bag(one, arguments))
+        check_all_bags(paths, lambda bag: _check_bag(bag, arguments))
     bags = _calibrate_bags(paths, arguments, notes)
     settings = bags[-1].config
     first, *others = [flat(bag.config) for bag in bags]      # each journal has settings
@@ -154,11 +154,13 @@ def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> l
     if any(not stop for _, stop in marks):
         listener.note(f'{bag.name}: {OPEN_LEG}')
     spans = bag.spans(arguments.legs)
-    found = not (marks or arguments.legs)      # by the standstills
-    coverage = coverage_reasons(bag.recorder) if found else ()
+    is_searched = not (marks or arguments.legs)      # legs between standstills
+    coverage = coverage_reasons(bag.recorder) if is_searched else ()
     notes = [bag.notes + coverage + note for note in missing_stop_reasons(spans, marks)]
     results = _calibrate_spans(bag, spans, notes, arguments.holdout, listener)
-    return _without_refused(results, listener) if bag.config.leg.automatic and found else results
+    if bag.config.leg.automatic and is_searched:
+        return _without_refused(results, listener)
+    return results
 
 
 def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
@@ -176,7 +178,7 @@ def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
                 progress(None, prefix + stage.words())
             parts = calibrate_parts(leg, bag.config, notes=notes[number - 1], holdout=holdout,
                                     progress=report)
-            results += [replace(one, bag=bag.name) for one in parts]
+            results += [replace(part, bag=bag.name) for part in parts]
     return results
 
 
@@ -233,7 +235,7 @@ def unique_names(paths: list[Path], legs: list[list[LegResult]],
     """Return each bag's legs and inputs with unique bag names: paths if they are not unique."""
     names = [entry['bag'] for entry in inputs]
     if len(set(names)) == len(names):
-        return [leg for of_bag in legs for leg in of_bag], inputs
-    return ([replace(leg, bag=one_line(path)) for path, of_bag in zip(paths, legs, strict=True)
-             for leg in of_bag],
+        return [leg for bag_legs in legs for leg in bag_legs], inputs
+    return ([replace(leg, bag=one_line(path)) for path, bag_legs in zip(
+        paths, legs, strict=True) for leg in bag_legs],
             [entry | {'bag': one_line(path)} for path, entry in zip(paths, inputs, strict=True)])

@@ -1,11 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparison of calibrations of one vehicle, to detect changes."""
+"""
+Comparison of calibrations of one vehicle, to detect changes of tyres, mounting or sensors.
+
+In: calibrations, the oldest first. Out: the change of each value since the first and the previous
+one, in sigmas, and the likely cause of a significant one.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 import math
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +59,9 @@ class Difference:
 class Entry:
     """A parameter in one calibration, with its change since the first and the one before."""
 
-    index: int
+    index: int                          # of the calibration
     estimate: Estimate
-    to_first: Difference | None
+    to_first: Difference | None         # None: there is no earlier usable one
     to_previous: Difference | None
 
 
@@ -65,10 +71,10 @@ class Change:
 
     parameter: str
     unit: str
-    entries: tuple[Entry, ...]
+    entries: tuple[Entry, ...]    # of the calibrations that have it, in order
 
 
-def changes(stored: list[Stored]) -> list[Change]:
+def find_changes(stored: list[Stored]) -> list[Change]:
     """
     Return each parameter of two or more usable calibrations, over all that have it.
 
@@ -85,7 +91,7 @@ def changes(stored: list[Stored]) -> list[Change]:
             if sum(stored[e.index].usable for e in c.entries) > 1]
 
 
-def notes(stored: list[Stored]) -> list[str]:
+def comparability_notes(stored: list[Stored]) -> list[str]:
     """Return notes on calibrations that are not, or not fully, comparable."""
     texts = []
     for s in stored:
@@ -109,15 +115,15 @@ def _differently_mounted(stored: list[Stored]) -> bool:
 
 def _change(name: str, stored: list[Stored]) -> Change:
     """Return a parameter in all calibrations that have it; raise BadUsage if units differ."""
-    known = [i for i, s in enumerate(stored) if s.value(name) is not None]
-    unit = stored[known[0]].estimates[name].unit
+    indices = [i for i, s in enumerate(stored) if s.value(name) is not None]
+    unit = stored[indices[0]].estimates[name].unit
     entries = []
     first = previous = None
-    for i in known:
+    for i in indices:
         if stored[i].estimates[name].unit != unit:
             raise BadUsage(f'{stored[i].name}: {name} is in {stored[i].estimates[name].unit}, in '
-                           f'{stored[known[0]].name} in {unit}; compare calibrations of the same '
-                           'odometer and unit')
+                           f'{stored[indices[0]].name} in {unit}; compare calibrations of the '
+                           'same odometer and unit')
         entries.append(Entry(i, stored[i].estimates[name], _difference(name, stored, first, i),
                              _difference(name, stored, previous, i)))
         if stored[i].usable:
@@ -192,11 +198,11 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
     """
     if len(calibrations) < 2:
         raise BadUsage('compare: only one calibration; give two or more, the oldest first')
-    stored = [stored_from(one.to_dict(), f'calibration {number}')
-              if isinstance(one, Calibration) else read_stored(Path(one))
-              for number, one in enumerate(calibrations, 1)]
-    all_changes = changes(stored)
-    return Comparison(tuple(stored), tuple(all_changes), tuple(notes(stored)),
+    stored = [stored_from(calibration.to_dict(), f'calibration {number}')
+              if isinstance(calibration, Calibration) else read_stored(Path(calibration))
+              for number, calibration in enumerate(calibrations, 1)]
+    all_changes = find_changes(stored)
+    return Comparison(tuple(stored), tuple(all_changes), tuple(comparability_notes(stored)),
                       *_verdict(all_changes, stored))
 
 
@@ -217,8 +223,8 @@ def _verdict(all_changes: list[Change],
         return tuple(_cause(c, d, stored) for _, c, d in significant.values()), True
     if not compared:
         return ('nothing to compare: no sigma is known',), None
-    size, change, _ = max(compared, key=lambda one: one[0])
-    return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label(change.parameter)}, '
+    size, change, _ = max(compared, key=itemgetter(0))
+    return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label_of(change.parameter)}, '
             f'{size:.1f} sigma',), False
 
 
@@ -227,31 +233,31 @@ def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     words = change.parameter.split('_')
     cause = next((text for key, text in CAUSES.items() if key in words),
                  'unknown; calibrate again')
-    before = stored[difference.since].value(change.parameter) or 0.0
-    if 'scale' in words and abs(difference.change) > TYRE_CHANGE_LIMIT * before:
+    old_value = stored[difference.since].value(change.parameter) or 0.0
+    if 'scale' in words and abs(difference.change) > TYRE_CHANGE_LIMIT * old_value:
         cause = f'{OTHER_CAUSE}; compare calibrations of the same odometer'
-    return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
+    return (f'{label_of(change.parameter)} changed by {change_text(change, difference, stored)} '
             f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
             f'{stored[difference.since].name}; likely cause: {cause}')
 
 
-def label(parameter: str) -> str:
+def label_of(parameter: str) -> str:
     """Return the name of a parameter for people."""
     return parameter.replace('gnss', 'fix').replace('_', ' ').replace(' angle', '')
 
 
-def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
+def change_text(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
     """Return a change as text: scales in per cent, angles in deg."""
     if change.parameter.startswith('scale_'):
-        before = stored[difference.since].value(change.parameter)
-        assert before is not None      # entries have a value
-        return format_change(difference.change / before)
+        old_value = stored[difference.since].value(change.parameter)
+        assert old_value is not None      # entries have a value
+        return format_change(difference.change / old_value)
     if change.unit == 'rad':
         return f'{math.degrees(1.0) * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'
 
 
-def hints(all_changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
+def shared_error_notes(all_changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
     """Yield notes on changes that are significant only if shared errors are the same in both."""
     for change in all_changes:
         last = change.entries[-1]
@@ -259,6 +265,6 @@ def hints(all_changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[s
             sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
             if d is not None and stored[last.index].usable and not d.is_significant \
                     and sigmas > REMARK_SIGMAS:
-                yield (f'note: the change of the {label(change.parameter)} is {sigmas:.1f} sigma '
-                       'if errors of heading source and lever arms are the same in both')
+                yield (f'note: the change of the {label_of(change.parameter)} is {sigmas:.1f} '
+                       'sigma if errors of heading source and lever arms are the same in both')
                 break

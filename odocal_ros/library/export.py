@@ -27,7 +27,7 @@ UNIT_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # in name
 KML = 'http://www.opengis.net/kml/2.2'
 
 
-def rrd(result: Calibration, path: Path) -> None:
+def write_rrd(result: Calibration, path: Path) -> None:
     """
     Write drive.rrd.
 
@@ -40,8 +40,8 @@ def rrd(result: Calibration, path: Path) -> None:
     pose, state = series.trajectory(result), series.states(result)
     for leg in np.unique(pose['leg']).tolist():
         _log_leg(recording, f'leg_{leg}', *(
-            {name: column[one['leg'] == leg] for name, column in one.items()}
-            for one in (pose, state)))
+            {name: column[columns['leg'] == leg] for name, column in columns.items()}
+            for columns in (pose, state)))
     with whole_file(path) as file:
         file.write(memory.drain_as_bytes())
 
@@ -64,7 +64,7 @@ def _log_leg(recording: Any, name: str, pose: series.Series, state: series.Serie
                 scalars=column), recording=recording)
 
 
-def tum(columns: series.Series) -> str:
+def tum_text(columns: series.Series) -> str:
     """Return poses in the format of evo: s, m, quaternion x y z w, separated by spaces."""
     stamp = columns['stamp_ns']
     rows = zip(*(columns[name] for name in (
@@ -74,13 +74,13 @@ def tum(columns: series.Series) -> str:
         for s, row in zip(stamp.tolist(), rows, strict=True))
 
 
-def csv(columns: series.Series) -> str:
+def csv_text(columns: series.Series) -> str:
     """Return a series as CSV text with a header line, numbers in full."""
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return ','.join(columns) + '\n' + ''.join(f'{",".join(map(str, row))}\n' for row in rows)
 
 
-def kml(columns: series.Series) -> str:
+def kml_text(columns: series.Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
@@ -100,15 +100,15 @@ def kml(columns: series.Series) -> str:
     return ElementTree.tostring(root, 'unicode', xml_declaration=True) + '\n'
 
 
-def parquet(columns: series.Series, path: Path) -> None:
+def write_parquet(columns: series.Series, path: Path) -> None:
     """Write a series as a Parquet file."""
     import pyarrow
-    from pyarrow import parquet as files
+    from pyarrow import parquet
     with whole_file(path) as file:
-        files.write_table(pyarrow.table(columns), pyarrow.PythonFile(file, mode='w'))
+        parquet.write_table(pyarrow.table(columns), pyarrow.PythonFile(file, mode='w'))
 
 
-def mcap(result: Calibration, path: Path) -> None:
+def write_mcap(result: Calibration, path: Path) -> None:
     """
     Write all series as one mcap file, for PlotJuggler and Foxglove.
 
@@ -121,7 +121,7 @@ def mcap(result: Calibration, path: Path) -> None:
 
 
 def _topics(result: Calibration) -> list[encode.Topic]:
-    """Return the topics of ``mcap``."""
+    """Return the topics of ``write_mcap``."""
     pose, bias = (_by_time(make(result)) for make in (series.trajectory, series.states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     zeros = np.zeros(n, np.int64)
@@ -181,7 +181,7 @@ def _is_importable(module: str) -> bool:
 SERIES: dict[str, Callable[[Calibration], series.Series]] = {
     'trajectory': series.trajectory, 'track': series.trajectory, 'states': series.states,
     'residuals': series.residuals, 'scale_by_speed': export_pictures.scale_by_speed}
-TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
+TEXTS = {'tum': tum_text, 'csv': csv_text, 'kml': kml_text}
 # names of files that ``export`` writes
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
@@ -224,11 +224,11 @@ def _write(result: Calibration, file: Path) -> None:
         draw = export_pictures.draw_map if name == 'map' else export_pictures.draw_scale_by_speed
         draw(result, file)
     elif ending == 'mcap':
-        mcap(result, file)
+        write_mcap(result, file)
     elif ending == 'rrd':
-        rrd(result, file)
+        write_rrd(result, file)
     elif ending == 'parquet':
-        parquet(SERIES[name](result), file)
+        write_parquet(SERIES[name](result), file)
     else:
         with whole_file(file) as output:
             output.write(TEXTS[ending](SERIES[name](result)).encode())

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of a recording: as requested, as marked by the node, or from its standstills."""
+"""
+The legs of a recording, as spans of stamps: requested, marked by the node, or found.
+
+Without request and marks, a leg begins and ends at standstills, as the node's automatic legs do.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
@@ -105,9 +109,9 @@ def _store_status(last: dict[tuple[str, int], dict[str, str]], values: dict[str,
         return
     # ids begin again with each run of the node: a leg is identified by its start too
     leg_id = values.get('leg_id', ''), start
-    before = last.get(leg_id, {}).get('leg_event', '')
-    if leg_id[0] not in ('', '0') and before not in DROPPED_EVENTS:
-        last[leg_id] = values | {'leg_event': values.get('leg_event') or before}
+    last_event = last.get(leg_id, {}).get('leg_event', '')
+    if leg_id[0] not in ('', '0') and last_event not in DROPPED_EVENTS:
+        last[leg_id] = values | {'leg_event': values.get('leg_event') or last_event}
 
 
 def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan | str],
@@ -137,14 +141,15 @@ def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan 
                                               check_faults=False)[0], first, config)
     legs = [_span_in_bag(leg, bag, first, last) for leg in requested if isinstance(leg, LegSpan)]
     if EACH_STOP in requested:
-        legs += _each_stop(standstills(), settings_by_frame(recorder.rows('fix'), config))
+        settings = settings_by_frame(recorder.rows('fix'), config)
+        legs += _legs_between_all_stops(standstills(), settings)
     if legs:
         return legs
     if marks:
         return _marked_spans(marks, last, bag)
     if config.leg.automatic:
         return automatic_legs(recorder, last, config) or [(first, last)]
-    return [_by_standstill(first, last, standstills())]
+    return [_leg_between_standstills(first, last, standstills())]
 
 
 def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans:
@@ -215,7 +220,7 @@ def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
             if (leg.stop_ns or last) > leg.start_ns]
 
 
-def _by_standstill(first: int, last: int, stops: Standstills) -> tuple[int, int]:
+def _leg_between_standstills(first: int, last: int, stops: Standstills) -> tuple[int, int]:
     """Return one leg, from the first standstill to the last; intermediate stops never split."""
     count, distance = len(stops.spans_ns), stops.distance
     if not count:
@@ -230,7 +235,7 @@ def _by_standstill(first: int, last: int, stops: Standstills) -> tuple[int, int]
     return start, stop
 
 
-def _each_stop(stops: Standstills, config: Config) -> Spans:
+def _legs_between_all_stops(stops: Standstills, config: Config) -> Spans:
     """Return a leg from each standstill to the next, without short ones if others are left."""
     starts, ends = stops.spans_ns[:-1, 1].tolist(), stops.spans_ns[1:, 1].tolist()
     legs = list(zip(starts, ends, strict=True))

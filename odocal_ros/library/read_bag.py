@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples of a bag: chosen topics, decoded messages, marks, metadata of a journal."""
+"""
+Read a bag into memory: samples of the chosen topics, marks of a node, settings of a journal.
+
+Out: a ``Recording``, from which legs are cut.
+"""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -190,16 +194,16 @@ def floor_marks_of(config: Config, bag: Bag) -> list[FloorMark]:
 
 def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
     """Return the marks in the status of a node."""
-    found = set[FloorMark]()
+    marks = set[FloorMark]()
     for values in last_statuses(bag):
         for word in filter(None, values.get('marks', '').split(',')):
             with suppress(ValueError):      # of another program
-                found.add(FloorMark.of(word))
-    for mark in found:
+                marks.add(FloorMark.of(word))
+    for mark in marks:
         if not 0 <= mark.point < points:
             raise BadUsage(f'the bag has a mark of point {mark.point + 1}, reference.points has '
                            f'{points}: use the points of the recording')
-    return sorted(found)
+    return sorted(marks)
 
 
 def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Assignment of a bag's topics to inputs, by message type if exactly one topic fits."""
+"""
+Assignment of a bag's topics to inputs (slots), for replay.
+
+In: names, types and message counts of the topics, and those that the user named. Out: slot ->
+topic, if exactly one topic fits each required input; else an error that lists the candidates.
+"""
 
 from collections.abc import Iterable, Mapping
 import re
@@ -65,11 +70,11 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     for slot in required_slots(config, marked):
         if slot in chosen:
             continue
-        found = candidates(topics, slot, config, chosen)
-        if len(found) == 1:
-            chosen[slot] = found[0]
-        elif not _is_optional(slot, config, found):
-            errors.append(_open_slot_text(topics, slot, found, config, chosen))
+        fitting = candidates(topics, slot, config, chosen)
+        if len(fitting) == 1:
+            chosen[slot] = fitting[0]
+        elif not _is_optional(slot, config, fitting):
+            errors.append(_open_slot_text(topics, slot, fitting, config, chosen))
     if errors:
         if not all('; choose one with ' in text for text in errors):
             errors.append(f'the bag has:{_described(topics, topics)}')
@@ -90,32 +95,32 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     """Return the topics that fit a slot and are not chosen for another."""
     types = _types(slot, config)
     taken = set(chosen.values())
-    found = [t.name for t in topics.values()
+    fitting = [t.name for t in topics.values()
              if t.count and t.msgtype in types and t.name not in taken
              and t.name not in SYSTEM_TOPICS and '/calibrator/' not in t.name]
     if slot in ('odometer', 'odometer_right'):
-        found = [name for name in found if not _contains(name, COMMANDS)]
-        found = without_estimates(found)
+        fitting = [name for name in fitting if not _contains(name, COMMANDS)]
+        fitting = without_estimates(fitting)
         if config.odometer.own_topics:
-            found = [name for name in found if ('right' in name) == (slot != 'odometer')]
+            fitting = [name for name in fitting if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
-            return [name for name in found if _base_name(name) == 'heading']
+            return [name for name in fitting if _base_name(name) == 'heading']
         # a single topic with an orientation is the IMU
-        is_imu = len(found) == 1 and 'imu' not in chosen
-        found = [name for name in found if 'heading' in name] or ([] if is_imu else found)
+        is_imu = len(fitting) == 1 and 'imu' not in chosen
+        fitting = [name for name in fitting if 'heading' in name] or ([] if is_imu else fitting)
     elif slot == 'imu':
-        found = _preferably_without(found, ('heading',))
+        fitting = _preferably_without(fitting, ('heading',))
     elif slot == 'fix':
-        fixes = [name for name in found if topics[name].msgtype in GEODETIC]
-        found = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
-            name for name in found if not _contains(name, (*COMMANDS, *GOALS))]
-        found = _preferably_without(found, ('filtered', 'fused'))
+        fixes = [name for name in fitting if topics[name].msgtype in GEODETIC]
+        fitting = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
+            name for name in fitting if not _contains(name, (*COMMANDS, *GOALS))]
+        fitting = _preferably_without(fitting, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
-        found = [name for name in found if _is_of_receiver(name)]
+        fitting = [name for name in fitting if _is_of_receiver(name)]
         # by the name of the node's input
-        found = [name for name in found if _base_name(name) == slot] or found
-    return found
+        fitting = [name for name in fitting if _base_name(name) == slot] or fitting
+    return fitting
 
 
 def without_estimates(names: list[str]) -> list[str]:
@@ -141,10 +146,10 @@ def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str,
             f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
 
 
-def _is_optional(slot: str, config: Config, found: list[str]) -> bool:
+def _is_optional(slot: str, config: Config, fitting: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
-        return not found and not config.odometer.needs_imu
+        return not fitting and not config.odometer.needs_imu
     return slot in EXTERNAL_SLOTS and not (
         slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
@@ -193,20 +198,20 @@ def _fits_slot(msgtype: str, slot: str) -> bool:
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
-def _open_slot_text(topics: Topics, slot: str, found: list[str], config: Config,
+def _open_slot_text(topics: Topics, slot: str, fitting: list[str], config: Config,
                     chosen: dict[str, str]) -> str:
     """Return the reason for a slot without topic, and the option that selects one."""
     fix = chosen.get('fix', '')
-    if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:
+    if slot == 'odometer' and fix and not fitting and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
                 f'({topic_option("fix")}): an odometer cannot be calibrated against itself')
-    if found:
+    if fitting:
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
-                side for name in found for side in ('left', 'right') if side in name}:
+                side for name in fitting for side in ('left', 'right') if side in name}:
             hint = ', or for two wheels set odometer.left and odometer.right to topic'
-        return (f'{len(found)} topics can be the {INPUTS[slot].label}; choose one with '
-                f'{topic_option(slot)}{hint}:{_described(topics, found)}')
+        return (f'{len(fitting)} topics can be the {INPUTS[slot].label}; choose one with '
+                f'{topic_option(slot)}{hint}:{_described(topics, fitting)}')
     types = tuple(_types(slot, config))
     empty = topics_without_messages({t.name: (t.msgtype, t.count) for t in topics.values()}, slot)
     if empty:
@@ -238,6 +243,6 @@ def _contains(name: str, words: Iterable[str]) -> bool:
     return any(word in name.lower() for word in words)
 
 
-def _preferably_without(found: list[str], words: Iterable[str]) -> list[str]:
+def _preferably_without(fitting: list[str], words: Iterable[str]) -> list[str]:
     """Return the topics without such a word in their name; all, if none are left."""
-    return [name for name in found if not _contains(name, words)] or found
+    return [name for name in fitting if not _contains(name, words)] or fitting

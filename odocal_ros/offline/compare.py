@@ -27,37 +27,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from odocal_ros.library.compare import compare
     from odocal_ros.offline.cli import OK, REJECTED
-    found = compare(*args.files)
+    comparison = compare(*args.files)
     if args.json:
-        print_json(found.to_dict())
+        print_json(comparison.to_dict())
     else:
-        print_text('\n'.join(_screen(found)))
-    return OK if found.changed is False else REJECTED
+        print_text('\n'.join(_screen(comparison)))
+    return OK if comparison.changed is False else REJECTED
 
 
-def _screen(found: 'Comparison') -> list[str]:
-    from odocal_ros.library.compare import hints, label
+def _screen(comparison: 'Comparison') -> list[str]:
+    from odocal_ros.library.compare import label_of, shared_error_notes
     from odocal_ros.output.stored import estimate_text as value_text
     from odocal_ros.output.value_text import counted, table_lines
-    stored = found.stored
+    stored = comparison.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '
              f'{counted(len(s.legs), "leg")}' for i, s in enumerate(stored, 1)]
-    for change in found.changes:
+    for change in comparison.changes:
         rows: list[tuple[str, ...]] = [
             (f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
              _cell(change, e.to_previous, stored)) for e in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         if len(stored) == 2:       # both are the same
             rows = [row[:3] for row in rows]
-        lines += ['', label(change.parameter), *table_lines(rows, ' ')]
-    return [*lines, '', *(f'note: {note}' for note in found.notes), *found.sentences,
-            *hints(found.changes, stored)]
+        lines += ['', label_of(change.parameter), *table_lines(rows, ' ')]
+    return [*lines, '', *(f'note: {note}' for note in comparison.notes), *comparison.sentences,
+            *shared_error_notes(comparison.changes, stored)]
 
 
 def _cell(change: 'Change', difference: 'Difference | None', stored: 'tuple[Stored, ...]') -> str:
-    from odocal_ros.library.compare import amount
+    from odocal_ros.library.compare import change_text
     if difference is None:
         return '-'
     sigmas = '' if difference.sigmas is None else f' ({difference.sigmas:+z.1f} sigma)'
-    return amount(change, difference, stored) + sigmas
+    return change_text(change, difference, stored) + sigmas
