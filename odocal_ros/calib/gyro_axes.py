@@ -53,7 +53,7 @@ class WrongAxis(NamedTuple):
     text: str         # statement of what was observed
 
 
-def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
+def level_axes(up: Floats) -> tuple[Floats, list[str]]:
     """Return level e1, e2 and up as rows, (3, 3), and the sensor axis nearest to each, as "-y"."""
     k = int(np.argmax(np.abs(up)))
     first, second = np.eye(3)[(k + 1) % 3], np.sign(up[k]) * np.eye(3)[(k + 2) % 3]
@@ -93,7 +93,7 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     """
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
-    axes, names = sensor_axes(up / np.linalg.norm(up))
+    axes, names = level_axes(up / np.linalg.norm(up))
     wrong_axes = by_course(inputs, located, w_i, axes, names)
     if not wrong_axes and inputs.has_accelerometer:
         inverted = orientation and orientation.inward < min(

@@ -89,10 +89,10 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
             source, target = (np.array([x[b].mean() for b in blocks]) for x in (reckoned, fixed))
             if (source != source[0]).any():      # else the path stays where it is
                 fits[i] = _similarity(source, target)
-    for i, found in zip(fits, _scale_sigmas(list(fits.values()), float(np.median(sigma))),
-                        strict=True):
-        if found < 1.0:
-            ratio[i], ratio_sigma[i] = abs(fits[i].factor), found
+    scale_sigmas = _scale_sigmas(list(fits.values()), float(np.median(sigma)))
+    for i, scale_sigma in zip(fits, scale_sigmas, strict=True):
+        if scale_sigma < 1.0:
+            ratio[i], ratio_sigma[i] = abs(fits[i].factor), scale_sigma
     return Sections(edges[:-1], edges[1:], ratio, ratio_sigma)
 
 
@@ -188,8 +188,8 @@ def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
     by dead reckoning, m. The sigma is by the scatter over parts of the leg (jackknife); it is too
     small if errors last longer than such a part.
     """
-    rows = [(length, *found) for length in WINDOWS
-            if (found := _window_ratio(t_fix, fix_n[:, :2], dead_n[:, :2], length))]
+    rows = [(length, *ratio) for length in WINDOWS
+            if (ratio := _window_ratio(t_fix, fix_n[:, :2], dead_n[:, :2], length))]
     return np.array(rows) if rows else NO_ROWS
 
 

@@ -110,11 +110,11 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     t : (n,) s, rising.   x : (n, k) values.   min_step : smallest step of a spike from row to row.
     All False if so many rows jump that it is normal for the sensor.
     """
-    is_outlier = np.zeros(len(x), bool)
+    is_spike = np.zeros(len(x), bool)
     steps = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
     large = np.flatnonzero(steps > min_step)
     if not len(large):
-        return is_outlier
+        return is_spike
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
     end = -1
     most_jumps = 2000    # jumps that are tested
@@ -125,8 +125,8 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
         returned = np.abs(x[i + 2:stop] - x[i]).max(axis=1) <= RETURN_SHARE * steps[i]
         if returned.any():
             end = i + 2 + int(np.argmax(returned))
-            is_outlier[i + 1:end] = True
-    return is_outlier if is_outlier.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
+            is_spike[i + 1:end] = True
+    return is_spike if is_spike.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
 def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
@@ -152,11 +152,11 @@ def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
                             & (difference < EQUAL_NEIGHBOURS * deviation))
         return reduce_columns(np.logical_or, of_column)
 
-    found = np.zeros(len(x), bool)
+    outliers = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
-        found[edge:-edge] = by_step(is_outlier, x, steps=2 * edge)
-    found &= found.sum() <= max(GLITCH_SHARE * len(x), GROUP_ROWS)
-    return found
+        outliers[edge:-edge] = by_step(is_outlier, x, steps=2 * edge)
+    outliers &= outliers.sum() <= max(GLITCH_SHARE * len(x), GROUP_ROWS)
+    return outliers
 
 
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from odocal_ros.calib.gyro_axes import by_gravity, sensor_axes
+from odocal_ros.calib.gyro_axes import by_gravity, level_axes
 from odocal_ros.calib.mounting import mounting
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -163,7 +163,7 @@ def test_axes_are_those_of_the_messages_whatever_the_mounting():
                                 (0.1, -0.99, 0.1)])
 def test_level_axes_are_right_handed_and_named_by_the_sensor_axis_next_to_them(up):
     up = np.array(up) / np.linalg.norm(up)
-    axes, names = sensor_axes(up)
+    axes, names = level_axes(up)
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
     assert axes[2] == pytest.approx(up)
@@ -183,7 +183,7 @@ def test_a_sound_gyro_is_not_accused(scenario, more):
 def test_the_fit_finds_each_coefficient_within_its_sigma():
     made = town()
     inputs = screen_leg(made.leg(), settings(made)).inputs
-    axes, _ = sensor_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
+    axes, _ = level_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
     for M, expected in ((np.eye(3), SOUND), (AXES['mirrored x'], SOUND * [-1, 1, 1]),
                         (AXES['x and y swapped'], SOUND[[1, 0, 2]])):
         fit = gravity_fit(inputs.t_imu, inputs.w_b @ M.T, inputs.f_b, axes, inputs.travel,

@@ -38,11 +38,11 @@ from odocal_ros.nav.time_series import integral_at
 from odocal_ros.screening.axles import STEER_GRID, steering_path
 from odocal_ros.settings.levels import TRACK_WIDTH
 
-OWN_DELAY = 0.02        # s, judgement: 1 sigma of the stamps of a wheel relative to the others
+WHEEL_DELAY_SIGMA = 0.02    # s, judgement: of the stamps of a wheel relative to the others
 FIRST_WALK = 2e-3**2    # m^2/s, definition: initial levels of the random walk
-UNUSABLE = 1e10         # s, definition: ``Increments.share`` of an increment without information
-GAP = 0.3               # s, judgement: interpolation errors are then 1 to 2 cm
-FEWEST = 20             # increments, judgement: with fewer, the sigma of a level is 30 % or more
+UNUSABLE_SHARE = 1e10   # s, definition: ``Increments.share`` without information
+LONGEST_STEP = 0.3      # s, judgement: interpolation errors are then 1 to 2 cm
+FEWEST_INCREMENTS = 20  # judgement: with fewer, the sigma of a level is 30 % or more
 NUISANCE = range(2, 5)  # definition: indices of the delays and the drift among the unknowns
 # physical, relative error of x_i by sideslip and body motion: 20 mm of 2.7 m (docs/decisions/0022)
 POSITION_ERROR = 8e-3
@@ -93,11 +93,11 @@ def fit_wheels(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     t = stamp_of(state.t, state.constants)
     inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
                             & (t <= min(w.t[-1] for w in wheels)))
-    if len(inside) < FEWEST:
+    if len(inside) < FEWEST_INCREMENTS:
         return {}
     s = np.stack([as_rolled(w, state.constants)(state.t[inside]) for w in wheels]) * state.scale
     at = _nodes(s, state.scale * max(w.quantum for w in wheels))
-    if len(at) < FEWEST:
+    if len(at) < FEWEST_INCREMENTS:
         return {}
     signals = _Signals(problem, fit, inside[at], s[:, at])
     clock = np.array([layout.ODO_DELAY, layout.ODO_CLOCK])
@@ -125,7 +125,7 @@ def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
         yield t - 1.0, t + 1.0
     for wheel in leg.wheels:
         steps = np.diff(wheel.t)
-        for k in np.flatnonzero(steps > max(GAP, 3 * float(np.median(steps)))):
+        for k in np.flatnonzero(steps > max(LONGEST_STEP, 3 * float(np.median(steps)))):
             yield wheel.t[k], wheel.t[k + 1]
 
 
@@ -157,7 +157,7 @@ class _Signals:
         self.share = np.clip(path, 0.02 * np.minimum(self.T, 1.0), self.T)
         stamp = stamp_of(self.t, state.constants)
         for begin, end in _unknown(problem.leg):
-            self.share[(stamp[1:] > begin) & (stamp[:-1] < end)] = UNUSABLE
+            self.share[(stamp[1:] > begin) & (stamp[:-1] < end)] = UNUSABLE_SHARE
         self.scale = state.scale
         self.steer = {i: self._steering(state, up, i) for i, fixed in enumerate(self.fixed)
                       if not fixed}
@@ -184,7 +184,7 @@ class _Signals:
         X = np.stack([self.path, -self.turn, self.speed_change, y0 * self.rate_change,
                       y0 * self.T], -1)
         width_sigma = TRACK_WIDTH.taped_share * width / 2
-        prior = np.array([1.0, width_sigma or TRACK_WIDTH.any_sigma, OWN_DELAY,
+        prior = np.array([1.0, width_sigma or TRACK_WIDTH.any_sigma, WHEEL_DELAY_SIGMA,
                           max(delay, 1e-4), max(drift, 1e-9)])
         mean = np.array([0.0, y0 if width_sigma else 0.0, 0.0, 0.0, 0.0])
         if i in self.steer:
