@@ -24,8 +24,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '`gnss.min_status`, or a sigma above `gnss.max_sigma`.',
         Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or an impossible value, '
         'are isolated outliers, or are fixes far from all others. They were left out. A leg '
-        'counts its messages and those up to `leg.preroll` before it; odocal inspect counts those '
-        'of the time that all topics cover.',
+        'counts its messages and those of its pre-roll (`leg.preroll`); odocal inspect counts '
+        'those of the time that all topics cover.',
         Code.LOCAL_FRAME: 'Positions are poses or points in a local frame, not GNSS fixes. The '
         'direction of the Earth rate in this frame is not known, and external headings and GNSS '
         'velocities do not refer to it. The estimator treats the Earth rate as gyro bias; the '

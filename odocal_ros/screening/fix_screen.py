@@ -46,9 +46,13 @@ JUMP_DELAY = 0.1
 SPANS_LISTED = 3           # judgement: number of spans in a reason
 
 
-def usable_fixes(fix: FixSamples, received: int,
-                 gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
-    """Return usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, reasons; received: count."""
+def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
+                 origin: str = '') -> tuple[Bools, Floats, tuple[Reason, ...]]:
+    """
+    Return usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, and reasons.
+
+    received : number of fixes.   origin : text on which ones these are.
+    """
     no_fix = fix.status < gnss.min_status
     most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
     invalid = ~has_position(fix) | (abs(fix.height) > most_height)
@@ -78,7 +82,7 @@ def usable_fixes(fix: FixSamples, received: int,
     if rejected:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
         whys, remedies = zip(*rejected, strict=True)
-        reasons += (Reason(code, f'{int((~use).sum())} of {received} fixes are not used: '
+        reasons += (Reason(code, f'{int((~use).sum())} of {received} fixes{origin} are not used: '
                            f'{", ".join(whys)}', ' '.join(remedies)),)
     return use, covariance, reasons
 

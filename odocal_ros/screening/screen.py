@@ -141,7 +141,8 @@ def _usable(leg: Leg, config: Config, check_faults: bool, reasons: list[Reason])
 def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) -> dict[str, Any]:
     """Return fixes and external sensors as fields of Inputs; add the reasons for unused ones."""
     fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
-    use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
+    origin = ' of the leg and its pre-roll' if (rows.t_fix < 0).any() else ''
+    use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss, origin)
     reasons += fix_reasons
     reasons += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]

@@ -14,6 +14,7 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.core
+FIXES = 'fixes of the leg and its pre-roll'
 
 
 def test_a_clean_leg_is_used_to_the_last_row(leg):
@@ -34,7 +35,7 @@ def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, lab
     rows = leg.rows(slot)
     n, t = len(rows.stamp_ns), seconds(leg, rows)[40]
     if slot == 'fix' and value == 1e200:
-        assert reason.text.startswith(f'3 of {n} fixes are not used: 3 at an invalid '
+        assert reason.text.startswith(f'3 of {n} {FIXES} are not used: 3 at an invalid '
                                       'position (the first: latitude ')
     else:
         assert reason.text == (f'3 of {n} {label} messages hold NaN, Inf or an impossible value, '
@@ -61,11 +62,12 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
                       longitude=(rows, np.nan))
     n = len(leg.fix.stamp_ns)
     inputs, codes = screen_with(lost(slice(0, 9)))
-    assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} fixes are not used: 9 with status below 0'}
+    assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} {FIXES} are not used: 9 with status '
+                     'below 0'}
     assert inputs.fixes_rejected == 9
     inputs, codes = screen_with(lost(slice(None)))
     assert codes == {
-        Code.FIXES_UNUSABLE: f'{n} of {n} fixes are not used: {n} with status below 0'}
+        Code.FIXES_UNUSABLE: f'{n} of {n} {FIXES} are not used: {n} with status below 0'}
     assert 'gnss.min_status' in Code.FIXES_UNUSABLE.remedy
     assert len(inputs.t_fix) == 0
     # asked for, even a fix that is none is no position
@@ -92,7 +94,8 @@ def test_fixes_that_other_reasons_name_are_not_counted_as_invalid(leg):
     bad = spoilt(leg, 'fix', latitude=(slice(70, 74), 2.0), stamp_ns=(90, leg.fix.stamp_ns[89]))
     _, found = screen(bad, Config())
     (text,) = [r.text for r in found if 'are not used' in r.text]
-    assert text.startswith(f'4 of {len(leg.fix.stamp_ns)} fixes are not used: 4 at an invalid ')
+    assert text.startswith(f'4 of {len(leg.fix.stamp_ns)} {FIXES} are not used: 4 at an '
+                           'invalid ')
 
 
 @pytest.mark.parametrize('column', [
