@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 __version__ = '1.0.0'
 __all__ = ['Calibration', 'Comparison', 'Config', 'OdocalError', 'Planned', 'Recording',
            'calibrate_bag', 'compare', 'plan', 'read_bag', 'simulate']
-# name: its module; imported at its first use, so that this page stays quick
+# name: its module; imported at its first use, so that `import odocal_ros` stays quick
 _HOMES = {'Calibration': 'library.calibration', 'Comparison': 'library.compare',
           'Config': 'settings.config', 'OdocalError': 'errors', 'Planned': 'library.plan',
           'Recording': 'library.read_bag', 'calibrate_bag': 'library.calibrate_bag',

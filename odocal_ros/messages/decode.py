@@ -162,7 +162,7 @@ class Reader:
         columns = self._plan.columns
         if layout is not self._layout:
             self._layout = layout
-            paths = [column.pick(layout) for column in columns]
+            paths = [column.find_paths(layout) for column in columns]
             self._record, self._unpackers = layout.record(paths), (
                 layout.unpackers(paths) if self._plan.has_readings else [])
         if self._record is None:
@@ -175,7 +175,7 @@ class Reader:
         """Return the columns of messages of one layout; None if one is missing."""
         values: list[NDArray[Any]] = []
         for column in self._plan.columns:
-            paths = column.pick(layout)
+            paths = column.find_paths(layout)
             value = layout.columns(table, paths) if paths else None
             if value is None:
                 self._count_unreadable(len(table), self._plan.missing(layout))

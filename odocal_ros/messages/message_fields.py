@@ -85,9 +85,9 @@ View = Layout | MessageView
 @lru_cache
 def parts(path: str) -> tuple[tuple[str, str], ...]:
     """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
-    found = tuple(PATH_PART.findall(path))
-    rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
-    return found if rebuilt.lstrip('.') == path else ()
+    pairs = tuple(PATH_PART.findall(path))
+    rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in pairs)
+    return pairs if rebuilt.lstrip('.') == path else ()
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ class Column:
     """
     Values to read from every message: one column of samples, or several.
 
-    width : number of values.   pick : returns their paths in a message, None if they are missing.
+    width : number of values.   find_paths : returns their paths in a message, None if missing.
     """
 
     dtype: type
     width: int
-    pick: Callable[[View], Sequence[str] | None]
+    find_paths: Callable[[View], Sequence[str] | None]
 
     def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the values of an object; None if they are missing."""
-        values = [view.value(path) for path in self.pick(view) or ()]
+        values = [view.value(path) for path in self.find_paths(view) or ()]
         if self.dtype is np.int64:
             values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
         return values or None

@@ -199,12 +199,12 @@ class OdometerPlan:
             return lambda view: (path,)
         key = key or side        # not by parsing the path: a joint may have any name
 
-        def pick(view: View) -> Sequence[str] | None:
+        def find_paths(view: View) -> Sequence[str] | None:
             n = view.count(base)
             names = view.names
             index = names.index(key) if key in names else int(key) if key.isdigit() else n
             return (f'{base}[{index}]',) if index < n else None
-        return pick
+        return find_paths
 
     def missing(self, view: View) -> str:
         """Return the reason why a message has no value, as text."""

@@ -24,7 +24,7 @@ Rows = Ints | Bools | slice      # selected messages: numbers, mask or slice
 Table = NDArray[np.uint8]      # (n, size): a message in each row
 # judgement: layouts per message length; messages of further ones are read one by one
 MAX_LAYOUTS = 16
-FEW_ROWS = 8      # judgement: messages up to which single reads take less time than a table
+FEW_ROWS = 8      # judgement: messages up to selection single reads take less time than a table
 FRAME_MESSAGES = 3     # judgement: messages that determine the frame; one may be damaged
 TEXT_OFFSET = cdr.FRAME_OFFSET - 4      # format: offset of the length of the frame_id
 
@@ -47,16 +47,16 @@ class RawMessages(Sequence[bytes]):
         return len(self.start)
 
     @overload
-    def __getitem__(self, which: int) -> bytes: ...
+    def __getitem__(self, selection: int) -> bytes: ...
 
     @overload
-    def __getitem__(self, which: slice) -> 'RawMessages': ...
+    def __getitem__(self, selection: slice) -> 'RawMessages': ...
 
-    def __getitem__(self, which: int | slice) -> 'bytes | RawMessages':
-        if isinstance(which, slice):
-            return self.take(which)
-        start = int(self.start[which])
-        return bytes(self.data[start:start + int(self.size[which])])
+    def __getitem__(self, selection: int | slice) -> 'bytes | RawMessages':
+        if isinstance(selection, slice):
+            return self.take(selection)
+        start = int(self.start[selection])
+        return bytes(self.data[start:start + int(self.size[selection])])
 
     def take(self, rows: Rows) -> 'RawMessages':
         """Return the messages of some rows, without a copy of their bytes."""

@@ -50,20 +50,20 @@ def select_wheels(names: Sequence[str], count: int) -> Choice | str:
         return 'the list is empty'
     if len(set(keys)) < len(keys):
         return f'two joints with the same name in {_list_text(keys)}'
-    found = _select_by_name(names) if names else tuple(keys)
+    selected = _select_by_name(names) if names else tuple(keys)
     if len(keys) == 1:
-        if not found:
+        if not selected:
             return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
                     'odometer.field')
         return Choice((keys[0],), True, '')
-    if isinstance(found, Choice):
-        return found
-    if len(found) == 1:
-        return Choice((found[0],), True, f'joints {_list_text(keys)}: only {found[0]} is used, '
-                      'selected by name')
-    if len(found) == 2:
+    if isinstance(selected, Choice):
+        return selected
+    if len(selected) == 1:
+        return Choice((selected[0],), True,
+                      f'joints {_list_text(keys)}: only {selected[0]} is used, selected by name')
+    if len(selected) == 2:
         noun = 'joints' if names else 'values'
-        first, second = found
+        first, second = selected
         return Choice((first, second), False, f'{noun} {_list_text(keys)}: the mean of {first} '
                       f'and {second} is used. Left and right cannot be decided from the data; '
                       'below, the first is called left')
@@ -89,10 +89,10 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
                         if not set(_words(name)) & set(EXCLUDED_WHOLE_WORDS)]
         candidates = [name for name in not_excluded
                       if _contains(name, DRIVE_WORDS_IN_NAME)] or not_excluded
-    places = {name: _side_and_rest(name) for name in candidates}
-    left, right = ([name for name in candidates if places[name][0] == side]
+    split = {name: _side_and_rest(name) for name in candidates}
+    left, right = ([name for name in candidates if split[name][0] == side]
                    for side in ('left', 'right'))
-    pairs = [(a, b) for a in left for b in right if places[a][1] == places[b][1]]
+    pairs = [(a, b) for a in left for b in right if split[a][1] == split[b][1]]
     if len(left) == len(right) == 1:
         pairs = [(left[0], right[0])]
     if len(pairs) != len({name for pair in pairs for name in pair}) / 2:
@@ -101,15 +101,15 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
         return Choice(pairs[0], True, _selection_text(names, pairs[0], ''))
     steered = {_axle(_side_and_rest(name)[1]) for name in names
                if _contains(name, STEERING_WORDS)} - {''}
-    fixed = [pair for pair in pairs if steered and _axle(places[pair[0]][1]) not in steered]
-    rear = [pair for pair in pairs if _axle(places[pair[0]][1]) == 'rear']
+    fixed = [pair for pair in pairs if steered and _axle(split[pair[0]][1]) not in steered]
+    rear = [pair for pair in pairs if _axle(split[pair[0]][1]) == 'rear']
     for axle_pairs, reason in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
         if len(axle_pairs) == 1:
             all_names = ', '.join(name for pair in pairs for name in pair)
             explanation = _selection_text(names, axle_pairs[0], reason)
             return Choice(axle_pairs[0], True,
                           f'{explanation}; for all wheels set odometer.wheels to [{all_names}]')
-    single = [name for name in candidates if _axle(places[name][1]) == 'rear']
+    single = [name for name in candidates if _axle(split[name][1]) == 'rear']
     return tuple(single) if len(candidates) == 2 and len(single) == 1 else tuple(candidates)
 
 

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Options of a simulated drive, with defaults and checks, and kinds of position references."""
+"""
+Options of a simulated drive, their defaults by scenario, and their checks.
+
+Also the kinds of position references (GNSS, motion capture, SLAM ...), with their usual errors.
+"""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
@@ -149,13 +153,15 @@ DEFAULTS = {
     'square': {'duration': 151.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
                'track_width': 0.3},
 }
-COMMON = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
-          'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
-          'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0}
+COMMON_DEFAULTS = {
+    'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
+    'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
+    'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0,
+}
 ROBOTS = ('indoor', 'square')     # scenarios
-# of a robot: 70 mm wheels, encoders with 2500 counts
+# (true, nominal) scale by kind of odometer, of a robot: 70 mm wheels, encoders with 2500 counts
 INDOOR_SCALES = {'counts': (8.9e-5, 8.8e-5), 'speed': (1.02, 1.0), 'angle': (0.0354, 0.035)}
-SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
+SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}     # of a car
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
             'nominal_scale', 'track_width', 'wheelbase', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
@@ -178,7 +184,7 @@ def resolved(options: SimOptions) -> SimOptions:
     """Return options with the scenario's own values; BadUsage for a wrong name or value."""
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--odometer', options.odometer, ODOMETERS)
-    defaults: dict[str, Any] = COMMON | DEFAULTS[options.scenario]
+    defaults: dict[str, Any] = COMMON_DEFAULTS | DEFAULTS[options.scenario]
     _choice('--reference', options.reference or defaults['reference'], REFERENCES)
     defaults |= REFERENCES[options.reference or defaults['reference']].usual
     options = _with_defaults(options, defaults)
@@ -199,12 +205,12 @@ def resolved(options: SimOptions) -> SimOptions:
         nominal = 1.2 * (options.scale or scale)
     elif options.scale is not None:
         nominal = options.scale * nominal / scale
-    filled = _with_defaults(options, {'scale': scale, 'nominal_scale': nominal,
+    resolved_options = _with_defaults(options, {'scale': scale, 'nominal_scale': nominal,
                                       'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
     if isinstance(options.real, dict):      # as in truth.yaml
-        filled = replace(filled, real=Real(**options.real))
-    _check(filled)
-    return filled
+        resolved_options = replace(resolved_options, real=Real(**options.real))
+    _check(resolved_options)
+    return resolved_options
 
 
 def _with_defaults(options: SimOptions, values: dict[str, Any]) -> SimOptions:
@@ -226,10 +232,10 @@ def _check(options: SimOptions) -> None:
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: required: A:B, seconds with 0 <= A < B')
-    most = 20_000_000    # of one topic; more would not fit in memory
-    if options.duration * options.imu_rate > most:
+    most_samples = 20_000_000    # of one topic; more would not fit in memory
+    if options.duration * options.imu_rate > most_samples:
         raise BadUsage(f'--duration {options.duration:g} at --imu-rate {options.imu_rate:g}: more '
-                       f'than {most:,} samples; lower one of them')
+                       f'than {most_samples:,} samples; lower one of them')
 
 
 def _check_number(name: str, value: float) -> None:

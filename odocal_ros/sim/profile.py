@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Profiles of a drive: piecewise polynomials of time with exact derivatives; slope of the road."""
+"""
+Profiles of a drive: piecewise polynomials of time with exact derivatives; slope of the road.
+
+Routes are chains of pieces of acceleration and turn rate; speed and yaw are their integrals.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -38,8 +42,8 @@ class Profile:
     def mean(self, t: ArrayLike) -> Floats:
         """Return the values, at a jump the mean of both sides (a trapezoid rule is then exact)."""
         t = np.asarray(t, dtype=float)
-        near = 1e-9    # s, a sample this near a break counts as on it
-        before, after = self._piece(t - near), self._piece(t + near)
+        tolerance = 1e-9    # s, a sample so close to a break is on it
+        before, after = self._piece(t - tolerance), self._piece(t + tolerance)
         return (self._evaluate(before, t) + self._evaluate(after, t)) / 2
 
     def derivative(self) -> 'Profile':
@@ -130,10 +134,11 @@ class Hills:
         """Return slope and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
         wave, cosine_wave = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
-        _, sine, by, by2 = self._over_kerbs(travel)
+        _, sine, sine_by_path, sine_by_path2 = self._over_kerbs(travel)
         cosine = np.sqrt(1 - sine**2)
-        return (wave + np.arcsin(sine), k * cosine_wave + by / cosine,
-                -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
+        return (wave + np.arcsin(sine), k * cosine_wave + sine_by_path / cosine,
+                -k**2 * wave + sine_by_path2 / cosine
+                + sine_by_path**2 * sine / cosine**3)
 
     def chord(self, travel: Floats, wheelbase: float) -> tuple[Floats, Floats]:
         """Return the slope of the line from ``travel`` to a wheelbase ahead and its derivative."""
@@ -141,8 +146,8 @@ class Hills:
         mean = self.slope * (np.cos(k * travel) - np.cos(k * ahead)) / (k * wheelbase)
         mean_by_path = self.slope * (np.sin(k * ahead) - np.sin(k * travel)) / wheelbase
         rear, front = self._over_kerbs(travel), self._over_kerbs(ahead)
-        sine, by = ((front[i] - rear[i]) / wheelbase for i in (0, 1))
-        return mean + np.arcsin(sine), mean_by_path + by / np.sqrt(1 - sine**2)
+        sine, sine_by_path = ((front[i] - rear[i]) / wheelbase for i in (0, 1))
+        return mean + np.arcsin(sine), mean_by_path + sine_by_path / np.sqrt(1 - sine**2)
 
     def _over_kerbs(self, travel: Floats) -> Floats:
         """Return the height by kerbs, m, and its three derivatives by distance: (4, n)."""

@@ -113,8 +113,9 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
         return samples.ScalarSamples.none()
     ns, t = stamps(motion.duration, rate, PHASE['pressure'])
     state, draw = motion.at(t), make_rng(options.seed, 'pressure').standard_normal
-    weather, by_wind, warmer = draw(3) * [1e-3, 6e-3, 0.03]    # m/s, m per (m/s)^2, relative
-    height = (state.height + by_wind * state.speed**2 + weather * t) / (1 + warmer)
+    # change by weather, m/s; by wind, m per (m/s)^2; by temperature, relative
+    weather, wind, temperature = draw(3) * [1e-3, 6e-3, 0.03]
+    height = (state.height + wind * state.speed**2 + weather * t) / (1 + temperature)
     value = ground * np.exp(-(height + sigma * draw(len(t))) / scale_height)
     stamp = options.start_ns + ns
     return samples.ScalarSamples(stamp, stamp, value, (value * sigma / scale_height)**2)
@@ -138,8 +139,8 @@ def odometers(motion: Motion, options: SimOptions) -> list[samples.OdometerSampl
 
 
 def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
-    """Return stamps that are late by a topic's delay and jitter, by a clock of its own."""
-    delay, jitter, rate = (getattr(owner, f'{name}_{what}') for owner, what in (
+    """Return stamps, ns, late by delay and jitter of a topic, by a clock with another rate."""
+    delay, jitter, rate = (getattr(group, f'{name}_{quantity}') for group, quantity in (
         (options, 'delay'), (options.real, 'jitter'), (options.real, 'clock_rate')))
     ns = ns + np.rint(rate * ns).astype(np.int64)
     if not jitter:
@@ -190,8 +191,8 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     if options.slip_events:     # each takes a second
         rng = make_rng(options.seed, f'slip events {side}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
-        for at in rng.choice(state.t[moving], spins):
-            length += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
+        for begin in rng.choice(state.t[moving], spins):
+            length += options.slip_size * np.clip(state.t - begin, 0.0, 1.0)
     if options.start_slip:
         length += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
     return length
@@ -217,16 +218,16 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     error = error + reference_drift(t, motion.at(t).travel, options)
     error = real_sensors.fused_errors(t, error, options)
     meridian, normal = radii(latitude)
-    by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
-    # from the first fix: metres per radian change along the path
+    metres_per_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
+    # from the first fix; metres per radian change along the path
     change = np.stack([longitude - longitude[:1], latitude - latitude[:1]], -1)
-    position = np.column_stack([by_rad * change, height])
+    position = np.column_stack([metres_per_rad * change, height])
     error = real_sensors.tunnel_errors(t, error, position, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
-    power = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
+    variance_ratio = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
     variance = real_sensors.true_variance(
-        _axes(options) ** 2 * power + stationary_sigma(options)**2, options)
+        _axis_sigmas(options) ** 2 * variance_ratio + stationary_sigma(options)**2, options)
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].planar:
         variance[2] = 0.0
@@ -244,7 +245,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     return samples.take(sent, received)
 
 
-def _axes(options: SimOptions) -> Floats:
+def _axis_sigmas(options: SimOptions) -> Floats:
     return options.fix_sigma * np.array([1.0, 1.0, 2.0])
 
 
@@ -255,7 +256,7 @@ def fix_errors(t: Floats, options: SimOptions) -> Floats:
         slow = gauss_markov(make_rng(options.seed, 'fix slow'), 1.0,
                             options.fix_correlation_time, t)
         draws = slow + WHITE_SHARE * draws
-    errors = _axes(options) * draws
+    errors = _axis_sigmas(options) * draws
     rng = make_rng(options.seed, 'outliers')
     share, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
     distance = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (share < options.outliers)
