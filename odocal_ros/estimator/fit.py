@@ -35,8 +35,6 @@ from odocal_ros.estimator.state import Priors, State
 Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
 # sigmas of a prior beyond which it is relaxed. Statistical: one sound prior in 22
 RELAXATION_SIGMAS = 2.0
-
-
 # step along the previous one, as a share of it, below which it is shortened. Judgement: smaller
 # reversals converge without it
 REVERSAL = -0.5

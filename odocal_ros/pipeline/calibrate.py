@@ -79,8 +79,9 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     reversed_spans, scale = _reversed_sections(result, inputs)
     if not len(reversed_spans):
         return result
-    found = reversing_reasons(reversed_spans, inputs.travel, scale, BY_FIT, config.odometer.signed)
-    return result_of(inputs.mirrored(reversed_spans), (*screened.reasons, *found))
+    reasons = (*screened.reasons, *reversing_reasons(
+        reversed_spans, inputs.travel, scale, BY_FIT, config.odometer.signed))
+    return result_of(inputs.mirrored(reversed_spans), reasons)
 
 
 def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:

@@ -67,11 +67,11 @@ def _fit_guarded(run: planar.Run, inputs: Inputs, config: settings.Config,
         return refused_planar_result([reason], unit)
     try:
         with raise_on_overflow():
-            found = fit_run(run, known_values(run, config), lambda passes, change: progress(
+            fit = fit_run(run, known_values(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
-            method = make_planar_result(found, unit, nominal_scale(config, unit), config,
+            method = make_planar_result(fit, unit, nominal_scale(config, unit), config,
                                         shortened_by_slopes(inputs))
-            return method, _tracks(run, found)
+            return method, _tracks(run, fit)
     except (FloatingPointError, np.linalg.LinAlgError):
         return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} did not converge: an estimate became '
                               'infinite or NaN. Likely cause: the wheels do not belong to the '

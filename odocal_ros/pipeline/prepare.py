@@ -128,11 +128,11 @@ def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track
         return (), NO_SLIPS
     from odocal_ros.calib.wheel_faults import wheel_faults
     odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
-    found, wheel_slips = zip(*(wheel_faults(
+    axle_reasons, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
         located.origin.latitude, located.rough, odometer.track_width, inputs.uncertain_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
-    return tuple(chain(*found)), join_axles(wheel_slips, count)
+    return tuple(chain(*axle_reasons)), join_axles(wheel_slips, count)
 
 
 def _time_of_four_fifths(track: Track, t_stop: float) -> float:

@@ -35,9 +35,10 @@ WIDE_HYPERPRIOR, HYPERPRIOR_SIGMAS = 3.0, dict.fromkeys(('along', 'turn', 'spin'
 STUDENT_FREEDOM = 4.0
 # m/s, added to the speed of wheels, moving and at rest, for noise that grows with time. Judgement
 SPEED_IN_MOTION, SPEED_AT_REST = 0.1, 1e-3
-LEAST = 1e-4        # judgement: lowest level, over its median: no sensor is without noise
+LEAST_LEVEL = 1e-4  # judgement: lowest level, over its median: no sensor is without noise
 MOST_PASSES = 80
-CONVERGED = 0.02    # largest last step: sigmas of a constant, logarithm of a level
+# judgement: of a fit that has converged: sigmas of a constant, logarithm of a level
+LARGEST_LAST_STEP = 0.02
 
 
 def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], None] = lambda
@@ -69,7 +70,7 @@ def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], 
             levels[name] *= float(np.exp(step))
         sigma = np.sqrt(np.diag(solution.covariance))
         change = float((np.abs(solution.constants) / sigma).max())
-        converged = change < CONVERGED and max(map(abs, level_steps.values())) < CONVERGED
+        converged = max(change, *map(abs, level_steps.values())) < LARGEST_LAST_STEP
         after_pass(passes, change)
     result = fit_at(run, known, state, c, levels, first_gains, prior, student_weights)
     return replace(result, passes=passes, converged=converged, swapped=initial.swapped)
@@ -146,7 +147,7 @@ def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
         prior_slope = np.log(LEVELS[name] / levels[name]) / hyperprior_sigma**2
         step = ((chi2 - freedom) / 2 + prior_slope) / (
             max(chi2, freedom) / 2 + 1 / hyperprior_sigma**2)
-        lowest = np.log(LEAST * LEVELS[name] / levels[name])
+        lowest = np.log(LEAST_LEVEL * LEVELS[name] / levels[name])
         steps[name] = float(max(np.clip(step, -1.5, 1.5), lowest))
     return steps
 
