@@ -70,7 +70,8 @@ def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], 
             levels[name] *= float(np.exp(step))
         sigma = np.sqrt(np.diag(solution.covariance))
         change = float((np.abs(solution.constants) / sigma).max())
-        converged = max(change, *map(abs, level_steps.values())) < LARGEST_LAST_STEP
+        level_change = max(map(abs, level_steps.values()))
+        converged = change < LARGEST_LAST_STEP and level_change < LARGEST_LAST_STEP
         after_pass(passes, change)
     result = fit_at(run, known, state, c, levels, first_gains, prior, student_weights)
     return replace(result, passes=passes, converged=converged, swapped=initial.swapped)
