@@ -238,7 +238,7 @@ def remarks(row: dict[str, Any]) -> list[str]:
         texts.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
     if row['odd_legs']:
         texts.append(f'outlier legs: {", ".join(row["odd_legs"].split())}')
-    if row['rejected_for']:
+    if row['rejected_for'] and not (row['rejected_since'] and row['why']):    # else stated there
         since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
         texts.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
                      f'({", ".join(row["rejected_for"].split())}){since}')

@@ -6,6 +6,7 @@
 from contextlib import contextmanager
 import csv
 from dataclasses import replace
+from datetime import datetime, UTC
 import json
 import os
 import re
@@ -23,6 +24,7 @@ from odocal_ros.fleet import calibrate_bags
 from odocal_ros.fleet.bag_jobs import computed_rows
 from odocal_ros.fleet.bags import find_bags
 from odocal_ros.fleet.engine import FEWEST_TASKS, task_results
+from odocal_ros.fleet.page import remarks
 from odocal_ros.fleet.rows import DONE, FAILED, read_rows
 from odocal_ros.offline.cli import main
 
@@ -161,6 +163,16 @@ def test_a_second_run_computes_only_what_is_new_or_changed(fleet, client, output
     assert computed(client, fleet.jobs(output, '--accept', 'scale_ratio=0:9')[:2])[0] == 0
     assert computed(client, fleet.jobs(tmp_path, '--set', 'leg.min_distance=50')[:2])[0] == 2
     assert stored(tmp_path)[str(bag)].key != before[str(bag)].key
+
+
+def test_rejected_legs_are_stated_once():
+    row = {'decision': 'UNDECIDED', 'changes': '[]', 'outlier': '', 'odd_legs': '', 'legs': 4,
+           'legs_good': 2, 'rejected_for': 'ODOMETER_STILL', 'bags_failed': 0,
+           'rejected_since': datetime(2025, 6, 29, tzinfo=UTC)}
+    why = 'rejected: ODOMETER_STILL: the last 2 legs, since 2025-06-29, are all rejected'
+    assert remarks(row | {'why': why}) == ['UNDECIDED', why]
+    assert remarks(row | {'why': ''})[1] == (
+        '2 of 4 legs rejected (ODOMETER_STILL), all since 2025-06-29')
 
 
 def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, output, capsys):
