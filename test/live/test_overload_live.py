@@ -241,6 +241,6 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
         assert (content['vehicle'], content['inputs'][0]['node']) == (name, f'/{name}/calibrator')
     text = answers['slip'].message
     assert 'WHEEL_SLIP' in text
-    size, at = text.split('travel of the vehicle: ')[1].split(' s (')[0].split(' m at t = ')
+    size, at = text.split('travel of the vehicle: ')[1].split(' s for ')[0].split(' m at t = ')
     assert float(size) == pytest.approx(SLIP_M, abs=0.15)
     assert float(at) == pytest.approx(SLIP_S - START_S, abs=1.5)
