@@ -212,13 +212,14 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(Path(bag)) if bag else None
     settings = config_of(config, journal.settings if journal else None)
-    of_bag: dict[str, Any] = {}      # fields of Sigmas
+    bag_sigmas: dict[str, Any] = {}      # fields of Sigmas
     if scenario:
         drive = planned_drives.from_scenario(scenario, duration)
     elif gpx:
         drive = planned_drives.from_gpx(Path(gpx), speed)
     elif bag:
-        drive, of_bag = planned_drives.from_bag(Path(bag), settings, dict(topics or {}), journal)
+        drive, bag_sigmas = planned_drives.from_bag(Path(bag), settings, dict(topics or {}),
+                                                    journal)
     elif speed is None:
         raise BadUsage('--distance needs --speed, m/s')
     else:
@@ -226,6 +227,6 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         drive = planned_drives.from_figures(
             speed, distance, 30.0 if standstill is None else standstill, turns or 0, acceleration)
     if 'fix' in figures:
-        of_bag |= {'fix_up': None}
-    sigmas = Sigmas(config=settings, **(of_bag | figures))
+        bag_sigmas |= {'fix_up': None}
+    sigmas = Sigmas(config=settings, **(bag_sigmas | figures))
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)

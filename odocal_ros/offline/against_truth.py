@@ -75,9 +75,9 @@ def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
                None if accept is None else (float(accept[0]), float(accept[1])))
 
 
-def table(found: list[Row]) -> str:
+def table(compared: list[Row]) -> str:
     lines = [f'{"":<28}{"found":<32}{"truth":<20}off by']
-    for row in found:
+    for row in compared:
         if row.value is None:
             lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
             continue
@@ -96,14 +96,14 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if len(argv) != 2:
             raise BadUsage('required: two files: calibration.json truth.yaml')
-        found = rows(*(_read(Path(name)) for name in argv))
-        if not found or found[0].value is None:
+        compared = rows(*(_read(Path(name)) for name in argv))
+        if not compared or compared[0].value is None:
             raise BadUsage(f'{argv[0]}: no scale factor to compare; see its reasons')
     except OdocalError as error:
         warn(f'against_truth: {error}')
         return 2
-    print_text(table(found))
-    return 0 if all(row.agrees for row in found) else 1
+    print_text(table(compared))
+    return 0 if all(row.agrees for row in compared) else 1
 
 
 def _read(path: Path) -> dict[str, dict[str, Any]]:

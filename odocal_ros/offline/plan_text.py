@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of odocal plan: the sigmas and budgets of ``library.plan.Planned`` as one screen."""
+"""Text of odocal plan: sigmas, budgets and improvements of a planned drive as one screen."""
 
 import math
 
@@ -22,8 +22,9 @@ from odocal_ros.output.value_text import (
 
 
 def screen(planned: Planned) -> str:
-    return '\n'.join([*_head(planned), '', *_methods(planned), '', *_budgets(planned),
-                      *_improvements(planned), *_reasons(planned)])
+    return '\n'.join([*_drive_lines(planned), '', *_sigma_lines(planned), '',
+                      *_budget_lines(planned), *_improvement_lines(planned),
+                      *_reason_lines(planned)])
 
 
 def indoor_screen(runs: list[PlannedRun]) -> str:
@@ -58,7 +59,7 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
     return f'{math.degrees(sigma):.2g} deg' if head == 'yaw' else f'{100 * sigma:.2g} %'
 
 
-def _head(plan: Planned) -> list[str]:
+def _drive_lines(plan: Planned) -> list[str]:
     sigmas, two_point = plan.sigmas, plan.two_point
     alignment, tau = two_point.alignment, sigmas.correlation_time
     stands = [f'standing {duration_text(s)}' if s else 'in motion' for s in two_point.standing]
@@ -79,14 +80,15 @@ def _head(plan: Planned) -> list[str]:
     return lines
 
 
-def _methods(plan: Plan) -> list[str]:
+def _sigma_lines(plan: Plan) -> list[str]:
     rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
-        (name, *(_shown(p, method.estimates[p].sigma) for p in MAIN_VALUES))
+        (name, *(_sigma_text(p, method.estimates[p].sigma) for p in MAIN_VALUES))
         for name, method in plan.methods.items())]
-    return [*(table_row(row, (20, 14, 16, 16)) for row in rows), f'  (result: {_result(plan)})']
+    return [*(table_row(row, (20, 14, 16, 16)) for row in rows),
+            f'  (result: {_method_text(plan)})']
 
 
-def _result(plan: Plan) -> str:
+def _method_text(plan: Plan) -> str:
     by_method: dict[str | None, list[str]] = {}
     for parameter, label in MAIN_VALUES.items():
         by_method.setdefault(plan.method_of(parameter), []).append(label)
@@ -95,39 +97,39 @@ def _result(plan: Plan) -> str:
                      for method, labels in by_method.items())
 
 
-def _shown(parameter: str, sigma: float | None) -> str:
+def _sigma_text(parameter: str, sigma: float | None) -> str:
     if sigma is None:
         return 'unknown'
     return (relative_text(sigma) if parameter == SCALE
             else f'{significant(math.degrees(sigma))} deg')
 
 
-def _budgets(plan: Plan) -> list[str]:
+def _budget_lines(plan: Plan) -> list[str]:
     """Return the main error sources of each method that will provide a value."""
     budgets = []
-    shown = 0.01    # share of the variance from which a source has its row
+    least_share = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
         method = plan.methods[name]
         hidden = [p for p in MAIN_VALUES if method.estimates[p].sigma is None]
-        lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
+        lines = budget_lines(method.details.get('budget'), 1.0, least_share, hidden)
         if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
         budgets += [*lines, ''] if lines else []
     return budgets
 
 
-def _improvements(plan: Planned) -> list[str]:
+def _improvement_lines(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
         best, word = ranked(plan.improvements, plan, parameter), MAIN_VALUES[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
-        lines += [f'    {c.text:<58}{_shown(parameter, plan.sigma(parameter)):>10} -> '
-                  f'{_shown(parameter, c.sigmas[parameter])}' for c in best[:4]]
+        lines += [f'    {c.text:<58}{_sigma_text(parameter, plan.sigma(parameter)):>10} -> '
+                  f'{_sigma_text(parameter, c.sigmas[parameter])}' for c in best[:4]]
     return lines
 
 
-def _reasons(plan: Plan) -> list[str]:
+def _reason_lines(plan: Plan) -> list[str]:
     lines = []
     for reason in plan.reasons:
         lines += wrapped(f'{reason}. {reason.remedy}', hanging='   ', width=96)

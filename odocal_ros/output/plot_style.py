@@ -101,9 +101,9 @@ def peak_rows(y: Floats) -> Ints:
     return np.array(sorted(keep))
 
 
-def even_rows(n: int, most: int = MOST_MARKS) -> Ints:
-    """Return at most ``most`` row numbers of n, both ends included: (m,) int."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else \
+def even_rows(n: int, limit: int = MOST_MARKS) -> Ints:
+    """Return at most ``limit`` row numbers of n, both ends included: (m,) int."""
+    return np.unique(np.linspace(0, n - 1, min(n, limit)).round().astype(int)) if n else \
         np.empty(0, int)
 
 

@@ -15,7 +15,7 @@ from odocal_ros.data.samples import LOCAL
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.scale_plots import by_speed, by_window
 
-PAUSE = {'no fix used': style.PINK, 'no IMU': style.RED, 'no odometer': style.GREEN}
+GAP_COLOURS = {'no fix used': style.PINK, 'no IMU': style.RED, 'no odometer': style.GREEN}
 STATUS = {-1: ('no fix (-1)', 'x', style.GREY), 0: ('fix (0)', 'o', style.BLUE),
           1: ('satellite based aid, SBAS (1)', 's', style.GREEN),
           2: ('ground based aid, GBAS or RTK (2)', '^', style.PINK)}
@@ -106,11 +106,11 @@ def _draw_marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
     labelled = set()
     for label, begin, end in gaps:
         ends = np.clip((begin, end), evidence.t[0], evidence.t[-1])
-        ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=PAUSE[label], linewidth=4,
+        ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=GAP_COLOURS[label], linewidth=4,
                 alpha=0.6, zorder=1, solid_capstyle='butt',
                 label=None if label in labelled else label)
         if label != 'no fix used':       # marks at the ends make short gaps visible
-            ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
+            ax.plot(*at(ends), '|', color=GAP_COLOURS[label], markersize=12, markeredgewidth=2)
         labelled.add(label)
     if evidence.t_fit < evidence.t[-1]:
         ax.plot(*at(np.array([evidence.t_fit])), 'D', color='black', markersize=6,

@@ -1,10 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations to write and to tell of, made by hand so that every field is known."""
+"""Calibrations made by hand, so that every field that is written is known."""
 
 from dataclasses import replace
 
+from hand_made import GAP
 import numpy as np
 import pytest
 
@@ -16,30 +17,15 @@ from odocal_ros.calib.result import (
     Source,
     TrackCheck,
 )
-from odocal_ros.output import program_files
-from odocal_ros.output.files import as_json
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.config import Config, with_settings
 
-CREATED = '2026-01-02T03:04:05+00:00'
 PITCH_LOST = Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too inaccurate')
-GAP = Reason(Code.TOPIC_GAP, 'odometer gap of 1.2 s at t = 3.1 s')
 START_NS = 1_533_200_000_500_000_000        # 2018-08-02 08:53:20.5 UTC
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])    # Rz(-90 deg)
 
 
-def texts(calibration, **changes):
-    """Return the files for other programs by name; changes of settings as group__name."""
-    config = with_settings(Config(), {k.replace('__', '.'): v for k, v in changes.items()})
-    return program_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
-
-
-def with_estimates(calibration, **changed):
-    return replace(calibration, estimates=calibration.estimates | changed)
-
-
 def estimates(unit='m/pulse', scale=0.05, ratio=1.25):
-    """Return what a two-point leg gives."""
+    """Return the estimates of a two-point leg."""
     return {
         'scale_factor': Estimate(scale, 1.2e-6, unit),
         'scale_ratio': Estimate(ratio, None if ratio is None else 3e-5, '1'),
@@ -50,9 +36,9 @@ def estimates(unit='m/pulse', scale=0.05, ratio=1.25):
 @pytest.fixture
 def good():
     """Return an accepted calibration of one leg, K0 = 0.04 m/pulse, pitch not determined."""
-    found = estimates()
+    values = estimates()
     method = MethodResult(
-        'two_point', (PITCH_LOST,), found, ('scale_factor', 'yaw_mounting_angle'),
+        'two_point', (PITCH_LOST,), values, ('scale_factor', 'yaw_mounting_angle'),
         (Source('fixes', np.diag([2e-5, 1e-6])), Source('gyro_bias_z', np.diag([1e-6, 5e-5]))),
         {'budget': {'fixes': {'scale_factor': np.float64(1e-6)}},
          'correlation': {'scale_factor,yaw_mounting_angle': 0.25},
@@ -63,7 +49,7 @@ def good():
         methods={'two_point': method}, before=TrackCheck(1500.0, 2800.0, 1400.0, 2800.0, 25.0),
         after=TrackCheck(0.1, 0.3, 0.09, 0.02, 1.8e-4), track_n=np.zeros((5, 3)), bag='drive',
         C_bi=TURN)
-    result = {name: replace(e, method='two_point') for name, e in found.items()}
+    result = {name: replace(e, method='two_point') for name, e in values.items()}
     return Calibration((GAP, PITCH_LOST), result, {'two_point': method}, (leg,),
                        (0.0, 0.0, -0.0087, 0.99996), (0.0, 0.0, -0.0174533))
 
@@ -88,17 +74,17 @@ def smoothed(good):
     """Return an accepted calibration of two wheels by the smoother, 0.05 m/pulse."""
     method = replace(good.methods['two_point'], name='smoother', details=SMOOTHED)
     leg = replace(good.legs[0], methods={'smoother': method}, origin=(0.8, 0.2, 100.0))
-    found = good.estimates | {f'scale_factor_{side}': Estimate(0.05, 1e-6, 'm/pulse')
-                              for side in ('left', 'right')} | {
-        'track_width': Estimate(1.6, 1e-3, 'm')} | {
-        f'gyro_bias_{axis}': Estimate(0.1, 1e-5, 'rad/s') for axis in 'xyz'}
+    values = {**good.estimates, 'track_width': Estimate(1.6, 1e-3, 'm'),
+              **{f'scale_factor_{side}': Estimate(0.05, 1e-6, 'm/pulse')
+                 for side in ('left', 'right')},
+              **{f'gyro_bias_{axis}': Estimate(0.1, 1e-5, 'rad/s') for axis in 'xyz'}}
     return replace(good, methods={'smoother': method}, legs=(leg,), estimates={
-        name: replace(e, method='smoother') for name, e in found.items()})
+        name: replace(e, method='smoother') for name, e in values.items()})
 
 
 @pytest.fixture
 def nothing():
-    """Return a rejected calibration that found no number at all."""
+    """Return a rejected calibration without any value."""
     reason = Reason(Code.NO_FIX, 'no fix came')
     leg = LegResult(0, 10 * 10**9, 0.0, 10.0, 5, 5, 0, 0, (reason,), {})
     return Calibration((reason,), {}, {}, (leg,))

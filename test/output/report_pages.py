@@ -8,7 +8,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 import re
 
-from conftest import CREATED
+from hand_made import CREATED
 import numpy as np
 
 from odocal_ros.calib.evidence import Evidence

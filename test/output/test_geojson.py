@@ -8,7 +8,7 @@ from dataclasses import replace
 import io
 import json
 
-from conftest import CREATED
+from hand_made import CREATED
 import numpy as np
 import pytest
 

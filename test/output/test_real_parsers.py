@@ -10,7 +10,7 @@ import sys
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
-from conftest import texts, with_estimates
+from hand_made import texts, with_estimates
 from pages import fenced, ROOT
 import pytest
 import yaml

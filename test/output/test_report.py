@@ -8,7 +8,7 @@ from html import unescape
 import math
 import re
 
-from conftest import CREATED
+from hand_made import CREATED
 import numpy as np
 import pytest
 from report_pages import drawn, evidence, INPUTS, page_of, three_methods

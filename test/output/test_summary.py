@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 import re
 
-from conftest import GAP
+from hand_made import GAP
 import numpy as np
 import pytest
 

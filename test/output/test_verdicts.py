@@ -6,7 +6,7 @@
 from dataclasses import replace
 import json
 
-from conftest import CREATED
+from hand_made import CREATED
 import pytest
 
 from odocal_ros.output import report_tables

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from conftest import CREATED
+from hand_made import CREATED
 import pytest
 
 from odocal_ros.calib.result import Estimate
