@@ -44,9 +44,10 @@ def with_right(made, change, **more):
 def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signed):
     half = span // 2 * signed
     leg = with_right(made, lambda a: (a + half) % span - half)
-    inputs, said = screened(leg, made)
-    text = said[Code.WHEEL_COUNTERS_DIFFER]
-    assert f"right wheel's counter rolls over at {span}," in text
+    inputs, found = screen(leg, settings(made))
+    reason, = (r for r in found if r.code is Code.WHEEL_COUNTERS_DIFFER)
+    assert f"right wheel's counter rolls over at {span}," in reason.text
+    assert f'have this modulus, set odometer.wrap to {span}.' in reason.remedy
     # bridging would lose counts; here none is
     assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
     assert not len(inputs.uncertain_t)

@@ -136,7 +136,7 @@ def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: floa
     left, right = pair.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {pair.t[at]:.0f} s on, after about '
                    f'{100 * share:.0f} % of the path, the {right} wheel counts '
-                   f'{100 * abs(change):.2f} % (± {100 * abs(change) / sigmas:.2f}) '
+                   f'{100 * abs(change):.2f} ± {100 * abs(change) / sigmas:.2f} % '
                    f'{"more" if change > 0 else "less"} relative to the {left} wheel and the '
                    'gyro. Likely cause: continuous slip or a tyre that loses pressure. Which '
                    'section is correct cannot be decided from the data: '

@@ -132,7 +132,9 @@ def correct_rollovers(
         span.size, f'{span.size:.0f}')
     angle = span.size in NAMED_SPANS     # exact, but odometer.wrap needs an integer
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
-    do = f'Set odometer.wrap to {span.size:.0f}.' if only_counter and not angle else ''
+    do = '' if angle else f'Set odometer.wrap to {span.size:.0f}.' if only_counter else (
+        f'If both wheels have this modulus, set odometer.wrap to {span.size:.0f}. Otherwise '
+        'correct the driver: odometer.wrap is for both.')
     # judgement: few counters roll over so often; values of two counters alternate
     two_publishers = times > 0.1 * len(step)
     reason = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '

@@ -200,7 +200,7 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     assert method.estimates['scale_factor'].value is None
     reason, = method.reasons
     assert reason.code is Code.NOT_CONVERGED
-    assert 'accelerometer scale y -21 %' in reason.text
+    assert 'accelerometer scale y of -21 %, impossible for an IMU (limit 20 %)' in reason.text
 
 
 def test_equations_without_a_solution_say_the_time(monkeypatch):

@@ -49,11 +49,13 @@ def implausible_imu_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a scale error that no IMU has, [] if there is none."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
-    if abs(c[worst]) <= 0.2:        # twenty times the error of a consumer IMU
+    limit = 0.2        # twenty times the error of a consumer IMU
+    if abs(c[worst]) <= limit:
         return []
-    return [Reason(Code.NOT_CONVERGED, 'the fit converged to '
-                   f'{layout.CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+z.0f} %, '
-                   'impossible for an IMU: a local minimum, or wrong units, axes or time offsets')]
+    return [Reason(Code.NOT_CONVERGED, 'the fit converged to an error of '
+                   f'{layout.CONSTANTS[worst].replace("_", " ")} of {100 * c[worst]:+z.0f} %, '
+                   f'impossible for an IMU (limit {100 * limit:.0f} %). Likely cause: wrong '
+                   'units, axes or time offsets, or a local minimum')]
 
 
 def unknown_estimates(scale_unit: str) -> dict[str, Estimate]:
