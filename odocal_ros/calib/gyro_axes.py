@@ -70,10 +70,10 @@ def turning(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation |
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.least_motion)
-    found = gyro_reasons(ratio, gyro_scale)
-    if not any(one.code is Code.GYRO_SIGN for one in found):
-        return ratio, gyro_axes(inputs, located, orientation) or found
-    text = found[0].text
+    reasons = gyro_reasons(ratio, gyro_scale)
+    if not any(one.code is Code.GYRO_SIGN for one in reasons):
+        return ratio, gyro_axes(inputs, located, orientation) or reasons
+    text = reasons[0].text
     if orientation and abs(orientation.inward) > max(
             -INVERTED, FAR_SIGMAS * orientation.inward_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
@@ -146,15 +146,15 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
         return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
     if one_motion(ratio(axes[2])):
         return []
-    found = []
+    wrong_axes = []
     for name, axis in zip(names[:2], axes[:2], strict=True):
         turns = ratio(axis)
         if turns is not None and one_motion(turns):
             sent, true = _measured(name, names[2], turns)
-            found.append(WrongAxis(
+            wrong_axes.append(WrongAxis(
                 sent, true, f'angular_velocity.{sent} turns with the course of the fixes (ratio '
                 f'{turns:.2f}), angular_velocity.{names[2][-1]} does not'))
-    return found
+    return wrong_axes
 
 
 def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
@@ -163,7 +163,7 @@ def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, 
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough)
     if fit is None:
         return []
-    found = []
+    wrong_axes = []
     nearest = WRONG[np.abs(WRONG - fit.coefficient[:, None]).argmin(axis=1)]
     close, first = np.abs(nearest - fit.coefficient) < NEAR_WRONG, nearest.imag == 0
     for k, c in enumerate(fit.coefficient):
@@ -173,10 +173,10 @@ def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, 
             continue
         along, part = (names[0], c.real) if first[k] else (names[1], c.imag)
         sent, true = _measured(names[k], along, float(part))
-        found.append(WrongAxis(
+        wrong_axes.append(WrongAxis(
             sent, true, f'angular_velocity.{sent} measures the rotation of gravity about {true} '
             f'(coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
-    return found
+    return wrong_axes
 
 
 def _measured(sent: str, true: str, part: float) -> tuple[str, str]:

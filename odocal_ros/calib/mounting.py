@@ -113,8 +113,8 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
         C = np.stack([forward_i, np.cross(up_i, forward_i), up_i])
         nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
         deviation = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
-        found = nearest if deviation < MEANT_AXIS + sigma else None
-        return Mounting(found, up_i, forward_i, sigma, False, deviation)
+        meant = nearest if deviation < MEANT_AXIS + sigma else None
+        return Mounting(meant, up_i, forward_i, sigma, False, deviation)
     if abs(up_i[2]) > np.cos(MEANT_AXIS):     # upright or upside down: x is forward, most likely
         C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
         return Mounting(C_bi, up_i, None, sigma, True, float(np.arccos(abs(up_i[2]))))

@@ -166,7 +166,7 @@ def section_ratio(s: Floats, path: Floats, p: Floats, min_chord: float) -> float
 
 
 def level_track(travel: Floats, turn: Floats) -> Floats:
-    """Return the level path of travel, (n, 2) in its units; turned : (n,) rad about up."""
+    """Return the level path of travel, (n, 2) in its units; turn : (n,) rad about up."""
     middle = (turn[1:] + turn[:-1]) / 2
     step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
     return running_sum(step)

@@ -170,9 +170,9 @@ class TwoPointRun:
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
         sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
         pieces = track_check.cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
-        found = track_check.reversal_reasons(pieces, self.config.odometer.signed)
-        self.data_reasons += found
-        if not found:
+        reversals = track_check.reversal_reasons(pieces, self.config.odometer.signed)
+        self.data_reasons += reversals
+        if not reversals:
             residuals = track_check.track_residuals(prepared.path(f), chord.start, fixes)
             statistics = track_check.track_statistics(residuals, prepared.distance)
             self.reasons += track_check.distance_reasons(

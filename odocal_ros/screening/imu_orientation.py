@@ -98,9 +98,9 @@ def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | Non
     """Return the changes of the accelerations of a leg, None if it is too short."""
     mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))
-    found = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
-                              metres_per_unit) if size else None
-    return None if found is None else found.changes()
+    binned = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
+                               metres_per_unit) if size else None
+    return None if binned is None else binned.changes()
 
 
 def estimate_orientation(inputs: Inputs, metres_per_unit: float) -> ImuOrientation | None:

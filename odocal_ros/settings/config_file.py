@@ -120,15 +120,15 @@ def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
 
     A repeated key is added to the block of its first appearance, as in rcl.
     """
-    found: dict[str, list[Node]] = {}
+    blocks: dict[str, list[Node]] = {}
     for key, value in _pairs(node):
         if key == PARAMETERS and prefix:
-            found.setdefault(prefix, []).append(value)
+            blocks.setdefault(prefix, []).append(value)
         elif isinstance(key, str):
             name = f'{prefix}/{key}' if prefix else key
             for deeper, mappings in _blocks(value, name).items():
-                found.setdefault(deeper, []).extend(mappings)
-    return found
+                blocks.setdefault(deeper, []).extend(mappings)
+    return blocks
 
 
 def _matches_calibrator(key: str) -> bool:

@@ -143,11 +143,11 @@ def parse_accept(text: str) -> dict[str, float]:
     if not (equals and colon and limits != ':'):
         raise BadUsage(f'--accept {text}: required: {ACCEPT_FORM}')
     try:
-        found = {f'accept.{parameter}_{side}': float(value) * factor
-                 for side, value in (('min', low), ('max', high)) if value.strip()}
-        if any(map(math.isnan, found.values())):
+        settings = {f'accept.{parameter}_{side}': float(value) * factor
+                    for side, value in (('min', low), ('max', high)) if value.strip()}
+        if any(map(math.isnan, settings.values())):
             raise ValueError
-        return found
+        return settings
     except ValueError:
         raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
                        f'{ACCEPT_FORM}') from None

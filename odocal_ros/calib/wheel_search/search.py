@@ -120,7 +120,7 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     if fixed_difference:
         direct = least_squares(leg, x[best], space, robust)
     refined = _refine(leg, x[best], ranges, space, robust)
-    refined_set, direct_set = (sets_of(leg, found.x)[0] for found in (refined, direct))
+    refined_set, direct_set = (sets_of(leg, fit.x)[0] for fit in (refined, direct))
     refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
     return SearchResult(
         (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, fixed_difference,

@@ -242,9 +242,9 @@ def twist_noise(calibration: Calibration) -> TwistNoise | None:
 
 def _fitted_details(legs: Sequence[LegResult]) -> tuple[dict[str, Any], ...]:
     """Return the details of the legs that the smoother fitted and nothing rejects."""
-    found = [leg.methods['smoother'].details for leg in legs
-             if 'smoother' in leg.methods and leg.verdict.value != 'rejected']
-    return tuple({'wheels': {}, **details} for details in found if 'odometer' in details)
+    fitted = [leg.methods['smoother'].details for leg in legs
+              if 'smoother' in leg.methods and leg.verdict.value != 'rejected']
+    return tuple({'wheels': {}, **details} for details in fitted if 'odometer' in details)
 
 
 def _mean_square(effect: dict[str, float]) -> float:
