@@ -240,7 +240,8 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
         return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '
                        'the fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
-    text = f'turns by the gyro are {ratio:#.3g} times those by the fixes'
+    text = (f'turns by the gyro are {ratio:#.3g} times those by the fixes (limits '
+            f'{ONE_MOTION_RATIO[0]:g} and {ONE_MOTION_RATIO[1]:g})')
     if degrees:
         return (Reason(Code.IMU_UNITS, text + ', typical for deg/s',
                        f'Set imu.gyro_scale to {gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '

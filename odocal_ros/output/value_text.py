@@ -28,8 +28,9 @@ UNKNOWN = Estimate(None, None, '')
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 MAIN_VALUES = {'scale_factor': 'scale', **ANGLES}
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
-# definition: the space between a number and its unit
-BEFORE_UNIT = re.compile(r'(?<=\d) (?=%|(?:deg|ppm|Hz|[ckm]?m|m?s|m/s)(?!\w))|(?<=±) ')
+# definition: the space between a number and its unit, and in 't = 5'
+BEFORE_UNIT = re.compile(r'(?<=\d) (?=%|(?:deg|ppm|Hz|[ckm]?m|m?s|m/s)(?!\w))|(?<=±) '
+                         r'|(?<=\bt) (?== )|(?<=\bt =) ')
 LEG_PREFIX = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 

@@ -20,7 +20,11 @@ from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.result.estimates import estimate_constants, FittedConstants
+from odocal_ros.estimator.result.estimates import (
+    estimate_constants,
+    FittedConstants,
+    OTHER_WARNINGS,
+)
 from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECTIONS, M, YAW
 from odocal_ros.reasons import Code, Verdict
@@ -124,6 +128,8 @@ def test_an_uncertainty_that_model_errors_increase_is_explained():
         assert len(texts) == bool(text)
         # twice 0.4 deg exceeds the limit, 0.4 deg would not: motion is not what lacks
         assert all(text in one and 'the model errors' in one for one in texts)
+        assert not text or {r.remedy for r in reasons if r.code in (
+            Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED)} == {OTHER_WARNINGS}
 
 
 def test_an_even_drive_straight_on_tells_no_yaw():

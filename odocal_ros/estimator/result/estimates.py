@@ -58,6 +58,10 @@ def implausible_imu_reasons(fit: Fit) -> list[Reason]:
                    'units, axes or time offsets, or a local minimum')]
 
 
+# the angle would be determined without the factor for model errors
+OTHER_WARNINGS = 'Follow the actions of the other warnings first.'
+
+
 def unknown_estimates(scale_unit: str) -> dict[str, Estimate]:
     """Return the estimates of a leg, each without a value."""
     units = {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
@@ -177,11 +181,11 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
     if sigma[layout.YAW] > limit / factor:
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in changed_angles else (
             'too little acceleration, or too few turns' if sigma[layout.YAW] > limit else
-            'the model errors, see the other warnings')
+            'the model errors')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
                               f'{differing(*np.rad2deg([factor * sigma[layout.YAW], limit]))} '
-                              f'deg{limit_text}. '
-                              f'Likely cause: {cause}'))
+                              f'deg{limit_text}. Likely cause: {cause}',
+                              OTHER_WARNINGS if sigma[layout.YAW] <= limit else ''))
     elif deviation > REVERSED_YAW:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
                               'directions: positive counts mean backwards, or the IMU x axis '
@@ -195,5 +199,6 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
             Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
             f'{differing(*np.rad2deg([factor * sigma[layout.PITCH], limit]))} deg{limit_text}',
             'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in changed_angles else
+            OTHER_WARNINGS if sigma[layout.PITCH] <= limit else
             'Drive longer, with stops and starts. Accurate heights, or z of poses, also help.'))
     return reasons
