@@ -50,6 +50,9 @@ WHEELBASE = 5.0         # m, physical: 1 sigma of x_i of a steered wheel, of a l
 # judgement: prior sigmas of the logarithms of the levels: mean of the walks about the initial
 # value, each walk about their mean, and reading errors about those of rounding
 WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
+# of those logarithms, definition: wheels of a forecast have no noise, and their levels would
+# decrease until the equations are singular
+LEAST_LOG_LEVEL = -20.0
 # judgement: iterations of the search for outliers, until variances change by less than a tenth;
 # each removes nine tenths of their effect on a level
 TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
@@ -237,7 +240,7 @@ def fit_line(data: Increments) -> Line:
         minimum = minimize(_minus_log_likelihood, log_levels, args=(data, factor),
                            method='Nelder-Mead', options={
                                'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
-        log_levels = minimum.x
+        log_levels = np.maximum(minimum.x, LEAST_LOG_LEVEL)
         x, covariance, _, banded, root = _solve(log_levels, data, factor)
         z = _leave_one_out(banded, root, data.y - data.X @ x)
         before, factor = factor, np.maximum(factor * (z / TAIL_SIGMAS)**2, 1.0)
@@ -250,8 +253,9 @@ def fit_line(data: Increments) -> Line:
 def _solve(log_levels: Floats, data: Increments,
            factor: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
     """Return x, its covariance, -2 ln likelihood, and the banded covariance of y and its root."""
-    reading = data.reading * np.exp(log_levels[-1])
-    walk = (data.walk * np.exp(log_levels[:-1]))[data.kind] * data.share * factor
+    levels = np.exp(np.maximum(log_levels, LEAST_LOG_LEVEL))
+    reading = data.reading * levels[-1]
+    walk = (data.walk * levels[:-1])[data.kind] * data.share * factor
     banded = np.empty((2, len(data.y)))
     banded[0], banded[1] = -reading, walk + 2 * reading
     root = cholesky_banded(banded, check_finite=False)
