@@ -81,20 +81,23 @@ class Axle:
         bank: Floats = roll - share @ (roll - by_acceleration * acceleration)
         return bank
 
-    def accelerations(self) -> Floats:
+    def accelerations(self, mean_rate: Floats) -> Floats:
         """
         Return the signals of BODY_LEAN in each interval: (K, 4).
+
+        mean_rate : (K, 3) rad/s in b, mean turn rates.
 
         Acceleration forward and left, including the components of gravity along a slope and a
         bank, m/s^2, and their rates of change, m/s^3.
         """
-        T = np.diff(self.state.t)[:, None]
-        # mean axes: with those at its start, centripetal acceleration looks like braking
-        C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
-        force = rotate((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
-        force[:, 0] += G * self._slope()
-        force[:, 1] += G * self._bank(C_vn[:, 1, 2], force[:, 1])
-        jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
+        T, speed = np.diff(self.state.t), self._forward_speed(self.v_n)
+        # to the left by speed and turn rate: a difference of velocities of the axle contains the
+        # noise of two turn rates times its distance from the IMU, and then looks like less
+        # sideslip (docs/decisions/0009)
+        left = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
+        left += G * self._bank(self.state.C_nb[:, 2] @ self.state.C_bv[:, 1], left)
+        force = np.stack([np.diff(speed) / T + G * self._slope(), left], -1)
+        jerk = np.gradient(force, axis=0) / T[:, None] if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)
 
     def acceleration(self) -> Floats:

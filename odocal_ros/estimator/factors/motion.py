@@ -138,7 +138,7 @@ class Motion:
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
         state, T, c = self.state, self.T, self.state.constants
-        self.lean_accelerations = self.axle.accelerations()
+        self.lean_accelerations = self.axle.accelerations(self.sums.mean_rate)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
         self.tyre_signals = tyre_signals_at(
