@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated legs as the smoother sees them, their results, their truth at its keyframes."""
+"""Simulated legs in the format of the smoother, their results, their true keyframe states."""
 
 from dataclasses import replace
 
@@ -39,9 +39,9 @@ VELOCITY_SIGMA = 0.05      # m/s
 
 @cached
 def made(**options):
-    """Return a drive, its settings and its leg for the smoother."""
+    """Return a drive, its settings and its leg in the format of the smoother."""
     drive = simulate(SimOptions(**({'scenario': 'town', 'imu_rate': 50.0} | options)))
-    # of an accelerometer without scale error, as it is simulated unless asked for
+    # the simulated accelerometer has no scale error unless a test sets one
     config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0,
                       imu__misalignment_sigma=0.0, imu__gyro_by_force_sigma=0.0)
     return drive, config, leg_of(drive.leg(), config)
@@ -60,7 +60,7 @@ def reason_texts(result):
 
 
 def leg_of(leg, config):
-    """Return the smoother's view of a leg."""
+    """Return a leg in the format of the smoother."""
     inputs, _ = screen(leg, config)
     located = locate_fixes(inputs, config)
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough,
@@ -69,7 +69,7 @@ def leg_of(leg, config):
 
 
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
-    """Return the drive's leg with a GNSS velocity at 5 Hz; errors: (n, 3) draws to m/s."""
+    """Return the leg with a GNSS velocity at 5 Hz; errors converts (n, 3) draws to m/s."""
     o = drive.options
     ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.PHASE['fix'])
     state = drive.motion.at(t)
@@ -118,14 +118,14 @@ def _biases(drive, since):
 
 
 def at_truth(t_stop=None, **options):
-    """Return a drive without noise, and problem and state of its leg."""
+    """Return a drive without noise, and the problem and true state of its leg."""
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
     leg = replace(leg, t_stop=t_stop or leg.t_stop)
     return drive, make_problem(leg, config), truth(drive, config, leg)
 
 
 def along_axis(problem, state, axis, constants):
-    """Return the odometer's residuals along an axis of the vehicle and how constants move them."""
+    """Return the odometer residuals along a vehicle axis and their derivatives by constants."""
     part = Equations(problem, state).factors['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     return ((C_vn @ part.raw[:, D, None])[:, axis, 0],

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The start and the iteration of a fit: parts of long legs, steps that turn back or are cut."""
+"""Start and iterations of a fit: parts of long legs, damped and shortened steps."""
 
 from dataclasses import replace
 
@@ -28,14 +28,14 @@ from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-# of a consumer gyro that warms up by 10 K: 0.35 deg/s in all, half of it in the first 5 min
+# a consumer gyro that warms up by 10 K: 0.35 deg/s in total, half of it in the first 5 min
 WARMS = Real(gyro_slope=(4e-4, -6e-4, 5e-4), warm_rise=10.0, warm_time=400.0)
 DRIVE = {'duration': 1860.0, 'imu_rate': 20.0, 'odometer_rate': 10.0, 'imu_grade': 'consumer',
          'real': WARMS}
 
 
 @pytest.mark.core
-def test_noise_of_rtk_at_one_hz_is_not_taken_for_correlated_errors():
+def test_rtk_noise_at_1_hz_is_not_treated_as_time_correlated():
     made, _ = draw_vehicle(109_000_002, 'motorway', 'industrial', ('squat', 'sideslip'),
                            duration=300.0, fix_noise='rtk', fix_sigma=0.02)
     assert made.fix_rate == 1.0
@@ -43,17 +43,17 @@ def test_noise_of_rtk_at_one_hz_is_not_taken_for_correlated_errors():
     config = configured(drive)
     result = combine([calibrate(drive.leg(), config)], config)
     scale = result.estimates['scale_factor']
-    # both ends of the drive are known by half a minute of white errors, beside the limit of 6 ppm
+    # half a minute of white errors determines each end of the drive; plus the limit of 6 ppm
     ends = made.fix_sigma * np.sqrt(2 / 30) / drive.truth.distance
     assert scale.sigma / scale.value < 2 * np.hypot(ends, 6e-6)
     assert Code.FIXES_NOISIER_THAN_SAID not in {reason.code for reason in result.reasons}
 
 
 @pytest.mark.core
-def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
-    """It takes back what noise in the signals made of the steps before, however much."""
+def test_first_iteration_with_fitted_signals_is_not_shortened(monkeypatch):
+    """It reverses the effect of signal noise on earlier iterations, of any size."""
     drive = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=20.0, seed=1))
-    passes: list[tuple[bool, bool]] = []      # by fitted signals; compared with a step before
+    passes: list[tuple[bool, bool]] = []      # fitted signals; compared with the one before
 
     class Watched(fit.Equations):
         def __init__(self, *args):
@@ -73,12 +73,12 @@ def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
 
 
 def step_of(border, reduced):
-    """Return a solution, with what ``damp_step`` reads of it."""
+    """Return a solution with the values that ``damp_step`` reads."""
     return Solved(border[None, :], border, None, 0.0, reduced, None, None, None, None)
 
 
 def walked(slope, passes):
-    """Return how far off an iteration is whose steps are ``slope`` times what is left."""
+    """Return the final error of an iteration whose steps are ``slope`` times the error."""
     off, taken = np.array([1.0, -0.5]), np.zeros(2)
     for _ in range(passes):
         found = damp_step(step_of(-slope * off, np.diag([4.0, 1.0])), taken)
@@ -88,8 +88,8 @@ def walked(slope, passes):
     return float(np.abs(off).max())
 
 
-def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
-    # a step twice too long turns back on itself whole: half of it leads to the zero
+def test_oscillating_steps_are_damped_and_other_steps_are_not():
+    # a step of twice the error oscillates; half of it reaches the solution
     assert walked(2.0, 1) == pytest.approx(1.0)
     assert walked(2.0, 2) < 1e-12
     assert walked(0.4, 3) == pytest.approx(0.6**3)
@@ -98,7 +98,7 @@ def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
     assert np.array_equal(damp_step(step_of(back, np.eye(2)), np.zeros(2)).step_constants, back)
 
 
-def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
+def test_best_iteration_is_stated_with_a_wider_sigma_at_the_iteration_limit():
     drive, config, leg = made(duration=200.0, imu_grade='consumer', fix_noise='white')
     whole = smooth(leg, config)
     few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
@@ -113,8 +113,8 @@ def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
 
 @pytest.mark.parametrize(('gap', 'parts'), [
     (None, 3), ((-20.0, 605.0), 2), ((595.0, 1225.0), 2), ((1215.0, 1850.0), 2)])
-def test_a_gyro_that_warms_up_is_level_in_each_part_with_fixes(gap, parts):
-    """A part without fixes is joined with its neighbour."""
+def test_start_with_a_warming_gyro_is_level_in_each_part_with_fixes(gap, parts):
+    """A part without fixes is joined with an adjacent part."""
     drive, config, leg = made(**DRIVE)
     if gap:
         seen = (leg.t_fix < gap[0]) | (leg.t_fix > gap[1])
@@ -126,13 +126,13 @@ def test_a_gyro_that_warms_up_is_level_in_each_part_with_fixes(gap, parts):
     assert (start.t == true.t).all()
     assert len(np.unique(start.gyro_bias, axis=0)) == parts
     assert np.log(start.scale / drive.truth.scale) == pytest.approx(0.0, abs=0.05 if gap else 0.02)
-    # the bias changes by 2 mrad/s in the first part; a level that swings by it over minutes
+    # the bias changes by 2 mrad/s in the first part; the level oscillates by it over minutes
     angle = np.linalg.norm(rotvec(transpose(true.C_nb) @ start.C_nb), axis=1)
     assert gap or np.percentile(angle, 90) < 0.3
 
 
-def test_a_heading_that_accelerations_do_not_give_is_tried_at_the_nominal_yaw():
-    """Half a lap at one speed with a reversed IMU: from a yaw of 0 the fit diverges."""
+def test_fit_starts_at_the_nominal_yaw_if_accelerations_do_not_give_a_heading():
+    """Half a lap at constant speed with a reversed IMU: from a yaw of 0 the fit diverges."""
     yaw = 3.0
     drive = simulate(SimOptions(scenario='oval', duration=300.0, imu_rate=50.0, yaw=yaw,
                                 imu_grade='consumer', seed=3))
@@ -149,7 +149,7 @@ def test_a_heading_that_accelerations_do_not_give_is_tried_at_the_nominal_yaw():
     assert abs(found.value - yaw) < 3 * found.sigma < 0.05
 
 
-def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
+def test_start_sums_follow_a_gyro_bias_change_to_first_order():
     _, config, leg = made(duration=120.0, imu_rate=50.0, odometer_rate=20.0)
     imu = make_problem(leg, config).imu
     K = len(imu.key) - 1
@@ -164,7 +164,7 @@ def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
     for delta in (change, change / 2):
         apart.append([np.abs(x - y).max() for x, y in zip(
             of_bias(none, delta), of_bias(delta, none), strict=True)])
-    # the rest is of second order, of intervals of a second
+    # the remainder is of second order, in intervals of 1 s
     assert (np.divide(*apart) > 3.5).all()
     force_and_speed = np.array([1.0, 10.0, 20.0 / leg.rough_scale])
     assert (apart[0][:3] < force_and_speed * (change @ change)).all()

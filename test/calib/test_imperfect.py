@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The IMU's own errors: estimated from the drive, and included in the sigma."""
+"""Systematic IMU errors are estimated from the drive and included in the sigma."""
 
 from dataclasses import replace
 import re
@@ -30,16 +30,16 @@ TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway'
 
 
 def of_grade(config, *names):
-    """Return settings with IMU errors as its grade has them."""
+    """Return settings with the IMU errors of its grade."""
     return with_settings(config, {f'imu.{name}_sigma': np.nan for name in names})
 
 
 @pytest.mark.parametrize(('grade', 'noise', 'seconds', 'error', 'size'), [
-    # as the grade allows, and ten times what such fixes determine
+    # errors of the grade, ten times as large as such fixes determine
     ('tactical', 'rtk', 250.0, 5e-4, 5e-4),
-    # a quarter of the grade's, which slow fixes do not determine: by a size that axes share
+    # a quarter of the grade's error, not determined by correlated fixes: common size of the axes
     ('consumer', 'correlated', 200.0, 0.01 / 4, 0.01)])
-def test_a_scale_error_of_the_accelerometer_is_within_its_sigma(grade, noise, seconds, error,
+def test_accelerometer_scale_error_is_within_its_sigma(grade, noise, seconds, error,
                                                                 size):
     drive, config, leg = made(scenario='town', duration=seconds, imu_grade=grade,
                               fix_noise=noise, accel_scale_error=error, seed=4)
@@ -49,14 +49,14 @@ def test_a_scale_error_of_the_accelerometer_is_within_its_sigma(grade, noise, se
         found = result.details[name]
         assert abs(found['value'] - error) < 3.0 * found['sigma']
         assert found['sigma'] < size / 2
-        # said beside the grade's, whatever size was found
+        # reported relative to the grade, for any size
         assert result.details['posterior_to_prior'][name] == pytest.approx(
             found['sigma'] / size, rel=0.01)
 
 
 @pytest.mark.parametrize('hertz', [0.3, 0.5, 0.7, 1.0])
-def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
-    """By 3 deg, as an agricultural robot: the path along its axis is 700 ppm shorter."""
+def test_body_sway_on_a_flat_path_does_not_change_the_scale(hertz):
+    """Sway of 3 deg, as of an agricultural robot: the path along its axis is 700 ppm shorter."""
     drive = simulate(SimOptions(scenario='out_and_back', duration=300.0, imu_rate=100.0, seed=4,
                                 imu_grade='industrial', fix_noise='rtk'))
     imu = drive.imu
@@ -64,7 +64,7 @@ def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
     sent = drive.leg()
     grows = np.convolve(drive.motion.speed(t) > 1.0, np.ones(200) / 200, 'same')
     angle = np.radians(3.0) * np.sin(2 * np.pi * hertz * t) * grows
-    C_bi = matrix_from_rpy(np.stack([0 * t, angle, 0 * t], -1))     # about the IMU's y
+    C_bi = matrix_from_rpy(np.stack([0 * t, angle, 0 * t], -1))     # about the y axis of the IMU
     w_i = rotate(transpose(C_bi), imu.w_i)
     w_i[:, 1] += np.gradient(angle, t)
     swaying = replace(sent, imu=replace(imu, w_i=w_i, f_i=rotate(transpose(C_bi), imu.f_i)))
@@ -75,8 +75,8 @@ def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
 
 
 @pytest.mark.parametrize('hertz', [0.4, 0.6])
-def test_a_body_that_bounces_on_a_flat_path_does_not_change_the_scale(hertz):
-    """By 20 cm at 10 m/s, as 2 cm at a walk: the path of the IMU is 400 ppm longer."""
+def test_body_bounce_on_a_flat_path_does_not_change_the_scale(hertz):
+    """Bounce of 20 cm at 10 m/s, as 2 cm at a walk: the IMU path is 400 ppm longer."""
     drive = simulate(SimOptions(scenario='out_and_back', duration=300.0, imu_rate=100.0, seed=4,
                                 imu_grade='industrial', fix_noise='rtk'))
     imu, sent = drive.imu, drive.leg()
@@ -94,20 +94,20 @@ def test_a_body_that_bounces_on_a_flat_path_does_not_change_the_scale(hertz):
 
 
 @pytest.mark.parametrize('noise', ['white', 'correlated'])
-def test_the_sigma_of_the_scale_holds_it(noise):
+def test_sigma_of_the_scale_covers_an_accelerometer_scale_error(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise, accel_scale_error=GRADE, seed=4)
     assert off(smooth(leg, of_grade(config, 'accel_scale')), drive) < 3.0       # 1 in 370
-    # of an IMU said to have none, the error is many sigmas: what this is for
+    # if the IMU is configured without scale error, the error exceeds the sigma by far
     assert off(smooth(leg, config), drive) > 4.0
 
 
 SKEW = np.deg2rad(0.5)
-# gyro: z into x; accelerometer: x into y and into z
+# gyro: z into x; accelerometer: x into y and x into z
 GYRO = (0.0, 0.0, SKEW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 ACCEL = (0.0, 0.0, 0.0, SKEW, 0.0, 0.0, SKEW, 0.0, 0.0)
 
 
-def test_angles_are_those_of_the_axes_that_the_imu_measures_in():
+def test_mounting_angles_refer_to_the_measuring_axes_of_the_imu():
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.01,
                               real=Real(gyro_matrix=GYRO, accel_matrix=ACCEL))
@@ -117,57 +117,57 @@ def test_angles_are_those_of_the_axes_that_the_imu_measures_in():
                                 ('pitch', truth.pitch, truth.pitch_housing)):
         e = found.estimates[f'{name}_mounting_angle']
         assert abs(e.value - true) < 3.0 * e.sigma
-        assert abs(e.value - housing) > 5.0 * e.sigma        # 20 to 50 mdeg for 500
+        assert abs(e.value - housing) > 5.0 * e.sigma        # sigma 20 to 50 mdeg, error 500
         beside = found.details['beside'][f'{name}_mounting_angle_housing_sigma']['value']
         assert abs(e.value - housing) < 3.0 * beside
-    # a fit that knows of no such axes is wrong: what this is for
+    # a fit without misaligned axes is wrong
     assert off(smooth(leg, config), drive, *ANGLES) > 5.0
 
 
 @pytest.mark.parametrize('skew', [SKEW, 0.0])
-def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
-    # z feels a push ahead by the nose's rise, y what it has of z; whether axes are off at all is
-    # told by the other two
+def test_yaw_sigma_includes_the_misalignment_of_y_and_z_with_a_pitched_imu(skew):
+    # with a pitched IMU, z measures a part of the forward acceleration and y a part of z; the
+    # other two axes determine whether axes are misaligned
     drive, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.12,
                               real=Real(accel_matrix=(0.0, 0.0, 0.0, skew, 0.0, skew,
                                                       skew, 0.0, 0.0)))
     found = smooth(leg, of_grade(config, 'misalignment'))
     e = found.estimates['yaw_mounting_angle']
-    assert abs(e.value - drive.truth.yaw) < 1.96 * e.sigma     # 61 of 52 mdeg; 6 of 31 without
-    # as large as the others are found; without them two fifths of what is usual, sqrt(2) times an
-    # axis, and that is still in the yaw
+    assert abs(e.value - drive.truth.yaw) < 1.96 * e.sigma     # 61 of 52 mdeg, no skew: 6 of 31
+    # with skew the size is that of the other axes; without skew two fifths of the usual sigma,
+    # sqrt(2) times that of an axis; the yaw sigma includes it
     held = found.details['accelerometer_axis_yz']['sigma']
     usual = np.sqrt(2) * GRADES['consumer'].misalignment
-    # seeds 4 to 7 have 0.65 to 0.69, and 0.38 to 0.43 without (sizes are means): the limits are
-    # their means and three times their scatters
+    # seeds 4 to 7 have 0.65 to 0.69, and 0.38 to 0.43 without skew (sizes are means): the limits
+    # are their means plus three times their scatter
     assert 0.15 * usual < held < (0.72 if skew else 0.46) * usual
     assert e.sigma > 0.9 * 0.12 * held
-    if skew:    # a fit that knows of no such axes is wrong
+    if skew:    # a fit without misaligned axes is wrong
         assert off(smooth(leg, config), drive, 'yaw_mounting_angle') > 3.0
 
 
-def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
-    # with derivatives by the force as measured, its noise: 0.15 +- 0.22 deg, 1.7 is true
+def test_straight_drive_does_not_pull_the_yaw_to_zero():
+    # derivatives by the measured force with its noise give 0.15 +- 0.22 deg; the truth is 1.7
     drive, config, leg = made(scenario='straight', duration=400.0, imu_grade='consumer', seed=4,
                               yaw=np.deg2rad(1.7))
     found = smooth(leg, of_grade(config, 'accel_scale', 'misalignment'))
     assert off(found, drive, 'yaw_mounting_angle') < 3.0
-    assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # nothing tells it
+    assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # not observable
 
 
 @pytest.mark.parametrize(('changes', 'accel'), [
     ({'imu.grade': 'consumer'}, TURN_ON['consumer'][1]),
     ({'imu.grade': 'industrial'}, TURN_ON['consumer'][1]), ({'imu.accel_bias': 0.04}, 0.04)])
-def test_an_imu_has_the_turn_on_bias_of_its_own_grade_as_sold(changes, accel):
-    """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
+def test_imu_has_the_turn_on_bias_of_its_grade(changes, accel):
+    """Otherwise a bias looks like a misaligned axis: docs/decisions/0016."""
     _, config, leg = made(imu_grade='consumer', duration=135.0)
     priors = make_problem(leg, with_settings(config, changes)).priors
     assert priors.accel_bias_sigma[:2] == pytest.approx(accel)
     assert priors.gyro_bias_sigma == pytest.approx(TURN_ON['consumer'][0])
 
 
-def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_one():
+def test_imu_gets_the_grade_nearest_to_its_noise_but_not_a_better_one():
     imu = Config().imu
     grade = GRADES['tactical']
     tactical = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2}
@@ -184,12 +184,12 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
      r'Measure .* \(z\) again'),
     ((0.0, 0.0, 0.0), -0.73, 0.1, 'z: not set, estimated -0.73 ± 0.05 m. The other values',
      r'Measure .* \(z\) and set it'),
-    # the result and the report have no value for it
+    # result and report have no value for it
     ((0.0, 0.0, 0.0), -0.73, 0.5, 'z: not set, estimated -0.73 ± 0.05 m (too uncertain for a '
      'result). The other', r'Measure .* \(z\) and set it'),
     ((0.0, 0.0, 0.0), 9.39, 0.1, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
      'Ignore the estimate')])
-def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, text, do):
+def test_configured_lever_arm_only_is_to_be_measured_again(set_to, found, ratio, text, do):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[CONSTANTS.index('antenna_lever_arm_z')] = found
     reason, = remarks._lever_arm_reasons(value, sigma, np.full(len(CONSTANTS), ratio),
@@ -203,7 +203,7 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, 
 
 @pytest.mark.parametrize(('imu_arm', 'part'), [
     ((0.0, 0.0, 0.0), 'imu.lever_arm is not set and'), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm')])
-def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
+def test_imu_lever_arm_is_named_as_the_other_cause(imu_arm, part):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[[CONSTANTS.index(f'odometer_lever_arm_{axis}') for axis in 'xy']] = 1.0
     reason, = remarks._lever_arm_reasons(value, sigma, np.zeros(len(CONSTANTS)), with_settings(
@@ -215,7 +215,7 @@ def test_the_lever_arm_of_the_imu_is_the_other_cause(imu_arm, part):
     assert 'On z' not in reason.remedy
 
 
-def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_a_value_is():
+def test_wrong_lever_arm_is_not_unobservable_but_a_delay_without_a_value_is():
     usual = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'consumer', 'seed': 4}
     _, config, leg = made(**usual, antenna_lever_arm=(1.5, 0.0, 1.0))
     config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
@@ -223,7 +223,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
     texts = reason_texts(found)
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in texts[Code.LEVER_ARM_OFF]
-    # the sigma of this axis is no smaller than that of its setting, but far from it
+    # the sigma of this axis is not below that of its setting, but the value is far from it
     arm = found.estimates['antenna_lever_arm_x']
     assert arm.sigma > 0.1 / 2
     assert abs(arm.value - 1.5) < 4 * arm.sigma
@@ -236,7 +236,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     assert 'odometer delay' in reason_texts(found)[Code.PARAMETER_NOT_DETERMINED]
 
 
-def test_what_a_vehicle_shows_beside_its_values_is_said():
+def test_vehicle_effects_beside_the_values_are_reported():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,
                               fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
@@ -245,7 +245,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     found = smooth(leg, moved)
     texts = reason_texts(found)
     tau = float(re.search(r'about (.*) s;', texts[Code.FIXES_SMOOTHED])[1])
-    assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
+    assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # printed to 0.01 s
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in texts[Code.LEVER_ARM_OFF]
     assert ' 2.0 times as large' in texts[Code.FIXES_NOISIER_THAN_SAID]
     assert 'from low to high speed' in texts[Code.SCALE_VARIES]
@@ -254,13 +254,13 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']
     assert off(found, drive) < 3.0
     assert 'warm tyres' in next(r for r in found.reasons if r.code is Code.SCALE_VARIES).remedy
-    # and of a vehicle that has none of it nothing
+    # a vehicle without these effects has no such reasons
     clean = reason_texts(smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config))
     assert not {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
                 Code.SCALE_VARIES, Code.IMU_AXES_SKEW} & set(clean)
 
 
-def test_a_scale_that_falls_with_speed_is_not_blamed_on_tyres():
+def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():
     _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial', seed=4,
                           fix_noise='rtk', real=Real(speed_law=-0.006))
     falls = next(r for r in smooth(leg, config).reasons if r.code is Code.SCALE_VARIES)
@@ -269,8 +269,8 @@ def test_a_scale_that_falls_with_speed_is_not_blamed_on_tyres():
 
 
 @pytest.mark.parametrize('driven', [True, False])
-def test_tyres_that_slip_one_way_only_leave_the_mean_right(driven):
-    """A wheel that does not drive slips under the brake only: half a slope each way is 90 ppm."""
+def test_tyre_slip_in_one_direction_keeps_the_mean_scale_correct(driven):
+    """A wheel without drive slips only in braking: half a slope per direction is 90 ppm."""
     drive, config, leg = made(**TOWN | {
         'fix_noise': 'rtk', 'fix_sigma': 0.01, 'real': Real(tyre_slip=0.035, driven=driven)})
     method = smooth(leg, config)
@@ -279,8 +279,8 @@ def test_tyres_that_slip_one_way_only_leave_the_mean_right(driven):
     assert Code.WHEEL_SLIP not in {r.code for r in method.reasons}
 
 
-def test_a_slow_drive_settles_on_its_metres():
-    """A yard with all that real sensors have: with noise in derivatives its metres shrink."""
+def test_slow_drive_converges_to_the_correct_scale():
+    """A yard with all errors of real sensors: with noise in derivatives the scale shrinks."""
     options, _ = draw_vehicle(70_000_024, 'yard', 'consumer', None)
     drive = simulate(options)
     config = configured(drive)

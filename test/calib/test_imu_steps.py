@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""IMU steps, the sums over them, and the filter of an odometer, against closed forms."""
+"""IMU steps, their sums and the odometer filter, compared with closed forms."""
 
 from types import SimpleNamespace
 
@@ -36,13 +36,13 @@ def samples(t, w_b, f_b):
 
 
 def turning(t):
-    """Return the samples of a constant turn under a constant force in b, with biases."""
+    """Return the samples of a constant turn with a constant force in b, with biases."""
     one = np.ones((len(t), 1))
     return samples(t, one * (RATE + BIAS), one * (FORCE + FORCE_BIAS))
 
 
 def integrals(T, terms=12):
-    """Return the attitude after T, its integral and the integral of that, by their series."""
+    """Return the attitude after T, its integral and its double integral, by their series."""
     R, A, AA, power = np.eye(3), np.eye(3) * T, np.eye(3) * T**2 / 2, np.eye(3)
     factorial = 1.0
     for n in range(1, terms):
@@ -62,9 +62,9 @@ def summed(leg, t_points=(), constants=None):
 
 
 @pytest.mark.parametrize('rate', [10.0, 47.0, 200.0])
-def test_a_constant_turn_has_its_closed_form(rate):
+def test_constant_turn_equals_its_closed_form(rate):
     imu, sums, points = summed(turning(np.arange(0.0, 5.001, 1 / rate)), [1.23, 3.91])
-    # G leaves out the third power of a step's turn: 0.06^3 / 24 of 7 m and 10 m/s
+    # G lacks the third power of a step's turn: 0.06^3 / 24 of 7 m and 10 m/s
     loose = (0.61 * max(STEP, 1 / rate))**3 / 24 * 10
     for k, T in enumerate(sums.T):
         R, A, AA = integrals(T)
@@ -78,20 +78,20 @@ def test_a_constant_turn_has_its_closed_form(rate):
         assert imu.t[imu.key[k]] + tau == pytest.approx((1.23, 3.91)[int(k > 1)])
         want = integrals(tau)
         np.testing.assert_allclose(R, want[0], atol=BENT)
-        # the force is a line within a step: 0.6^2 of it bends by T^2 / 12
+        # the force is linear within a step; its curvature is 0.6^2 T^2 / 12 of it
         bent = loose + 4 * SECOND * max(STEP, 1 / rate)**2
         np.testing.assert_allclose(dv, want[1] @ FORCE, atol=bent)
         np.testing.assert_allclose(dp, want[2] @ FORCE, atol=bent)
 
 
 def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
-    """Else a scale error of 1 explains a bias that drifts, and its random walk becomes small."""
+    """Otherwise a scale error of 1 explains bias drift, and the random walk becomes small."""
     t, constants = np.arange(0.0, 5.001, 0.01), np.zeros(M)
-    by_rate = np.array(GYRO_SIGNAL) < 3        # not by the force, which has its bias
+    by_rate = np.array(GYRO_SIGNAL) < 3        # not multiplied by the force, which has a bias
     constants[GYRO], constants[ACCEL] = 0.2 * by_rate, 0.1
     one = np.ones((len(t), 1))
     _, sums, points = summed(samples(t, one * BIAS, one * FORCE_BIAS), [1.23, 3.91], constants)
-    # of second order in the turn by the bias in a step
+    # second order in the turn by the bias within a step
     bent = (np.linalg.norm(BIAS) * STEP)**2 * np.linalg.norm(FORCE_BIAS)
     for found in (sums, points):
         np.testing.assert_allclose(found.R - np.eye(3), 0.0, atol=1e-12)
@@ -99,27 +99,27 @@ def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
             np.testing.assert_allclose(zero, 0.0, atol=1e-12)
         for zero in (found.dv, found.dp):
             np.testing.assert_allclose(zero, 0.0, atol=bent)
-    # an error of the bias is one of the signal, too
+    # an error of the bias is also an error of the signal
     by_bias = np.eye(3, 6)
     by_bias[GYRO_AXIS, GYRO_SIGNAL] -= 0.2 * by_rate
     np.testing.assert_allclose(sums.R_by_gyro[0, :, :3], by_bias[:, :3], atol=1e-9)
 
 
-# rad: of second order in the turn by the bias in each of ten steps, 0.0027 rad, beside 0.062 rad
+# rad: second order in the turn by the bias, ten steps of 0.0027 rad, beside 0.062 rad
 BENT = 10 * 0.0027**2 * 0.062 / 12
-# m/s: of the trapezoid rule between samples, times their interval squared: w^2 f / 12
+# m/s: trapezoid rule between samples, times the sample interval squared: w^2 f / 12
 SECOND = 0.62**2 * 10.0 / 12
 
 
-def test_the_angles_of_a_constant_turn_scatter_by_their_closed_form():
+def test_scatter_of_the_angles_of_a_constant_turn_equals_its_closed_form():
     imu = ImuSteps.from_leg(turning(np.arange(0.0, 5.001, 0.01)), 1.0)
     turn = RATE + BIAS
-    # of an angle that grows evenly over 1 s, of means of steps: 1 / 12 less STEP^2 / 12
+    # an angle that increases linearly over 1 s, as means of steps: 1 / 12 less STEP^2 / 12
     want = np.outer(turn, turn) * (1 - STEP**2) / 12
     np.testing.assert_allclose(imu.angle_covariances(), np.tile(want, (5, 1, 1)), atol=1e-12)
 
 
-def test_coning_at_the_sample_rate_is_in_the_steps():
+def test_steps_include_coning_at_the_sample_rate():
     rate, cone, spin = 200.0, 0.02, 2 * np.pi * 8.0
     t = np.arange(0.0, 4.001, 1 / rate)
 
@@ -133,12 +133,12 @@ def test_coning_at_the_sample_rate_is_in_the_steps():
     for turn in imu.turn:
         R = R @ exp_so3(turn)
     want = (attitude(t[:1]).inv() * attitude(t[-1:])).as_matrix()[0]
-    # the mean rate alone, 0.01 rad/s about z, would be 0.04 rad off
+    # the mean rate alone, 0.01 rad/s about z, gives an error of 0.04 rad
     np.testing.assert_allclose(R, want, atol=2e-4)
     assert abs(imu.signals[:, 2].sum()) == pytest.approx(4 * spin * cone**2 / 2, rel=0.02)
 
 
-def test_steps_are_a_tenth_of_a_second_and_end_at_keyframes_but_in_gaps_and_of_rare_samples():
+def test_steps_last_a_tenth_of_a_second_and_end_at_keyframes_except_in_gaps():
     t = np.arange(0.0, 4.001, 0.01)
     imu = ImuSteps.from_leg(turning(t), 1.0)
     np.testing.assert_allclose(np.diff(imu.t), STEP, atol=1e-9)
@@ -177,7 +177,7 @@ ROUNDING = SWING * (ANGLE**2 * (BEAT * STENCIL_REACH)**2 * (1 / 24 + ANGLE / 48)
 
 
 def travel(t, answer=1.0, delay=0.0):
-    """Return travel at t behind a filter of that answer to BEAT, complex, and mean delay, s."""
+    """Return travel at t behind a filter with complex gain answer at BEAT and mean delay, s."""
     return CRUISE * (t - delay) + SWING * np.imag(answer * np.exp(1j * BEAT * t))
 
 
@@ -187,14 +187,14 @@ def rolled(readings, delay, square):
     return as_rolled(Travel(FINE, readings, 0.0), constants)(AT)
 
 
-def test_a_first_order_filter_is_corrected():
+def test_first_order_filter_is_corrected():
     readings = travel(FINE, 1 / (1 + 1j * ANGLE), T)
     np.testing.assert_allclose(rolled(readings, T, T**2), travel(AT), atol=ROUNDING)
     assert 0.1 * np.abs(rolled(readings, T, 0.0) - travel(AT)).max() > ROUNDING
 
 
-def test_a_mean_is_corrected_except_for_its_third_moment():
-    """The mean over W has a variance of W^2 / 12 and no third moment, the filter one of 2 T^3."""
+def test_moving_mean_is_corrected_except_for_its_third_moment():
+    """A mean over W has variance W^2 / 12 and no third moment; the filter has 2 T^3."""
     W = np.sqrt(12) * T
     answer = np.exp(-0.5j * BEAT * W) * np.sinc(BEAT * W / 2 / np.pi)
     found = rolled(travel(FINE, answer, W / 2), W / 2, T**2)
@@ -202,20 +202,20 @@ def test_a_mean_is_corrected_except_for_its_third_moment():
 
 
 @pytest.mark.parametrize('square', [T**2, 0.0, -T**2])
-def test_the_derivative_by_the_square_is_half_the_acceleration(square):
-    """And half of T times its change, which the fit leaves out."""
+def test_derivative_by_the_squared_lag_is_half_the_acceleration(square):
+    """It includes half of T times the change of acceleration, which the fit neglects."""
     h = 1e-4
     found = (rolled(travel(FINE), T, square + h) - rolled(travel(FINE), T, square - h)) / (2 * h)
     lag, angle = np.sqrt(max(square, 0.0)), BEAT * (AT + T)
     expected = SWING * BEAT**2 * (np.sin(angle) - BEAT * lag * np.cos(angle)) / 2
-    # differences over STENCIL_REACH; about zero the third moment is that of T^2 = h
+    # differences over STENCIL_REACH; near zero the third moment is that of T^2 = h
     loose = SWING * BEAT**4 * STENCIL_REACH**2 * (1 / 24 + BEAT * lag / 32) \
         + SWING * BEAT**3 * np.sqrt(h)
     np.testing.assert_allclose(found, expected, atol=loose)
 
 
-def test_a_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
-    """And one that begins so of its first: beyond the readings nothing is known."""
+def test_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
+    """A drive that starts in motion has that of its first second; no readings exist beyond."""
     push = 2.0                                  # m/s^2
     constants = np.zeros(M)
     constants[ODO_LAG2] = T**2
@@ -224,11 +224,11 @@ def test_a_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
     np.testing.assert_allclose(as_rolled(readings, constants)(AT), expected, atol=1e-9)
 
 
-def test_a_fast_clock_is_corrected():
-    """The delay is that at 0, where the clocks agree but for it."""
+def test_fast_clock_is_corrected():
+    """The delay is defined at t = 0, where the clocks differ only by it."""
     fast, constants = 1e-3, np.zeros(M)
     constants[ODO_DELAY], constants[ODO_CLOCK] = T, fast
     readings = Travel(FINE * (1 + fast) + T, travel(FINE), 0.0)
-    # readings are straight lines between samples
+    # readings are interpolated linearly between samples
     loose = SWING * BEAT**2 * (FINE[1] - FINE[0])**2 / 8 + 1e-9
     np.testing.assert_allclose(as_rolled(readings, constants)(AT), travel(AT), atol=loose)

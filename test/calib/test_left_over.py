@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the smoother leaves over: against the equations made anew, closed forms, drawn errors."""
+"""Residuals of the smoother: compared with recomputed equations, closed forms, drawn errors."""
 
 from dataclasses import replace
 
@@ -40,8 +40,8 @@ def left_by_odometer(leg, config):
     return fit, *in_halves(stored_residuals(leg, problem, fit)['left_odometer'])
 
 
-def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
-    """The fit has brought its rows there to first order; it ended within 0.03 sigma."""
+def test_residuals_equal_those_of_the_equations_recomputed_at_the_estimate():
+    """The fit linearises its rows to first order; its last step is within 0.03 sigma."""
     _, _, leg, problem, fit = fitted()
     found = stored_residuals(leg, problem, fit)
     again = Equations(problem, fit.state, fit.priors, fit.variance_factors, True)
@@ -54,28 +54,28 @@ def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
             ('odometer', np.einsum('kij,kj->ki', middle, motion.residual[:, D])),
             ('fix', -again.factors[Fixes.name].raw)):
         value, sigma = in_halves(found[f'left_{name}'])
-        if name == 'odometer':      # its rows end before the last second does
+        if name == 'odometer':      # its rows end before the end of the last second
             value, sigma, expected = value[:-1], sigma[:-1], expected[:-1]
-        # the delay may still move by a tenth of its 0.7 ms, and a count at 20 Hz more or less,
-        # 0.43 m/s, at either end is then 0.06 mm; counts before and after may part twice as much.
-        # The mean of two axes is shorter by an eighth of their turn squared
+        # the delay may change by a tenth of its 0.7 ms. One count more or less at 20 Hz, 0.43 m/s,
+        # at either end is then 0.06 mm; the counts before and after may differ by twice as much.
+        # The mean of two axes is shorter by an eighth of the squared turn between them
         counts = 1.2e-4 if name == 'odometer' else 0.0
         near = 0.2 + 0.03 * np.abs(value / sigma).max(axis=1, keepdims=True)
         assert np.all(np.abs(value - expected) < np.maximum(near * sigma, counts)), name
         assert np.abs(expected / sigma).max() > 0.5, 'there is something to compare'
 
 
-def test_sigmas_are_those_of_white_noise_over_an_interval():
+def test_residual_sigmas_are_those_of_white_noise_over_an_interval():
     """White noise of density s gives a mean over T a sigma of s / sqrt(T)."""
     _, _, leg, problem, fit = fitted()
     found = stored_residuals(leg, problem, fit)
     T = np.diff(fit.state.t)
     _, sigma = in_halves(found['left_gyro'])
-    # walks of the bias add less than 1e-3 of it
+    # the random walk of the bias adds less than 1e-3
     np.testing.assert_allclose(sigma, np.sqrt(fit.levels['gyro'] / T)[:, None].repeat(3, 1),
                                rtol=1e-3)
     _, sigma = in_halves(found['left_accelerometer'])
-    # the gyro's noise turns gravity: most of what is level
+    # gyro noise rotates gravity: most of the horizontal sigma
     assert np.all(sigma > 0.999 * np.sqrt(fit.levels['accel'] / T)[:, None])
     np.testing.assert_allclose(sigma[problem.at_rest[1:], 2], np.sqrt(
         fit.levels['accel'] / T)[problem.at_rest[1:]], rtol=0.02)
@@ -85,7 +85,7 @@ def test_sigmas_are_those_of_white_noise_over_an_interval():
     np.testing.assert_allclose(sigma, stated * factor, rtol=1e-3)
 
 
-def test_a_wheel_that_slipped_is_seen_where_it_did():
+def test_wheel_slip_appears_in_the_residuals_at_its_time():
     drive, config, *_ = fitted()
     begin, seconds, metres = 100.0, 1.0, 1.0
     rows = drive.leg()
@@ -96,14 +96,14 @@ def test_a_wheel_that_slipped_is_seen_where_it_did():
     fit, value, sigma = left_by_odometer(leg, config)
     t, along = fit.state.t, value[:, 0]
     slipping = (t[1:] > begin) & (t[:-1] < begin + seconds)
-    # the fit has gone less far than the wheel said; the IMU tells the way of a second to 1 mm,
-    # and a share of 1 - (its variance over the slip's) of it is taken for slip
+    # the fitted path is shorter than the wheel travel; the IMU determines the path length of a
+    # second to 1 mm; the slip is 1 - (IMU variance over slip variance) of the difference
     assert along[slipping].sum() == pytest.approx(-metres, rel=0.05)
-    assert np.abs(along[:-1][~slipping[:-1]]).max() < 0.02      # no rows to the end of the last
+    assert np.abs(along[:-1][~slipping[:-1]]).max() < 0.02      # last interval: rows end earlier
     assert np.abs(along / sigma[:, 0])[:-1].max() < 4, 'its sigma was widened'
 
 
-def test_where_no_odometer_was_there_is_nothing():
+def test_odometer_residuals_are_nan_without_odometer_data():
     drive, config, *_ = fitted()
     rows = drive.leg()
     when = (rows.odometer.stamp_ns - rows.start_ns) * 1e-9
@@ -117,7 +117,7 @@ def test_where_no_odometer_was_there_is_nothing():
     assert np.isfinite(value[fit.state.t[1:] < 148.0]).all()
 
 
-def test_sigmas_of_the_biases_are_honest_all_along():
+def test_sigmas_of_the_biases_hold_over_the_whole_drive():
     apart = []
     for seed in range(1, 9):
         drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
@@ -129,6 +129,6 @@ def test_sigmas_of_the_biases_are_honest_all_along():
         assert sigma.shape == (2, len(fit.state.t), 3)
         assert sigma[0, len(true.t) // 2, 2] < 0.99 * sigma[0, 0, 2], 'least amid the drive'
     z = np.sqrt((np.array([one[:, ::50].copy() for one in apart])**2).mean(axis=(0, 2)))
-    # rms of 8 drives, each axis near one draw: 0.35 to 1.75 in 999 of 1000 by chi2 of 8
+    # rms of 8 drives, each axis about one draw: 0.35 to 1.75 in 999 of 1000 by chi2 of 8
     assert z.min() > 0.35
     assert z.max() < 1.75

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The information on noise levels against differences of costs and of solutions."""
+"""The information on noise levels compared with differences of costs and of solutions."""
 
 from itertools import pairwise
 
@@ -17,22 +17,22 @@ from odocal_ros.estimator.level_steps import prior_information
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.smoother import best_fit
 
-STEP = 0.02                 # of logarithms of levels
-# relative: third derivatives of logarithms are as large as the second: STEP**2 / 6
+STEP = 0.02                 # change of the logarithm of a level
+# relative: third derivatives are as large as second derivatives: STEP**2 / 6
 ROUGH = 1e-3
-# one level of each part at least; a travel error is at its least and cannot be less
+# at least one level of each factor; a travel error is at its lower limit and cannot decrease
 NAMES = ('size_squat', 'gyro', 'along', 'side', 'fix', 'slow', 'size_gyro_axis')
 
 
 @pytest.fixture(scope='module')
 def weighted_equations():
-    """Return (function from changed levels to equations and solution, levels), no row a tail."""
+    """Return (function from changed levels to equations and solution, levels), without tails."""
     _, config, leg = made(imu_grade='industrial', duration=135.0, fix_sigma=0.5)
     problem = make_problem(leg, config)
     fit = best_fit(problem, config)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # weights would change with the levels
-        patch.setattr(signals, 'LIKELY_NOISE', 1e-3)    # and derivatives by small rates
+        patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # otherwise weights change with the levels
+        patch.setattr(signals, 'LIKELY_NOISE', 1e-3)    # and derivatives by small rates, too
         equations = Equations(problem, fit.state, fit.priors, fit.variance_factors, True)
 
         def at(**by):
@@ -44,7 +44,7 @@ def weighted_equations():
         yield at, fit.levels
 
 
-def test_moves_are_the_differences_of_solutions(weighted_equations):
+def test_constants_by_level_equal_differences_of_solutions(weighted_equations):
     at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
@@ -57,7 +57,7 @@ def test_moves_are_the_differences_of_solutions(weighted_equations):
 
 
 def test_average_information_is_the_curvature_of_the_cost(weighted_equations):
-    """Of a variance s V the least cost C has d2C/d(ln s)2 = 4 A + dC/d(ln s), and 4 A across."""
+    """For variance s V the minimum cost has d2C/d(ln s)2 = 4 A + dC/d(ln s), mixed terms 4 A."""
     at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
@@ -82,7 +82,7 @@ def test_average_information_is_the_curvature_of_the_cost(weighted_equations):
             across / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), (name, other)
 
 
-def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_equations):
+def test_known_levels_add_no_error_and_unknown_levels_add_their_prior(weighted_equations):
     at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
@@ -92,11 +92,11 @@ def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighted_equ
     effects = information.effects(own)
     most = sum(information.constants_by_level[:, i]**2 / own[n]
                for i, n in enumerate(information.names))
-    # errors of levels in common may double what each does alone, not more than their number
+    # joint errors of levels may double the separate errors; the factor is at most their number
     assert ((effects**2).sum(axis=1) <= most * len(own) + 1e-30).all()
 
 
-def test_a_border_with_errors_of_levels_has_the_sum_of_both_covariances():
+def test_marginal_information_with_level_errors_has_the_sum_of_both_covariances():
     rng = np.random.default_rng(1)
     A, effects = rng.standard_normal((9, 4)), 0.1 * rng.standard_normal((4, 2))
     D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)

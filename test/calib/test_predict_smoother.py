@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother's predicted sigmas against simulated drives, reference bounds and itself."""
+"""Predicted sigmas of the smoother against simulated drives, reference bounds and the fit."""
 
 from dataclasses import replace
 import math
@@ -30,7 +30,7 @@ from odocal_ros.settings.nominal import GRADES
 
 pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
-ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
+ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # noise levels of a planned drive
 WHITE = {'gnss.correlation_time': 0.0}
 USUAL = prepare.imperfection_sigmas(GRADES['consumer'])
 
@@ -51,28 +51,28 @@ CELLS = [({'scenario': 'town', 'imu_grade': 'industrial'}, 0.0),
 
 
 @pytest.mark.parametrize(('options', 'tau'), CELLS)
-def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(options, tau):
+def test_bound_of_ideal_samples_equals_that_of_a_simulated_leg_at_its_truth(options, tau):
     drive, config, leg = made(**ROAD, **options)
     sigmas = figures(drive, config, tau)
     problem = make_problem(leg, config)
     true = cramer_rao_bound(leg, config, truth(drive, config, leg),
                             planned_noise_levels(problem, sigmas))
     sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
-    # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
-    # elsewhere: 5 % of what rests tell
+    # standstills are found to about a second of twenty or more in a drive, keyframes are at other
+    # times: 5 % of the information from standstills
     predicted = predict_smoother(planned(drive.motion, drive.options), sigmas)
     np.testing.assert_allclose(sigmas_of(predicted) / sigma, 1.0, atol=0.05)
 
 
-def test_the_sigma_predicted_is_the_one_that_the_smoother_states():
+def test_predicted_sigma_equals_the_sigma_of_the_smoother():
     options, tau = CELLS[1]
     drive, config, leg = made(**ROAD, **options)
     config = with_settings(config, {'gnss.correlation_time': tau})
     result = smooth(leg, config)
     stated = sigmas_of(result) / [result.estimates[NAMES[0]].value, 1.0, 1.0]
-    # it finds the noise itself: slip and slide from some 400 intervals (1 / sqrt(800) = 3.5 %),
-    # gyro and accelerometer from 100 s at rest in three axes (4 %): three of their root sum
-    # squared would be 16 %, the rests and the shares that are certain take half of that
+    # the smoother estimates the noise: slip and sideslip from about 400 intervals (1 / sqrt(800) =
+    # 3.5 %), gyro and accelerometer from 100 s at rest in three axes (4 %): three times their root
+    # sum square is 16 %; standstills and the fixed shares halve it
     predicted = predict_smoother(planned(drive.motion, drive.options), figures(drive, config, tau))
     np.testing.assert_allclose(sigmas_of(predicted) / stated, 1.0, atol=0.12)
 
@@ -104,7 +104,7 @@ def paper():
     (paper, 'navigation', 35, 5.7)])
 def test_scale_sigmas_agree_with_the_reference_bounds(monkeypatch, drive, grade, white, pulses):
     # by an independent program (docs/decisions/0005): lever arms and delays known, fixes white, no
-    # slip of the pulses, a perfect vehicle; it knows standstills by the odometer only, so the last
+    # slip of the pulses, an ideal vehicle; it finds standstills by the odometer only, so the last
     # digits differ
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
@@ -118,11 +118,11 @@ def test_scale_sigmas_agree_with_the_reference_bounds(monkeypatch, drive, grade,
 
 @pytest.fixture
 def town_sigmas():
-    # of an IMU whose gyro feels no force, which else is most of a consumer grade's pitch
+    # without a gyro error by force, otherwise most of the pitch sigma of a consumer grade
     return Sigmas(config=with_settings(Config(), WHITE | {'imu.gyro_by_force_sigma': 0.0}))
 
 
-def test_fixes_are_thinned_without_loss(town_sigmas, monkeypatch):
+def test_thinned_fixes_keep_the_sigma(town_sigmas, monkeypatch):
     # heights drift by the stated sigma, which differs here
     monkeypatch.setattr(prepare, 'HEIGHT_TIME', np.inf)
     drive = stop_and_go().cut_at(180.0, 10.0)
@@ -131,12 +131,12 @@ def test_fixes_are_thinned_without_loss(town_sigmas, monkeypatch):
     np.testing.assert_allclose(sigmas_of(often), sigmas_of(rare), rtol=1e-6)
 
 
-def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
+def test_wider_keyframes_never_decrease_a_sigma(town_sigmas):
     drive = stop_and_go()
     fine, coarse = (sigmas_of(predict_smoother(drive, town_sigmas, spacing))
                     for spacing in (1.0, WIDEST_SPACING))
-    # each keeps what a second has, but for what happens within, to the safe side: a tenth or so,
-    # twice that of the yaw, which how a turn sets in tells from axes of the IMU that are off
+    # each keyframe keeps the information of its interval except changes within it, on the safe
+    # side: about a tenth; for yaw, which misalignment affects at the start of a turn, twice that
     assert (coarse >= fine).all()
     assert (coarse < 1.2 * fine).all()
     assert keyframe_spacing(drive) == 1.0
@@ -146,7 +146,7 @@ def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     assert day.duration / keyframe_spacing(day) == pytest.approx(1440.0)
 
 
-def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
+def test_samples_and_states_agree_for_any_sensor_positions(town_sigmas):
     drive = stop_and_go().cut_at(180.0, 10.0)
     drive = replace(drive, slope=0.03 * np.sin(drive.travel / 100.0))
     config = with_settings(town_sigmas.config, {
@@ -156,17 +156,17 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
     one = ideal_samples(drive, sigmas, 1.0)
     problem = make_problem(one.leg, config, one.imu)
     parts = Equations(problem, one.state).factors
-    # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
-    # most, beside what a planned drive's own steps of 0.1 s leave
+    # a turn starts within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 give 5 mrad and 4 cm/s at
+    # most, in addition to the error of the 0.1 s steps of a planned drive
     assert np.abs(parts['fixes'].raw).max() < 0.03
     r = parts['motion'].raw
     assert np.abs(r[:, 3:6]).max() < 0.1        # velocity
     assert np.abs(r[:, 6:9]).max() < 0.01       # attitude
-    assert np.median(np.abs(r[:, 15:18]), axis=0).max() < 1e-3      # way by odometer, m
+    assert np.median(np.abs(r[:, 15:18]), axis=0).max() < 1e-3      # path by odometer, m
     assert np.abs(r[:, 15:18]).max() < 0.03
 
 
-def test_a_heading_that_is_given_helps_as_far_as_it_is_known(town_sigmas):
+def test_external_heading_improves_the_yaw_according_to_its_sigma(town_sigmas):
     drive = straight().cut_at(300.0, 30.0)
 
     def yaw(source, sigma):
@@ -176,18 +176,18 @@ def test_a_heading_that_is_given_helps_as_far_as_it_is_known(town_sigmas):
         return sigmas_of(predict_smoother(drive, replace(town_sigmas, config=config)))[1]
 
     alone = yaw('auto', 0.1)
-    # two independent opinions of one angle: never better than their inverse squares' sum
+    # two independent measurements of one angle: not better than the sum of their information
     both = 1 / math.hypot(1 / alone, 1 / math.radians(0.1))
     assert both * 0.999 <= yaw('fixed', math.radians(0.1)) < alone
     for source in ('heading_topic', 'imu_orientation'):
-        # all along the drive it tells how the gyro drifts, too; its own error stays
+        # over the drive it also determines the gyro drift; its own error remains
         assert 0.9 * both <= yaw(source, math.radians(0.1)) < alone
-        assert yaw(source, 1.0) == alone        # the smoother takes none so bad
+        assert yaw(source, 1.0) == alone        # the smoother does not use such a large sigma
     assert yaw('fixed', 1.0) == pytest.approx(alone, rel=2e-3)
     assert yaw('course', 0.001) == alone == yaw('gyrocompass', 0.001)
 
 
-def test_what_the_smoother_would_refuse_is_refused(town_sigmas):
+def test_drive_that_the_smoother_rejects_is_rejected_in_the_prediction(town_sigmas):
     t = np.arange(0.0, 120.0, 0.1)
     even = drive_from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
     method = predict_smoother(even, town_sigmas)
@@ -201,13 +201,13 @@ def test_what_the_smoother_would_refuse_is_refused(town_sigmas):
     assert '74 fixes and ' in method.reasons[0].text
 
 
-def test_more_slip_and_slide_cost_what_they_should(town_sigmas):
+def test_more_slip_and_sideslip_increase_the_sigmas(town_sigmas):
     drive = stop_and_go()
     at = [sigmas_of(predict_smoother(drive, replace(town_sigmas, sway=sway, slip=slip)))
           for sway, slip in ((0.05, 0.01), (0.2, 0.01), (0.05, 0.05))]
-    assert at[1][1] > 1.5 * at[0][1]       # the yaw hangs on the sideways noise
+    assert at[1][1] > 1.5 * at[0][1]       # the yaw sigma depends on the sideways noise
     assert at[1][0] < 1.2 * at[0][0]
-    assert at[2][0] > 1.5 * at[0][0]       # the scale on the slip
+    assert at[2][0] > 1.5 * at[0][0]       # the scale sigma depends on the slip
     budget = predict_smoother(drive, town_sigmas).details['budget']
     for i, name in enumerate(NAMES):
         assert math.sqrt(sum(row[name]**2 for row in budget.values())) == pytest.approx(

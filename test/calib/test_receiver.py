@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What receivers, their clocks and drifting heights do to fixes: found, within the sigmas."""
+"""Effects of receivers, their clocks and drifting heights are found, within the sigmas."""
 
 from dataclasses import replace
 import re
@@ -23,7 +23,7 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
-# quadratic sums and expectations of levels that are as the rows have them
+# quadratic sums and expectations of levels that agree with the rows
 AS_IT_IS = dict.fromkeys(('fix', 'fix_up', 'slow', 'slow_up'), (1.0, 1.0))
 DRIVE = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_noise': 'rtk'}
 FAST = 1e-4         # relative
@@ -33,7 +33,7 @@ IN_SIGMAS = np.array([0.8, -1.2, 0.5])      # east, north, up
 
 
 def received(**real):
-    """Return the details and the reasons of a drive whose scale is within its sigma."""
+    """Return details and reasons of a drive; asserts that the scale is within its sigma."""
     drive, config, leg = made(**DRIVE, seed=4, real=Real(**real))
     found = smooth(leg, config)
     assert off(found, drive) < 3
@@ -41,7 +41,7 @@ def received(**real):
 
 
 @pytest.mark.parametrize('share', [0.02, -0.003])
-def test_an_odometer_in_the_receiver_is_told_from_the_vehicles(share):
+def test_odometer_in_the_receiver_is_distinguished_from_the_vehicle_odometer(share):
     details, texts = received(receiver_odometer=share)
     seen, time = (details[name] for name in ('fix_error_by_motion', 'fix_motion_time'))
     assert abs(seen['value'] - share) < 3 * seen['sigma'] < 0.3 * abs(share)
@@ -49,20 +49,20 @@ def test_an_odometer_in_the_receiver_is_told_from_the_vehicles(share):
     assert f'{100 * seen["value"]:+.2f} %' in texts[Code.FIXES_FOLLOW_ODOMETER]
 
 
-def test_a_filter_of_position_and_velocity_is_said_with_its_time():
+def test_filter_of_position_and_velocity_is_reported_with_its_time():
     _, texts = received(receiver_tracking=0.8)
     text = texts[Code.FIXES_SMOOTHED]
     assert 'positions and velocities' in text
     assert float(re.search(r'about (.*) s;', text)[1]) == pytest.approx(0.8, rel=0.02)
 
 
-def test_of_a_plain_receiver_nothing_is_said():
+def test_receiver_without_a_filter_has_no_reasons():
     _, texts = received()
     assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED, Code.CLOCKS_DRIFT} & texts.keys()
 
 
-def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
-    """A short yard, where an accelerometer error of the same size explains speeds as well."""
+def test_odometer_in_the_receiver_is_found_with_a_consumer_accelerometer():
+    """In a short yard drive, an accelerometer error of the same size also explains the speeds."""
     drive = simulate(SimOptions(scenario='yard', duration=300.0, seed=5,
                                 imu_grade='consumer', real=Real(receiver_odometer=0.05)))
     config = settings(drive, None)
@@ -79,7 +79,7 @@ def fixes_of(error, t):
         whitening=np.tile(np.eye(3), (len(t), 1, 1)))
 
 
-def test_errors_as_the_model_has_them_are_left_as_they_are():
+def test_errors_that_fit_the_model_are_not_widened():
     t, sigma, time, white = np.arange(0.0, 900.0), 1.5, 60.0, 0.3
     gain = 2 * sigma**2 / time
     levels = Levels({'slow': gain, 'slow_up': gain, 'fix': white**2, 'fix_up': white**2,
@@ -92,38 +92,38 @@ def test_errors_as_the_model_has_them_are_left_as_they_are():
         error = gauss_markov(rng, sigma, time, t) + white * rng.standard_normal((len(t), 3))
         found = long_span_factors(fixes_of(error, t), levels, AS_IT_IS)
         factors += found.values()
-        # a level that is four times too high, as its own steps say, is no reason
+        # a level four times too high, consistent with its own steps, does not change the factors
         again = long_span_factors(fixes_of(error, t), high, steps)
         assert again == pytest.approx(found)
     # one span in six is a sigma too large by chance, the longest, of 8 differences, by half of it;
-    # 1 in 1000 times their mean square is 3.3 times too large, of which 1.5 are allowed
+    # in 1 of 1000 their mean square is 3.3 times too large; a factor of 1.5 is tolerated
     assert max(factors) < 3.3 / 1.5
     assert np.mean(factors) < 1 + 0.5 / 6
 
 
-def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
+def test_errors_with_a_persistent_rate_grow_faster_than_their_steps():
     t, seconds, factors = np.arange(0.0, 900.0), 20, []
     levels = Levels({'slow': 1 / seconds, 'slow_up': 1 / seconds, 'fix': 1e-6, 'fix_up': 1e-6,
                      'correlation_time': 1e4})
     for seed in range(3, 11):
         steps = np.random.default_rng(seed).standard_normal((len(t) + seconds, 3))
-        # the mean of a walk over 20 s: steps of 1 / sqrt(20), in the long run as large as before
+        # mean of a random walk over 20 s: steps of 1 / sqrt(20), the same growth over long spans
         error = np.stack([np.convolve(x, np.full(seconds, 1 / seconds), 'valid')
                           for x in np.cumsum(steps, axis=0).T], -1)[:len(t)]
         factors += long_span_factors(fixes_of(error, t), levels, AS_IT_IS).values()
     assert seconds / 3 < min(factors) < max(factors) < 1.5 * seconds
-    # 20 less what chance may do at spans of 50 s or more: a quarter, or more
+    # 20, minus the effect of chance at spans of 50 s or more: a quarter or more
     assert np.mean(factors) > 0.6 * seconds
 
 
 @pytest.mark.parametrize('name', ['fix', 'odometer'])
-def test_the_rate_of_a_fast_clock_is_stated_and_the_scale_is_that_of_the_wheel(name):
+def test_clock_rate_is_reported_and_the_scale_is_that_of_the_wheel(name):
     drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
                               duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
     result = smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
     scale, texts = result.estimates['scale_factor'], reason_texts(result)
     assert off(result, drive) < 3
-    assert scale.sigma / scale.value < FAST / 3     # an error of FAST would show
+    assert scale.sigma / scale.value < FAST / 3     # an error of FAST exceeds the sigma
     text = texts[Code.CLOCKS_DRIFT]
     ppm = int(text.split('clock is ')[1].split(' ppm')[0])
     sigma = int(text.split('(± ')[1].split(')')[0])
@@ -133,7 +133,7 @@ def test_the_rate_of_a_fast_clock_is_stated_and_the_scale_is_that_of_the_wheel(n
     assert not {Code.WHEEL_SLIP, Code.SCALE_VARIES, Code.FIXES_NOISIER_THAN_SAID} & set(texts)
 
 
-def test_heights_that_drift_are_found_and_the_pitch_is_within_its_sigma():
+def test_height_drift_is_found_and_the_pitch_is_within_its_sigma():
     drive, config, leg = made(scenario='town', duration=500.0, fix_noise='white', fix_sigma=0.05)
     covariance, fixes = leg.covariance_n.copy(), leg.fixes_n.copy()
     covariance[:, 2, 2] = STATED**2
@@ -143,13 +143,13 @@ def test_heights_that_drift_are_found_and_the_pitch_is_within_its_sigma():
     assert abs(found['value'] - CHANGE / leg.t_fix[-1]) < 3 * found['sigma']
     assert off(result, drive, 'pitch_mounting_angle') < 3
     sigma = result.estimates['pitch_mounting_angle'].sigma
-    assert sigma < CHANGE / drive.truth.distance / 2        # the rise as the pitch's would show
+    assert sigma < CHANGE / drive.truth.distance / 2        # drift taken as pitch would exceed it
 
 
 @pytest.mark.parametrize(('unit', 'implausible'), [(1.0, False), (1 / 0.3048, False),
                                                    (100.0, True)])
-def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, implausible):
-    """Slopes of 1 % in cm; in feet the scale is 20 ppm off."""
+def test_implausible_heights_are_a_caution_with_the_cause(unit, implausible):
+    """Heights in cm give slopes of 1 %; heights in feet change the scale by 20 ppm."""
     _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial',
                           fix_noise='rtk', slope=0.01, seed=5)
     found = smooth(replace(leg, fixes_n=leg.fixes_n * [1.0, 1.0, unit]), config)
@@ -161,7 +161,7 @@ def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, 
         assert reason.remedy == 'Check the unit of heights in the fix driver.'
 
 
-def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
+def test_converging_fixes_are_found_and_the_scale_is_within_its_sigma():
     drive, config, leg = made(scenario='motorway', duration=500.0, fix_noise='white',
                               fix_sigma=WHITE, imu_grade='industrial')
     stated = np.hypot(WHITE, START * np.exp(-leg.t_fix / TIME))[:, None] * np.ones(3)
@@ -169,6 +169,6 @@ def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
                             covariance_n=stated[:, :, None]**2 * np.eye(3)), config)
     assert off(result, drive) < 3
     sigma = result.estimates['scale_factor'].sigma / drive.truth.scale
-    assert sigma < START / drive.truth.distance / 2     # it would show there
+    assert sigma < START / drive.truth.distance / 2     # the error at the start exceeds it
     for name, true in zip(CONSTANTS[FIX_ERROR_BY_SIGMA], IN_SIGMAS, strict=True):
         assert abs(result.details[name]['value'] - true) < 3 * result.details[name]['sigma']

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The block solver against dense algebra, the bound against all rows stacked, and its memory."""
+"""Block solver against dense algebra, the bound against all stacked rows, memory use."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ TOTAL = N * STATES + BORDER
 
 
 @pytest.mark.parametrize('correlation_time', [0.0, 40.0])
-def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
+def test_bound_is_the_inverse_of_all_stacked_rows(correlation_time):
     drive, config, leg = made(duration=140.0, fix_rate=1.0)
     leg = replace(leg, t_stop=50.0)
     problem = make_problem(leg, config)
@@ -104,20 +104,20 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     prior[IMPERFECTIONS] *= np.sqrt(SIZE)         # the first sizes
     add(np.eye(M), (border,), np.diag(1 / prior))
     A = np.concatenate(rows)
-    # by QR of the rows, which does not square their condition: scaled columns
+    # by QR of the rows, which does not square the condition number: scaled columns
     scale = np.linalg.norm(A, axis=0)
     R = np.linalg.qr(A / scale, mode='r')
     last = np.linalg.inv(R[-M:, -M:])
     dense = last @ last.T / np.outer(scale[-M:], scale[-M:])
     got = cramer_rao_bound(leg, config, state, levels)
     sigma = np.sqrt(np.diag(dense))
-    # the normal equations of the chain lose what their condition costs: 1e-6 of a sigma
+    # the normal equations of the chain lose accuracy by their condition: 1e-6 of a sigma
     np.testing.assert_allclose(got / np.outer(sigma, sigma), dense / np.outer(sigma, sigma),
                                atol=1e-5)
 
 
 def _dense(seed=0, rows=8):
-    """Return a dense normal matrix and right side with the chain's pattern, badly scaled."""
+    """Return a dense normal matrix and right side with the pattern of the chain, badly scaled."""
     rng = np.random.default_rng(seed)
     A = np.zeros((0, TOTAL))
     for k in range(N - 1):
@@ -141,10 +141,10 @@ def _as_chain(H, g):
     return out
 
 
-def test_step_and_covariances_are_those_of_a_dense_solve():
+def test_step_and_covariances_equal_those_of_a_dense_solve():
     H, g = _dense()
     solved = solve(_as_chain(H, g))
-    # the dense inverse of the scaled matrix: its condition is 1e4, so 1e-10 leaves room
+    # the dense inverse of the scaled matrix: with a condition of 1e4 the limit is 1e-10
     s = 1 / np.sqrt(np.diag(H))
     P = np.linalg.inv(H * np.outer(s, s)) * np.outer(s, s)
     x = P @ g
@@ -159,7 +159,7 @@ def test_step_and_covariances_are_those_of_a_dense_solve():
                                    atol=1e-10 * np.sqrt(np.outer(P[i, i], P[i, i])).min())
 
 
-def test_absent_constants_have_their_priors_as_if_they_were_in_the_border():
+def test_absent_constants_have_their_priors_in_the_marginal_information():
     H, g = _dense()
     solved = solve(_as_chain(H, g))
     normal, weights = _as_chain(H, g), np.array([4.0, 0.25])
@@ -184,20 +184,20 @@ def test_absent_constants_have_their_priors_as_if_they_were_in_the_border():
     np.testing.assert_allclose(some.marginals()[1], solved.marginals()[1], rtol=1e-12)
 
 
-def test_what_nothing_holds_is_said():
+def test_unconstrained_state_is_reported():
     H, g = _dense()
     H[N * STATES + 1, :] = H[:, N * STATES + 1] = 0.0
     with pytest.raises(NotPositive):
         solve(_as_chain(H, g))
 
 
-# bytes a keyframe: the chain is 16e3, derivatives 13.4e3, sums and rows 8e3; the rest is for the
-# blocks that are worked in at a time, 5e6 whatever the length
+# bytes per keyframe: chain 16e3, derivatives 13.4e3, sums and rows 8e3; the rest is for the
+# blocks in process, 5e6 for any length
 MOST = 41.5e3
 
 
 def peak_of_a_pass(duration):
-    """Return the number of keyframes and the peak, bytes, of a pass with slow fix errors."""
+    """Return the number of keyframes and the peak, bytes, of a pass with correlated fix errors."""
     _, config, leg = made(scenario='town', duration=duration, imu_rate=25.0, fix_rate=1.0)
     problem = make_problem(leg, config)
     state = cold_start(leg, problem.imu, problem.priors).state
@@ -214,21 +214,21 @@ def peak_of_a_pass(duration):
     return len(state.t), peak
 
 
-def test_a_longer_leg_costs_a_pass_little():
+def test_memory_of_a_pass_grows_little_with_the_leg():
     keyframes, peak = peak_of_a_pass(1152.0)
     assert keyframes > 1100
     assert peak / keyframes == pytest.approx(MOST / 2, abs=MOST / 2)
 
 
 def resident(peak=False):
-    """Return the resident bytes of this process, or their peak since it was last asked."""
+    """Return the resident bytes of this process, or their peak since the last call."""
     name = 'VmHWM' if peak else 'VmRSS'
     found = Path('/proc/self/status').read_text().split(f'{name}:')[1].split()[0]
     Path('/proc/self/clear_refs').write_text('5')
     return 1024 * int(found)
 
 
-def test_turn_rates_in_a_file_are_read_piece_by_piece():
+def test_turn_rates_in_a_file_are_read_in_chunks():
     rows, step = 6_000_000, 1e-3        # 100 min at 1 kHz
     t, w_b = work_array(rows), work_array(rows, 3)
     t[:] = np.arange(rows) * step
@@ -236,5 +236,5 @@ def test_turn_rates_in_a_file_are_read_piece_by_piece():
     release_mapped_memory()
     before = resident()
     mean_rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))
-    # all times are touched; the rates, if held as a whole, would add their own size
+    # all times are read; the rates, if in memory as a whole, would add their own size
     assert resident(peak=True) - before - t.nbytes < w_b.nbytes / 2

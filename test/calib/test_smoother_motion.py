@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Equations of the smoother: true at the truth; a bus that kneels has the result of another."""
+"""Equations of the smoother hold at the truth; a kneeling bus does not change the result."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def perfect():
 
 
 @pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
-def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
+def test_step_beyond_vertical_pitch_keeps_the_vehicle_upright(perfect, turned):
     _, state = perfect
     step = np.zeros(layout.M)
     step[layout.PITCH] = turned
@@ -48,7 +48,7 @@ def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
     assert moved.C_bv[2, 2] >= 0
 
 
-def test_the_truth_fulfils_the_equations(perfect):
+def test_truth_satisfies_the_equations(perfect):
     problem, state = perfect
     parts = Equations(problem, state).factors
     r = np.abs(parts['motion'].raw)
@@ -56,28 +56,28 @@ def test_the_truth_fulfils_the_equations(perfect):
     # of 3 m/s^3, 1e-4 m/s over an interval
     assert r[:, :6].max() < 2e-4
     assert r[:, 6:9].max() < 1e-7
-    # the odometer's rounding: two ends of up to one count of 2 cm, less their mean
+    # rounding of the odometer: two ends of up to one count of 2 cm, minus their mean
     assert r[:, 15:18].max() < 0.022
     assert np.abs(parts['fixes'].raw).max() < 5e-4
 
 
-def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
+def test_turn_of_a_rolled_body_does_not_pitch_it(perfect):
     problem, state = perfect
     preintegrate_at = preintegrated(problem, state)[0]
     rate_n = rotate(state.C_nb[:-1], preintegrate_at.mean_rate)
     assert np.abs(rate_n[:, 2]).max() > 0.1
-    rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level, and the mounting is 1 deg
+    rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level body; mounting of 1 deg
     leaning = replace(state, C_nb=rolled)
     measured = rotate(transpose(rolled[:-1]), rate_n)
     upright, other = (Motion(problem, one, own).tilt.pitch_increments[:, 0] for one, own in (
         (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
-    # of a turn by 0.2 rad a tenth was pitch; the heading that the mounting changes with the roll,
-    # by 0.1 times some degrees, turns what the body really pitches by
+    # an error would make a tenth of a turn of 0.2 rad pitch; the roll changes the heading of the
+    # mounting by 0.1 times some degrees, which rotates the real pitch
     assert np.abs(other - upright).max() < 0.01 * np.abs(upright).max() + 1e-5
 
 
-def test_a_turn_is_no_braking():
-    """Tyres that slip by 0.8 % for each m/s^2 of pull, half of it braking: a turn is none."""
+def test_turn_is_not_treated_as_braking():
+    """Tyres slip by 0.8 % per m/s^2 of drive, half of it in braking: a turn has no such slip."""
     stiff = 0.04
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
                                  real=Real(tyre_slip=stiff, driven=True))
@@ -91,12 +91,12 @@ def test_a_turn_is_no_braking():
     share = along / np.maximum(speed[1:], 1.0)
     turns, straight = share[even & (turned > 0.1)], share[even & (turned < 1e-3)]
     assert len(turns) > 3 < len(straight)
-    # the air's resistance at other speeds: 2e-5 of it; taken for braking, turns were 1e-3 off
+    # the air resistance at other speeds: 2e-5; if treated as braking, turns deviate by 1e-3
     assert np.abs(turns - np.median(straight)).max() < 1e-4
 
 
-def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
-    """An IMU 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
+def test_tyres_and_springs_depend_on_the_axle_acceleration_for_any_imu_position():
+    """An IMU 0.6 m to the left measures 0.6 m times the angular acceleration as forward force."""
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         _, problem, state = at_truth(imu_lever_arm=arm)
@@ -105,27 +105,27 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
     (at_axle, ahead, problem), (pushed, faster, _) = found
     change = np.abs(np.diff(problem.rate_b[:, 2])).max()
     assert change > 0.15
-    # a turn that begins amid the 0.1 s over which rates are means: a quarter of 0.05 s of its
-    # change is missing, at both ends, 0.9 m from the axle
+    # a turn that starts within the 0.1 s of a mean rate: a quarter of 0.05 s of its change is
+    # missing at both ends, 0.9 m from the axle
     most = 2 * 0.9 * change * 0.05 / 4
     assert np.abs(pushed - at_axle).max() < most
     assert np.abs(faster - ahead).max() < most
 
 
-def test_noise_of_turn_rates_is_no_side_force():
-    """As a difference of velocities of the axle, 3.4 m away, it was one of 0.01 m/s^2."""
+def test_turn_rate_noise_is_not_a_side_force():
+    """As a velocity difference of the axle, 3.4 m away, the noise was 0.01 m/s^2."""
     _, problem, state = at_truth(imu_lever_arm=(3.4, 0.0, 0.0))
     noise = 2e-3 * np.random.default_rng(3).standard_normal(len(state.t))
     noisy = replace(problem, rate_b=problem.rate_b + np.outer(noise, state.C_bv[:, 2]))
     pushes, others = (Equations(one, state).factors['motion'].motion.lean_accelerations[:, 1]
                       for one in (problem, noisy))
     assert np.abs(pushes).max() > 0.5
-    # the share of a path of 7 mm/s to the side, at more than 0.1 m/s, in the mean of the bank
+    # a path of 7 mm/s to the side, at more than 0.1 m/s, in the mean of the bank
     assert np.abs(others - pushes).max() < 1e-4
 
 
-def test_a_lean_is_level_though_the_imu_is_rolled():
-    """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
+def test_lean_axes_are_level_with_a_rolled_imu():
+    """About the axes of an IMU rolled by 5 deg, a tenth of a squat appeared as sideslip."""
     roll = 0.09
     drive, problem, state = at_truth(roll=roll)
     motion = Equations(problem, state).factors['motion'].motion
@@ -134,66 +134,66 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
         layout.SIZE_WITHOUT_SLOW)[2][:, 15:18, layout.BODY_LEAN]
     sizes = np.linalg.norm(by, axis=1).max(axis=0)
     assert (sizes > 0.1).all()
-    # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
+    # the pitch axis of the mounting is level to second order of yaw and pitch, 1 deg each
     assert np.abs(by[:, 1, 0]).max() < 0.005 * sizes[0]
     assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
 
 
 def _left_by_lean(real, axis, columns):
-    """Return what is left of a displacement, rms, without and with constants of the lean."""
+    """Return the rms displacement without and with constants of the lean."""
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
     off, by = along_axis(problem, state, axis, layout.BODY_LEAN)
     rests = [off - by[:, c] @ np.linalg.lstsq(by[:, c], off, rcond=None)[0] for c in columns]
     return [np.sqrt((one**2).mean()) for one in (off, *rests)]
 
 
-def test_an_axle_slides_by_speed_times_turn_rate():
+def test_axle_slides_by_speed_times_turn_rate():
     whole, rest = _left_by_lean(Real(sideslip=0.005), 1, [[0, 1]])
     # the mean of a product over 1 s is not the product of means; a difference of velocities
     # left 3 %
     assert rest < 1e-3 * whole
 
 
-def test_a_body_leans_late():
-    """A third at least of what is left of a squat goes with the change of the push."""
+def test_body_lean_is_delayed():
+    """At least a third of the remaining squat is proportional to the change of acceleration."""
     whole, rest, with_change = _left_by_lean(Real(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
     assert rest < 0.3 * whole
     assert with_change < 0.7 * rest
 
 
-def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
+def test_tyre_force_on_a_slope_equals_that_of_the_same_acceleration():
     drive, problem, state = at_truth(slope=0.1)
     motion = Equations(problem, state).factors['motion'].motion
     since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
     fast = there.speed > 2.0
     want = there.acceleration + G * there.slope
-    # means of a second of what changes by up to 1 m/s^3 within it
+    # means over 1 s of an acceleration that changes by up to 1 m/s^3
     assert np.abs(motion.axle.acceleration() - want)[fast].max() < 0.3
     assert np.ptp(G * there.slope[fast]) > 0.5
-    # the body's axes are those of the road here
+    # here the body axes are those of the road
     assert np.abs(motion.lean_accelerations[:, 0] - want)[fast].max() < 0.3
 
 
-def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
+def test_truth_with_an_accelerometer_scale_error_satisfies_the_equations(perfect):
     error = 0.01
     _, problem, state = at_truth(60.0, accel_scale_error=error)
     c = state.constants.copy()
-    c[layout.ACCEL.start:layout.ACCEL.start + 2] = error / (1 + error)      # of what is measured
-    # on a level road the force along z is gravity, but for the tilt: the error a bias
+    c[layout.ACCEL.start:layout.ACCEL.start + 2] = error / (1 + error)      # of the measured force
+    # on a level road the force along z is gravity, except for tilt: the error is a bias
     bias = state.accel_bias + [0.0, 0.0, error * 9.80154]
     state = replace(state, constants=c, accel_bias=bias)
     r = Equations(problem, state).factors['motion'].raw
     without, straight = perfect
     kinks = Equations(without, straight).factors['motion'].raw
-    # no more than what the trapezoid rule leaves without a scale error; the error times the mean
-    # force of each second would be off by 1 % of up to 0.2 m
+    # not more than the trapezoid rule leaves without a scale error; the error times the mean
+    # force of each second would give 1 % of up to 0.2 m
     assert np.abs(r[:, :2] - kinks[:, :2]).max() < 2e-5
     assert np.abs(r[:, 3:5] - kinks[:, 3:5]).max() < 2e-5
 
 
-def test_the_scale_is_that_of_the_path_wherever_the_body_points():
-    """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
+def test_scale_is_that_of_the_path_for_any_body_direction():
+    """A squat of 0.1 rad per m/s^2 rotates the path in the body frame but keeps its length."""
     _, problem, state = at_truth(scenario='town')
     c = np.zeros(layout.M)
     c[layout.BODY_LEAN.start] = 0.1
@@ -201,7 +201,7 @@ def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     level, leaning = (Equations(problem, state.updated(unmoved, step)).factors['motion'].motion
                       for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
-    # slower than a walk the direction of travel is not known
+    # below walking speed the direction of travel is unknown
     walks = np.linalg.norm(level.displacement_by_state, axis=1) > WALK_SPEED * level.T[:, 0]
     hard = straight & walks & (np.abs(level.lean_accelerations[:, 0]) > 0.5)
     assert hard.sum() > 10
@@ -220,9 +220,9 @@ def result(kneeling):
 
 
 @pytest.mark.core
-def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
+def test_kneeling_bus_has_the_sigmas_of_a_bus_that_does_not_kneel():
     (kneels, bus), (stands, _) = (result(np.radians(x)) for x in (2.0, 0.0))
-    # white noise of the IMU and the standstills that are left without a tilt
+    # white noise of the IMU and the remaining standstills without tilt
     more = 1.2
     for name in ('scale_factor', *ANGLES):
         assert kneels.estimates[name].sigma < more * stands.estimates[name].sigma
@@ -232,7 +232,7 @@ def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
 
 
 @pytest.mark.core
-def test_a_turn_at_rest_has_the_variance_that_makes_it_an_outlier_of_three_sigmas():
+def test_turn_at_rest_gets_the_variance_of_a_three_sigma_outlier():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     k = int(np.flatnonzero(problem.at_rest[:-1] & problem.at_rest[1:])[3])

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise levels are those simulated; errors of the IMU multiply the signal, not the noise."""
+"""Noise levels agree with the simulation; IMU errors multiply the signal, not the noise."""
 
 from types import SimpleNamespace
 
@@ -34,25 +34,25 @@ def test_levels_of_a_noisy_speed_and_a_swaying_vehicle_are_found(noise):
     _, config, leg = made(imu_grade='industrial', fix_noise=noise, duration=400.0, **SWAY)
     result = smooth(leg, config)
     level, scale = result.details['noise'], result.estimates['scale_factor'].value
-    # what a second's way errs by: the walk, and a reading's own error at both of its ends
+    # path error of one second: the random walk, and the reading error at both ends
     along = np.hypot(level['along'], np.sqrt(2) * scale * level['travel'])
-    # 0.05 m/s white at 10 Hz: 0.0158 m/sqrt(s); 150 seconds of even driving tell it: 5 sigma of
-    # a standard deviation from so many are 29 %
+    # 0.05 m/s white at 10 Hz: 0.0158 m/sqrt(s); 150 seconds of even driving determine it: 5 sigma
+    # of a standard deviation from this number are 29 %
     for name, found in (('along', along), ('side', level['side']), ('up', level['up'])):
         assert found == pytest.approx(0.05 / np.sqrt(10.0), rel=5 / np.sqrt(2 * 150)), name
-    # no interval but chance ones is taken for a slip: the edges of stops are none
+    # only chance intervals count as slip: the edges of stops do not
     assert result.details['residuals']['intervals_slipping'] <= 4
 
 
 @pytest.mark.parametrize(('kerbs', 'least', 'most'), [(0.0, 0.0, 0.05), (0.06, 0.1, 1.0)])
-def test_a_body_that_kerbs_pitch_lifts_its_axle(kerbs, least, most):
-    # within a second by half a wheelbase at most, 0.25 m a rad; without kerbs it is as it begins
+def test_body_that_kerbs_pitch_lifts_its_axle(kerbs, least, most):
+    # within a second by half a wheelbase at most, 0.25 m/rad; without kerbs the initial value
     _, config, leg = made(scenario='yard', duration=300.0, imu_grade='industrial',
                           fix_noise='rtk', real=Real(kerbs=kerbs, wheelbase=0.5))
     assert least < smooth(leg, config).details['noise']['pitching'] < most
 
 
-def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
+def test_noise_at_rest_is_measured_in_standstills():
     rng = np.random.default_rng(4)
     path = np.concatenate([np.full(100, 9.0), 0.0158 * rng.standard_normal(100)])
     rest = np.arange(200) >= 100
@@ -63,8 +63,8 @@ def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
 
 
 @pytest.mark.parametrize(('loaded_s', 'most'), [(0, 1.2), (10, 2.0)])
-def test_a_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most):
-    """Stops of 20 s: the body is moved for half of each, and for 12 of its 18 differences."""
+def test_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most):
+    """Stops of 20 s: the body moves in half of each, in 12 of its 18 differences."""
     rng = np.random.default_rng(4)
     signals = 1e-3 * rng.standard_normal((400, 6))
     signals[np.arange(400) % 40 < loaded_s, 5] += 0.03 * rng.standard_normal(10 * loaded_s)
@@ -76,16 +76,16 @@ def test_a_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most
     assert 0.75 * 1e-3 < sigma < most * 1e-3
 
 
-def test_rounding_that_stands_counts_once():
+def test_rounding_error_at_standstill_counts_once():
     still = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1], bool)
     assert standstill_weights(still) == pytest.approx([1/2, 1/2, 1, 1, 1, 1, 1/3, 1/3, 1/3])
     assert standstill_weights(np.zeros(3, bool)) == pytest.approx(1.0)
 
 
-def test_a_counter_that_stands_is_no_slip_of_the_wheel():
+def test_counter_at_standstill_is_not_wheel_slip():
     _, config, leg = made(imu_grade='industrial', fix_noise='rtk', duration=400.0)
     level = smooth(leg, config).details['noise']
-    # wheels that never slip; the rounding, 5.8 mm, once a stop of a minute would be 0.75 mm
+    # wheels without slip; the rounding, 5.8 mm, once per stop of a minute would be 0.75 mm
     assert level['along_hard'] < 6e-4
 
 
@@ -96,7 +96,7 @@ def by_grade(config):
 
 
 def scores(fitted):
-    """Return the scores of the IMU's errors at the truth by noise alone, in their sigmas."""
+    """Return the scores of the IMU errors at the truth from noise alone, in their sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     weighted = Equations(problem, state, fitted=fitted).at(problem.initial_levels)
@@ -107,13 +107,13 @@ def scores(fitted):
             if name in GYRO_ERRORS or name in ACCEL_ERRORS}
 
 
-def test_at_the_truth_noise_says_nothing_of_the_imus_errors(monkeypatch):
+def test_noise_at_the_truth_does_not_bias_the_imu_errors(monkeypatch):
     off = scores(fitted=True)
     assert len(off) == len(GYRO_ERRORS) + len(ACCEL_ERRORS)
-    # by chance one of 19 lies beyond 3.5 in 1 of 100
+    # by chance one of 19 exceeds 3.5 in 1 of 100
     assert {name: x for name, x in off.items() if abs(x) > 3.5} == {}
-    # by the signal as measured a scale has one for each degree of freedom that noise has; those
-    # of the axes that hardly turn see little else
+    # with the measured signal, a scale has a score for each degree of freedom of the noise; axes
+    # that hardly turn have little other signal
     without_noise = scores(fitted=False)
     monkeypatch.setattr(signals, 'LIKELY_NOISE', 1e-6)
     both = [x['gyro_scale_x'] + x['gyro_scale_y']
@@ -124,20 +124,20 @@ def test_at_the_truth_noise_says_nothing_of_the_imus_errors(monkeypatch):
 
 
 @pytest.mark.parametrize('drive', [
-    # with the noise of small rates the fit has not converged after 40 passes, x is up to 10 % off
+    # with noise of small rates the fit does not converge in 40 passes, x deviates by up to 10 %
     {'duration': 7200.0, 'imu_grade': 'consumer', 'imu_rate': 10.0, 'fix_rate': 0.5,
      'odometer_rate': 5.0, 'odometer': 'counts'},
     {'duration': 1200.0, 'imu_grade': 'consumer', 'sway': 0.05, 'odometer_rate': 10.0,
      'speed_noise': 0.05},
-    # few turns in long sway: a signal that contains it is a scale y 4.6 sigmas off
+    # few turns in long sway: a signal that contains the sway gives scale y an error of 4.6 sigmas
     {'scenario': 'out_and_back', 'duration': 2400.0, 'imu_grade': 'industrial', 'sway': 0.02,
      'odometer_rate': 5.0, 'imu_rate': 10.0, 'fix_rate': 1.0,
      'real': Real(speed_step=1 / 3.6, slow_errors=((1.5, 60.0), (1.0, 600.0)))},
-    # with such fixes the IMU's scales and that of the odometer hardly differ: a signal without
-    # sway, by a path with sway, makes them 5 sigmas larger
+    # with such fixes, IMU scales and odometer scale are hardly separable: a signal without
+    # sway and a path with sway increase them by 5 sigmas
     {'scenario': 'yard', 'duration': 900.0, 'imu_grade': 'consumer', 'sway': 0.02, 'seed': 2,
      'odometer_rate': 20.0, 'fix_rate': 1.0, 'real': Real(slow_errors=((1.5, 100.0),))}])
-def test_gyro_noise_and_a_road_that_shakes_make_no_scale_error(drive):
+def test_gyro_noise_and_road_vibration_cause_no_scale_error(drive):
     drive, config, leg = made(**({'odometer': 'speed'} | drive))
     found = smooth(leg, by_grade(config))
     assert off(found, drive) < 3.3
@@ -151,7 +151,7 @@ KERBS = {'scenario': 'yard', 'real': Real(kerbs=0.06, wheelbase=0.5)}
 
 
 @pytest.mark.parametrize('road', [BANKED, KERBS])
-def test_without_noise_the_whole_signal_counts(road):
+def test_whole_signal_counts_without_noise(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
@@ -159,7 +159,7 @@ def test_without_noise_the_whole_signal_counts(road):
         for x in (False, True)))
     for i, name in enumerate(CONSTANTS[:raw.shape[2]]):
         if name in GYRO_ERRORS or name in ACCEL_ERRORS and road is BANKED:
-            # what kerbs lift the axle by is noise of the road; a roll of 0.2 rad is none
+            # the axle lift by kerbs is road noise; a roll of 0.2 rad is not
             off = np.linalg.norm(fitted[:, :, i] - raw[:, :, i]) / np.linalg.norm(raw[:, :, i])
             assert off < 0.01, name
 
@@ -167,9 +167,9 @@ def test_without_noise_the_whole_signal_counts(road):
 @pytest.mark.parametrize(('seed', 'kind', 'grade', 'effects', 'more'), [
     (102_000_000, 'oval', 'industrial', (), {
         'fix_noise': 'rtk', 'fix_sigma': 0.02, 'real': {'banking': 0.5}}),
-    # kerbs shorter than the wheelbase break the model: the scale is low by a sigma
+    # kerbs shorter than the wheelbase violate the model: the scale is low by one sigma
     (99_000_003, 'yard', 'consumer', ('kerbs',), {'fix_noise': 'correlated', 'fix_sigma': 1.5})])
-def test_a_road_that_leans_or_has_kerbs_gives_the_values_within_their_sigmas(
+def test_values_on_a_road_with_bank_or_kerbs_are_within_their_sigmas(
         seed, kind, grade, effects, more):
     drive = simulate(draw_vehicle(seed, kind, grade, effects, **more)[0])
     config = settings(drive, None)

@@ -48,19 +48,19 @@ def sigma_of(method, name='scale_factor'):
     return e.sigma / e.value if name == 'scale_factor' else e.sigma
 
 
-def test_rows_are_true_at_the_truth():
+def test_external_rows_vanish_at_the_truth():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             heading_sigma=0.0, **ARMS)
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     parts = Equations(problem, state).factors
-    # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
+    # 50 Hz: a turn rate is a mean over 20 ms, error 5 mrad/s at 0.5 rad/s^2, on an arm of 0.6 m
     assert np.abs(parts['velocity'].raw).max() < 5e-3
-    # within a step of 20 ms the turn is taken to first order: (0.02 s 0.5 rad/s)^2 / 2
+    # within a step of 20 ms the turn is of first order: (0.02 s 0.5 rad/s)^2 / 2
     assert np.abs(parts['heading'].raw).max() < 1e-4
 
 
-def test_a_velocity_helps_and_its_size_is_found():
+def test_velocity_reduces_the_sigma_and_its_noise_is_found():
     drive, without = smoothed(**SHORT)
     config = made(**SHORT)[1]
     pure = with_settings(config, {'gnss.velocity_scale_sigma': 1e-5})
@@ -68,7 +68,7 @@ def test_a_velocity_helps_and_its_size_is_found():
     silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), pure)
     assert off(measured, drive, *BOTH) < 3.3
     assert sigma_of(measured) < 0.9 * sigma_of(without)
-    # 1.5 thousand draws of each: 2 % of a sigma
+    # 1500 draws of each: 2 % of a sigma
     assert measured.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
     assert silent.details['noise']['velocity'] == pytest.approx(0.5, abs=0.04)
     assert sigma_of(silent) == pytest.approx(sigma_of(measured), rel=0.02)
@@ -76,7 +76,7 @@ def test_a_velocity_helps_and_its_size_is_found():
     assert not {'fix_velocity', 'heading'} & {s.name for s in without.sources}
 
 
-def test_outliers_of_a_velocity_do_not_pull():
+def test_velocity_outliers_do_not_shift_the_values():
     drive, config, _ = made(**SHORT)
 
     def errors(e):
@@ -85,11 +85,11 @@ def test_outliers_of_a_velocity_do_not_pull():
 
     method = fitted(with_velocity(drive, errors), config)
     assert off(method, drive, *BOTH) < 3.3
-    # 2 % of the rows at the edge of what counts in full, 9 in place of 1: 1.18 in variance
+    # 2 % of the rows at the limit of full weight, 9 instead of 1: 1.18 in variance
     assert method.details['noise']['velocity'] < 1.18
 
 
-def test_velocity_errors_that_stay_promise_no_more():
+def test_correlated_velocity_errors_do_not_reduce_the_sigma():
     drive, config, _ = made(**SHORT)
 
     def slow(e):
@@ -101,8 +101,8 @@ def test_velocity_errors_that_stay_promise_no_more():
         return out
 
     method = fitted(with_velocity(drive, slow), config)
-    # neighbours have a correlation of 0.95: (1 + 0.95) / (1 - 0.95) = 39 count as one, less those
-    # that the smoothing takes for motion
+    # adjacent rows have a correlation of 0.95: (1 + 0.95) / (1 - 0.95) = 39 count as one, fewer
+    # where the smoother attributes them to motion
     assert 10 < method.details['external']['velocity']['rows_per_independent'] < 80
     assert off(method, drive, *BOTH) < 3.3
 
@@ -110,9 +110,9 @@ def test_velocity_errors_that_stay_promise_no_more():
 @pytest.mark.parametrize(('error', 'name', 'true', 'sigma'), [
     ({'velocity_delay': 0.2}, 'velocity_delay', 0.2, 0.05),
     ({'velocity_lag': 0.5}, 'velocity_lag_square', 0.25, 0.0625),
-    ({'velocity_scale_error': 1e-3}, 'velocity_scale', 1e-3, 1e-3),     # the prior's alone
+    ({'velocity_scale_error': 1e-3}, 'velocity_scale', 1e-3, 1e-3),     # from the prior only
     ({'velocity_scale_error': 0.02}, 'velocity_scale', 0.02, 0.005)])   # of a fused velocity
-def test_what_a_receiver_does_to_a_velocity_is_found_and_does_not_pull(error, name, true, sigma):
+def test_receiver_errors_in_a_velocity_are_found_and_do_not_bias_the_fit(error, name, true, sigma):
     drive, method = smoothed(**SHORT, velocity_sigma=SIGMA, **error)
     found = method.details['external']['velocity'][name]
     assert abs(found['value'] - true) < 3.3 * found['sigma']
@@ -120,20 +120,20 @@ def test_what_a_receiver_does_to_a_velocity_is_found_and_does_not_pull(error, na
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_a_delay_is_not_lost_in_vibration():
-    # derivatives by single samples would hold the vibration: a delay that is off and looks certain
+def test_velocity_delay_is_found_despite_vibration():
+    # derivatives by single samples contain vibration: a wrong delay with a small sigma
     drive, config, _ = made(**SHORT, velocity_sigma=SIGMA, velocity_delay=0.3)
     leg = drive.leg()
     shake = 2.0 * np.random.default_rng(3).standard_normal(leg.imu.f_i.shape)
     leg = replace(leg, imu=changed(leg.imu, f_i=lambda f: np.add(f, shake, out=f)))
     found = smooth(leg_of(leg, config), config).details['external']['velocity']['velocity_delay']
     assert found['value'] == pytest.approx(0.3, abs=3.3 * found['sigma'])
-    assert found['sigma'] < 0.08        # a third of the prior's
+    assert found['sigma'] < 0.08        # a third of the prior sigma
 
 
-def test_what_cannot_be_used_or_is_not_asked_for_is_left_out():
+def test_unusable_or_unselected_sensors_are_left_out():
     drive, config, leg = made(**SHORT, **HILLS, velocity_sigma=SIGMA, orientation_sigma=1e-3)
-    assert set(leg.external) == {'velocity', 'pressure'}     # no orientation unless asked for
+    assert set(leg.external) == {'velocity', 'pressure'}     # no orientation unless selected
     without = with_settings(config, {'gnss.use_velocity': False, 'imu.use_pressure': False})
     assert not leg_of(drive.leg(), without).external
     assert 'pressure' not in without.inputs
@@ -141,7 +141,7 @@ def test_what_cannot_be_used_or_is_not_asked_for_is_left_out():
     assert not leg_of(silent, config).external
 
 
-def test_white_errors_are_not_alike():
+def test_white_errors_are_not_correlated():
     rng = np.random.default_rng(3)
 
     class White:
@@ -152,7 +152,7 @@ def test_white_errors_are_not_alike():
 
 
 @pytest.mark.parametrize('how', ['topic', 'fixed', 'imu'])
-def test_a_heading_adds_its_sigma_and_no_more(how):
+def test_heading_adds_only_the_information_of_its_sigma(how):
     sigma = 1e-3
     options = {'topic': {'heading_sigma': sigma}, 'imu': {'orientation_sigma': sigma}}
     drive, config, leg = made(**STRAIGHT, **options.get(how, {}))
@@ -160,12 +160,12 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
            'fixed': {'alignment__heading': float(drive.truth.heading),
                      'alignment__heading_sigma': sigma}}[how]
     method = fitted(drive.leg(), config, **ask)
-    # without it, at the noise levels that this fit found: a fit of its own would find others
+    # without the heading, at the noise levels of this fit: a separate fit finds other levels
     levels = Levels.from_sigmas(method.details['noise'])
     alone = math.sqrt(cramer_rao_bound(replace(leg, external={}), config,
                                        truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the
-    # drive contradicts, by 1.5 of its sigmas here, has less weight: up to 15 %
+    # drive contradicts, here by 1.5 of its sigmas, has less weight: up to 15 %
     both = 1 / np.hypot(1 / sigma, 1 / alone)
     assert 0.97 * both < sigma_of(method, 'yaw_mounting_angle') < 1.15 * both
     assert off(method, drive, *BOTH) < 3.3
@@ -174,7 +174,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     assert 'heading' in shared
 
 
-def test_a_wrong_heading_is_said_and_gives_way():
+def test_wrong_heading_is_reported_and_relaxed():
     drive, config, _ = made(**SHORT)
     method = fitted(drive.leg(), config, alignment__heading=float(drive.truth.heading) + 0.05,
                     alignment__heading_sigma=2e-3)
@@ -185,7 +185,7 @@ def test_a_wrong_heading_is_said_and_gives_way():
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_rows_without_a_possible_value_are_left_out():
+def test_rows_with_impossible_values_are_left_out():
     drive, config, _ = made(**HILLY)
     leg = with_velocity(drive, lambda e: 0 * e)
     sent, pressure = leg.rows('fix_velocity'), leg.rows('pressure')
@@ -204,7 +204,7 @@ def test_rows_without_a_possible_value_are_left_out():
     assert 'pressure' not in leg_of(leg, config).external
 
 
-def test_rows_vanish_at_the_truth_but_for_the_constants():
+def test_pressure_rows_vanish_at_the_truth_except_for_the_constants():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             **HILLS | {'pressure_sigma': 0.0})
     leg = replace(leg_of(drive.leg(), config), t_stop=60.0)
@@ -213,12 +213,12 @@ def test_rows_vanish_at_the_truth_but_for_the_constants():
     _, by_constants = part.jacobians(16)
     by = by_constants[:, 0, PRESSURE]
     left = part.raw[:, 0] - by @ np.linalg.lstsq(by, part.raw[:, 0], rcond=None)[0]
-    # a mean of twenty heights of a second, 4 m/s^2 up at most at a change of slope: 4 / 24 m
+    # mean of twenty heights in 1 s, 4 m/s^2 upwards at most at a change of slope: 4 / 24 m
     assert np.abs(left).max() < 4 / 24
     assert np.ptp(problem.external['pressure'].height) > 1.0
 
 
-def test_heights_sharpen_the_pitch_and_hold():
+def test_heights_improve_the_pitch_within_its_sigma():
     pitch, errors, gain = 'pitch_mounting_angle', [], []
     for seed in range(1, 7):
         drive, config, leg = made(**HILLY, seed=seed)
@@ -226,22 +226,22 @@ def test_heights_sharpen_the_pitch_and_hold():
         errors.append(off(found, drive, pitch))
         gain.append(sigma_of(found, pitch) / sigma_of(without, pitch))
         assert off(found, drive) < 3.3
-        # the air temperature is unknown by 15 K, 5 % of a height: no scale of metres
+        # the air temperature is unknown by 15 K, 5 % of a height: no scale information
         assert sigma_of(found) > 0.8 * sigma_of(without)
         assert 'air_pressure' in {s.name for s in found.sources}
-    # chi^2 of 6 at 1 in 1000. The vehicle is ideal: the sigma also holds for bodies that pitch
+    # chi^2 of 6 at 1 in 1000. The vehicle is ideal; the sigma also covers bodies that pitch
     assert np.sum(np.square(errors)) < 22.5
     assert np.median(gain) < 0.8
 
 
-def test_the_noise_level_is_found():
+def test_pressure_noise_level_is_found():
     level = smoothed(**HILLY | {'pressure_sigma': 0.3}, seed=3)[1].details['noise']['pressure']
-    # 240 means of a second: 1 / sqrt(2 * 240) of a sigma, and a mean over a second of hills
+    # 240 means of 1 s: 1 / sqrt(2 * 240) of a sigma, and a mean over 1 s of hills
     assert level == pytest.approx(1.0, abs=3.3 / np.sqrt(480))
 
 
 def test_doors_and_tunnels_are_outliers():
-    """A door that is slammed, a tunnel: 30 to 300 Pa for seconds."""
+    """A slammed door or a tunnel: 30 to 300 Pa for seconds."""
     drive, config, _ = made(**HILLY, seed=2)
     sent = drive.leg().rows('pressure')
     value = sent.value + np.where(np.arange(len(sent.value)) % 800 < 40, 300.0, 0.0)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the smoother's equations: derivatives, and that all they say of a step agrees."""
+"""Factors of the smoother: derivatives, and consistency of cost, step and likelihood."""
 
 from dataclasses import replace
 
@@ -25,18 +25,18 @@ from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow
 N = layout.SIZE_WITH_SLOW
-# clocks, and the delays they grow to
+# clock rates, and the delays they cause
 CLOCKS = {layout.GNSS_CLOCK: layout.GNSS_DELAY, layout.ODO_CLOCK: layout.ODO_DELAY}
 END = 60.0      # s
 COLUMNS = range(layout.M)
-# relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
-# and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order
+# relative errors neglected in derivatives. Motion: Earth rate times one second, 7e-5 rad, and
+# half the attitude residual, 2e-4. Fixes, velocity, heading: second order of a turn of 1e-3 rad
 LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'steps': 2e-3}
-# an arm's swing: at the mean turn rate of the second, and with no delay in it. Motion: a change of
-# speed at the mean of the directions at both ends, which a turn by 0.3 rad makes 0.3 / 12 rad of
+# rotation of a lever arm: at the mean turn rate of the second, without its delay. Motion: a change
+# of speed at the mean direction of both ends; a turn of 0.3 rad gives an error of 0.3 / 12 rad
 SWING = {'fixes': 1e-2, 'steps': 0.03, 'motion': 2e-3}
-# rows of a velocity have means of their second: right are those of all its rows, but for what the
-# second of a jump of turn rate, or of 2 m/s^2, has before and after it
+# derivatives of velocity rows are means over a second: correct for the mean of its rows, except
+# for motion before and after the second of a jump in turn rate, or of 2 m/s^2
 MEANS = dict.fromkeys((layout.YAW, layout.PITCH, *COLUMNS[layout.GNSS_ARM]), 0.02) | dict.fromkeys(
     (*COLUMNS[layout.GYRO], *COLUMNS[layout.ACCEL]), 0.13) | {layout.VELOCITY_DELAY: 0.1}
 
@@ -49,7 +49,7 @@ def by_second(rows, k):
 
 @pytest.fixture(scope='module')
 def moved():
-    """Return the problem of a leg with all sensors, and a state where no term vanishes."""
+    """Return the problem of a leg with all sensors, and a state in which no term vanishes."""
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
                             pressure_sigma=0.0, antenna_lever_arm=(0.5, -0.3, 1.2))
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=END,
@@ -61,12 +61,12 @@ def moved():
     c = 1e-3 * np.insert(rng.standard_normal(layout.M - 6), [
         layout.FIX_MOTION_TIME, *2 * [layout.BODY_TILT.start + 2],
         *3 * [layout.FIX_ERROR_BY_SIGMA.start - 3]], 1.0)
-    # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps or body
-    # of the size that there is: derivatives leave out how these change what the others do
+    # derivatives by biases treat these as constant over HILL_INTERVALS: no bump centre or body
+    # centre of real size, because derivatives neglect how they change the effect of the others
     c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
     c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
                                 0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3, 0.0, 0.0]
-    c[layout.FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
+    c[layout.FIX_LAG2] = 2.1e-4    # not zero, where the filter changes its type
     c[layout.VELOCITY_LAG2] = 2.1e-4
     return problem, state.updated(step, c)
 
@@ -101,7 +101,7 @@ def part_at(problem, state, name):
 
 # in a local frame the bias of the accelerometer turns with a robot
 @pytest.mark.parametrize(('name', 'local'), [*((name, False) for name in LOOSE), ('fixes', True)])
-def test_derivatives_are_those_of_finite_differences(moved, stepping, name, local, monkeypatch):
+def test_derivatives_equal_finite_differences(moved, stepping, name, local, monkeypatch):
     problem, state = stepping if name == 'steps' else moved
     if local:
         origin = replace(problem.leg.origin, local_earth_rate=rate_without_north(0.7))
@@ -118,10 +118,10 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name, loca
     if name == 'fixes':
         end[:, :, layout.SLOW] = -np.eye(3) * part.share[:, None, None]
     k = np.arange(len(part.raw)) if name == 'motion' else part.k
-    # every second keyframe moves: each row sees one end move only
+    # every second keyframe moves: each row has one moved end only
     even = np.arange(len(state.t)) % 2 == 0
     for i in range(N + layout.M):
-        if (i, name) == (N + layout.ODO_LAG2, 'motion'):   # of seconds: test_imu_steps.py
+        if (i, name) == (N + layout.ODO_LAG2, 'motion'):   # in seconds: test_imu_steps.py
             continue
         h = 1.0 if (i, name) == (layout.E, 'motion') else 1e-5 if name == 'motion' else 1e-4
         h /= END if i - N in CLOCKS else 1.0
@@ -140,12 +140,12 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name, loca
 
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
-        # g times the 1e-3 that another constant turns it by
+        # g times the 1e-3 by which another constant tilts it
         loose = 0.01 if name == 'steps' and i - N in COLUMNS[layout.ACCEL] else LOOSE[name]
         if i - N in (layout.GNSS_DELAY, layout.ODO_DELAY, *CLOCKS):
             loose = SWING.get(name, loose)
         found, size = (raw(h) - raw(-h)) / (2 * h), max(1.0, np.abs(expected).max())
-        if i - N in CLOCKS:         # a delay of so much at the end of the leg
+        if i - N in CLOCKS:         # the corresponding delay at the end of the leg
             size = max(1.0, END * np.abs(constants[:, :, CLOCKS[i - N]]).max())
         if name == 'velocity' and i - N in MEANS:
             found, expected, loose = by_second(found, k), by_second(expected, k), MEANS[i - N]
@@ -153,16 +153,16 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name, loca
     assert begin[:, :, layout.P].any() == (name in ('motion', 'fixes'))
 
 
-def test_the_way_of_a_speed_in_coarse_steps_tells_nothing_of_its_size(stepping):
+def test_path_of_a_speed_in_coarse_steps_does_not_determine_the_scale(stepping):
     problem, state = stepping
     by_constants = part_at(problem, state, 'motion').jacobians(N)[2]
     assert not by_constants[:, D, [layout.LN_K, layout.ODO_DELAY, layout.SPEED_OFFSET]].any()
     assert by_constants[:, D, layout.YAW].any()
 
 
-def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
+def test_path_excludes_the_offset_while_a_coarse_speed_moves(stepping):
     problem, state = stepping
-    # steps so fine that the way is heard, of the same way
+    # steps so fine that the path is used, with the same path
     problem = replace(problem, leg=replace(problem.leg, rough_scale=0.1))
     assert not problem.leg.uses_speed_steps
 
@@ -174,13 +174,13 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
     by_offset = part_at(problem, state, 'motion').jacobians(N)[2][:, :, layout.SPEED_OFFSET]
     np.testing.assert_allclose((raw(0.01) - raw(-0.01)) / 0.02, by_offset, atol=1e-9)
     moves = np.linalg.norm(by_offset, axis=1)
-    assert {0, 1} == set(np.rint(moves))        # seconds that moved, of each interval
+    assert {0, 1} == set(np.rint(moves))        # seconds in motion, of each interval
 
 
 @pytest.mark.parametrize('name', [part.name for part in FACTORS])
-def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, name):
+def test_cost_after_a_step_agrees_with_the_normal_equations(moved, stepping, name):
     problem, state = stepping if name == 'steps' else moved
-    # so wide that nothing lies far out: squares only
+    # sigmas so wide that there are no outliers: squares only
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
     levels = problem.initial_levels.replaced(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighted_copy(levels, layout.M)
@@ -188,7 +188,7 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     part.add(normal)
     rng = np.random.default_rng(2)
     x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(layout.M)
-    # the start is held, that the chain can be solved: no prior
+    # the start is fixed, otherwise the chain has no solution: no prior
     x[0, layout.P.start:layout.PHI.stop] = 0.0
     # H x by blocks of the chain
     Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.coupling @ c
@@ -198,14 +198,14 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     change = (x * Hx).sum() + c @ Hc - 2 * ((normal.g * x).sum() + normal.g_constants @ c)
     before = part.cost()
     part.apply_step(x, c, state.updated(x, c))
-    # standstills take their turns anew: of second order in 1e-3 rad
+    # standstills recompute their turns: second order in 1e-3 rad
     rel = 1e-2 if name == 'standstills' else 1e-6
     assert part.cost() - before == pytest.approx(change, rel=rel)
     assert change != 0.0
 
 
 @pytest.mark.parametrize('name', ['slow', 'slow_up', 'correlation_time'])
-def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
+def test_levels_of_correlated_errors_increase_the_restricted_likelihood(moved, name):
     problem, state = moved
     levels = problem.initial_levels.replaced(correlation_time=20.0, slow=0.01, slow_up=0.02,
                                            fix=1e4, fix_up=1e4, velocity=1.0)
@@ -213,7 +213,7 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
     weighted, solved, at = least(problem, state, levels)
     quadratic, expected = weighted[SlowError].components(solved.marginals())[name]
     score = (quadratic - expected) / 2
-    if name == 'correlation_time':      # a score as it is, and the prior of the time
+    if name == 'correlation_time':      # the score itself, and the prior of the time
         score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
     assert score == pytest.approx(slope(at, levels, name), rel=1e-3)
     assert abs(score) > 0.1
@@ -221,9 +221,9 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
 
 def least(problem, state, levels):
     """
-    Return rows and step near the least cost, where it does not change with the state.
+    Return rows and step near the minimum cost, where it does not change with the state.
 
-    And what gives them at other levels, with the logarithm of the restricted likelihood.
+    Also return a function of levels: rows, step and logarithm of the restricted likelihood.
     """
     def at(levels):
         weighted = Equations(problem, state).at(levels)
@@ -239,7 +239,7 @@ def least(problem, state, levels):
 
 
 def slope(at, levels, name):
-    """Return by how much the likelihood rises with the logarithm of a level."""
+    """Return the derivative of the likelihood by the logarithm of a level."""
     h = 1e-2      # at 1e-3 rounding of the cost is 1e-3 of the score
     above, below = (at(levels.replaced(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
     return (above - below) / (2 * h)
@@ -252,34 +252,34 @@ def sized(problem, where, sigma, mean):
     return replace(problem, priors=replace(problem.priors, sigma=sigmas, mean=means))
 
 
-# alone and two of a kind. The drive knows them to 1e-4 s^2 and 6e-4: of their priors by 1e-4
+# one alone and two of a kind. The drive determines them to 1e-4 s^2 and 6e-4, 1e-4 of the priors
 @pytest.mark.parametrize(('name', 'where', 'prior'), [
     ('size_fix_lag_square', layout.constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
     ('size_scale_by_force', layout.constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
-def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, name, where, prior):
+def test_sizes_of_observable_constants_are_the_mean_of_their_likelihood(moved, name, where, prior):
     problem, state = moved
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.initial_levels
     weighted, solved, at = least(problem, state, levels)
     found = weighted[PriorRows].sizes(solved.marginals())[name]
-    # 1.5 of the prior for each, against the log-normal prior of the size
+    # 1.5 of the prior for each, and the log-normal prior of the size
     logs = np.log(SIZE) + np.arange(-2.5, 5.0, 0.25)
     likelihood = np.array([at(levels.replaced(**{name: float(np.exp(x))}))[2] for x in logs])
     likelihood -= ((logs - np.log(SIZE)) / SIZE_SPREADS[name])**2 / 2
     p = np.exp(likelihood - likelihood.max())
     assert found == pytest.approx((np.exp(logs) * p).sum() / p.sum(), rel=0.01)
-    assert found > 1.5 * SIZE      # far from where it started
+    assert found > 1.5 * SIZE      # far from the initial value
 
 
-def test_what_the_drive_hardly_knows_has_no_say_in_its_size(moved):
+def test_size_of_a_weakly_observable_constant_keeps_its_prior(moved):
     problem, state = moved
     where = layout.CONSTANTS.index('squat_by_jerk')
-    # known to 1e-3 by the drive, to 7e-6 by the prior; a misfit pulls by 100 sigmas of the drive
+    # sigma 1e-3 by the drive, 7e-6 by the prior; a residual of 100 sigmas of the drive
     problem = sized(problem, where, 1e-5, 0.1)
     levels = problem.initial_levels
     weighted, solved, at = least(problem, state, levels)
     name = 'size_squat_by_jerk'
-    assert slope(at, levels, name) > 0.1         # the likelihood would have it grow
-    # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at the mean of its log-normal prior
+    assert slope(at, levels, name) > 0.1         # the likelihood increases with the size
+    # (7e-6 / 1e-3)^2 of that slope, 5e-5: the size stays at the mean of its log-normal prior
     assert weighted[PriorRows].sizes(solved.marginals())[name] == pytest.approx(
         SIZE * np.exp(SIZE_SPREADS[name]**2 / 2), rel=1e-3)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother's results on simulated legs: near the truth, from any start, refused where due."""
+"""Smoother results on simulated legs: near the truth, from any start, rejected if required."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -72,12 +72,12 @@ def test_outliers_among_the_fixes_are_reported(share):
 
 
 @pytest.mark.parametrize('start', ['scale', 'nothing stands', 'in motion'])
-def test_where_it_starts_from_does_not_matter(start):
+def test_initial_values_have_no_effect(start):
     _, config, leg = made(**SHORT)
     if start == 'scale':
         a, other = result()[1], replace(leg, rough_scale=1.3 * leg.rough_scale)
     else:
-        # the same samples, with and without a hint of what stands; sigmas differ by that hint
+        # the same samples, with and without information on standstills; the sigmas differ by it
         same = replace(leg, t_begin=25.0 if start == 'in motion' else leg.t_begin,
                        standstills=np.empty((0, 2)))
         a, other = smooth(same, config), replace(same, rough_scale=0.7 * leg.rough_scale)
@@ -88,7 +88,7 @@ def test_where_it_starts_from_does_not_matter(start):
 
 
 @pytest.mark.parametrize('yaw_deg', [40.0, -135.0])
-def test_a_large_mounting_angle_needs_no_guess(yaw_deg):
+def test_large_mounting_angle_needs_no_initial_value(yaw_deg):
     drive, method = result(yaw=np.deg2rad(yaw_deg))
     assert off(method, drive, *BOTH) < 3.3
     _, near = result()
@@ -97,7 +97,7 @@ def test_a_large_mounting_angle_needs_no_guess(yaw_deg):
     assert Code.YAW_FAR_FROM_NOMINAL in reason_texts(method) or abs(yaw_deg) > 90
 
 
-def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
+def test_stated_sigma_equals_the_bound_at_the_truth_and_the_sum_of_its_sources():
     drive, config, leg = made(**SHORT)
     _, method = result()
     details = method.details
@@ -109,14 +109,14 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
         Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
-    # linearised at the estimate or at the truth: the same but for heavy tails
+    # linearised at the estimate or at the truth: the same except for heavy tails
     stated = [scale.sigma / scale.value, method.estimates['yaw_mounting_angle'].sigma]
     assert stated == pytest.approx(sigma[:2], rel=0.03)
     total = np.sqrt(np.diag(total_covariance(method.sources)))
     assert stated == pytest.approx(total[:2], rel=1e-3)
 
 
-def test_an_uncertainty_that_model_errors_increase_is_explained():
+def test_uncertainty_increased_by_model_errors_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
     for uncertainty, text in ((1.0, ''),
@@ -126,13 +126,13 @@ def test_an_uncertainty_that_model_errors_increase_is_explained():
             FittedConstants(np.zeros(M), sigma, np.zeros(M), uncertainty), '1', 1.0, Config())
         texts = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
         assert len(texts) == bool(text)
-        # twice 0.4 deg exceeds the limit, 0.4 deg would not: motion is not what lacks
+        # twice 0.4 deg exceeds the limit, 0.4 deg does not: motion is sufficient
         assert all(text in one and 'the model errors' in one for one in texts)
         assert not text or {r.remedy for r in reasons if r.code in (
             Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED)} == {OTHER_WARNINGS}
 
 
-def test_an_even_drive_straight_on_tells_no_yaw():
+def test_straight_drive_at_constant_speed_does_not_determine_the_yaw():
     drive, config, leg = made(scenario='straight', duration=300.0, imu_grade='industrial')
     middle = replace(leg, t_begin=40.0, t_stop=145.0, standstills=np.empty((0, 2)))
     method = smooth(middle, config)
@@ -143,7 +143,7 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     assert off(method, drive) < 3.3
 
 
-def test_an_imu_said_to_be_without_noise_is_not_taken_so():
+def test_imu_configured_without_noise_still_has_noise():
     drive, config, leg = made(**SHORT)
     zero = with_settings(config, {f'imu.{name}': 0.0 for name in (
         'gyro_noise', 'gyro_bias', 'gyro_bias_walk', 'accel_noise', 'accel_bias',
@@ -153,47 +153,47 @@ def test_an_imu_said_to_be_without_noise_is_not_taken_so():
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_an_imu_that_is_silent_at_rest_is_not_taken_for_perfect():
+def test_imu_without_signal_at_rest_is_not_treated_as_perfect():
     drive, config, leg = made(**SHORT)
     w_b, f_b = leg.w_b.copy(), leg.f_b.copy()
-    for begin, end in leg.standstills:      # as one with a dead band, or a simulator's
+    for begin, end in leg.standstills:      # as with a dead band, or in a simulator
         rest = (leg.t_imu >= begin) & (leg.t_imu <= end)
         w_b[rest], f_b[rest] = 0.0, f_b[rest].mean(axis=0)
     method = smooth(replace(leg, w_b=w_b, f_b=f_b), config)
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_the_gyro_scale_has_the_configured_sigma():
+def test_gyro_scale_has_the_configured_sigma():
     _, config, leg = made(**SHORT)
     for required, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         asking = with_settings(config, {'imu.gyro_scale_sigma': required})
         assert make_problem(leg, asking).priors.sigma[GYRO.start] == prior
 
 
-def test_an_imu_worse_than_its_grade_is_said():
+def test_imu_worse_than_its_grade_is_reported():
     drive, config, _ = made(**SHORT)
     rng = np.random.default_rng(5)
     shaking = changed(drive.imu, f_i=lambda f: f + 0.1 * rng.standard_normal(f.shape))
     method = smooth(leg_of(replace(drive.leg(), imu=shaking), config), config)
     reason = next(r for r in method.reasons if r.code is Code.IMU_WORSE_THAN_GRADE)
-    assert 'gyro' not in reason.text + reason.remedy      # which is not what shakes
+    assert 'gyro' not in reason.text + reason.remedy      # the gyro does not vibrate
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_what_still_moves_far_widens_by_as_much():
+def test_last_step_of_an_unconverged_fit_widens_the_sigma():
     _, config, leg = made(**SHORT)
     problem = make_problem(leg, config)
     start = cold_start(leg, problem.imu, problem.priors).state
-    start.constants[YAW] += 0.1         # far off, and but one pass
+    start.constants[YAW] += 0.1         # far from the solution, with one pass only
     method = make_result(leg, problem, fit(problem, start, problem.initial_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',
                            reason_texts(method)[Code.MODEL_MISMATCH])[1])
     assert move > 10.0
-    assert method.details['widened'] == pytest.approx(4 * move, rel=0.05)      # said by two digits
+    assert method.details['widened'] == pytest.approx(4 * move, rel=0.05)      # 2 digits
 
 
-def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
-    """A false minimum: an out-and-back of the zoo had its pitch 12 sigmas off."""
+def test_fit_with_impossible_imu_errors_gives_no_values(monkeypatch):
+    """A false minimum: in an out-and-back drive of the zoo the pitch deviated by 12 sigmas."""
     _, config, leg = made(duration=150.0)
     for wrong, refused in ((0.19, False), (0.21, True)):
         c = np.zeros(M)
@@ -209,7 +209,7 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     assert 'accelerometer scale y of -21 %, impossible for an IMU (limit 20 %)' in reason.text
 
 
-def test_equations_without_a_solution_say_the_time(monkeypatch):
+def test_equations_without_a_solution_report_the_time(monkeypatch):
     _, config, leg = made(duration=100.0)
     normal = Weighted.normal
 
@@ -226,10 +226,10 @@ def test_equations_without_a_solution_say_the_time(monkeypatch):
 
 
 @pytest.mark.parametrize(('times', 'is_reported'), [(30.0, False), (200.0, True)])
-def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, is_reported):
+def test_turn_on_bias_of_imus_as_sold_is_not_a_worse_grade(times, is_reported):
     drive, config, _ = made(**SHORT)
     config = with_settings(config, {'imu.grade': 'industrial'})
-    bias = times * np.radians(20.0) / 3600.0        # rad/s: of the grade's; sold with 0.1 deg/s
+    bias = times * np.radians(20.0) / 3600.0        # rad/s; IMUs as sold: 0.1 deg/s
     turning = changed(drive.imu, w_i=lambda w: w + [0.0, bias, 0.0])
     method = smooth(leg_of(replace(drive.leg(), imu=turning), config), config)
     assert (Code.IMU_WORSE_THAN_GRADE in reason_texts(method)) == is_reported

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slip of a wheel, by two_point and in the smoother: its reason, place and uncertainty."""
+"""Wheel slip, by two_point and in the smoother: its reason, place and uncertainty."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 
 def slipping(leg, begin, length, share):
-    """Return a leg whose wheel turns more by a share for some seconds, and by how much, m."""
+    """Return a leg whose wheel turns more by a share for some seconds, and by how many counts."""
     t, s = leg.travel.t, leg.travel.s
     spun = np.cumsum(np.diff(s, prepend=s[0]) * ((t >= begin) & (t < begin + length)) * share)
     travel = Travel(t, np.floor(s + spun + 0.5), leg.travel.quantum)
@@ -45,22 +45,22 @@ def reason_text(method, code=Code.WHEEL_SLIP):
 @pytest.mark.parametrize(('noise', 'begin', 'length', 'share'), [
     ('white', 100.0, 3.0, 0.1), ('white', 100.0, 10.0, 0.05), ('rtk', 60.0, 10.0, 0.1),
     ('rtk', 100.0, 10.0, 0.3)])
-def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share):
+def test_slip_of_seconds_is_reported_with_place_and_size(noise, begin, length, share):
     drive, config, leg = made(**SHORT, fix_noise=noise)
     leg, pulses = slipping(leg, begin, length, share)
     method = smooth(leg, config)
     assert off(method, drive) < 3.3
     slips = method.details['slips']
     metres = sum(s['metres'] for s in slips if begin - 2.0 <= s['t'] <= begin + length)
-    # intervals of a second that slip in part are not all told: nine tenths, and the accelerometer
-    # knows a way of 10 s to some decimetres
+    # intervals that slip for a part of their second are found to nine tenths; the accelerometer
+    # determines a path of 10 s to some decimetres
     assert metres == pytest.approx(pulses * drive.truth.scale, rel=0.25, abs=0.3)
     assert begin - 2.0 <= slips[0]['t'] <= begin + length
     assert f'{slips[0]["metres"]:+.2f} m at t = {slips[0]["t"]:.0f} s' in reason_text(method)
 
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
-def test_slip_at_starts_is_said(noise):
+def test_slip_at_starts_is_reported(noise):
     drive, method = smoothed(**SHORT, fix_noise=noise, start_slip=0.005)
     assert 'slip while accelerating or braking' in reason_text(method)
     assert not reason_text(method, Code.SPEED_FILTERED)
@@ -72,12 +72,12 @@ def test_slip_at_starts_is_said(noise):
     {'odometer': 'speed', 'speed_noise': 0.05, 'odometer_rate': 10.0, 'sway': 0.05,
      'fix_noise': 'rtk'}, {'odometer_delay': 0.3}, {'scale': 0.3, 'nominal_scale': 0.3},
     {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
-def test_wheels_that_hold_without_a_filter_are_not_blamed_for_either(options):
+def test_wheels_without_slip_and_without_a_filter_have_no_reasons(options):
     assert not {Code.WHEEL_SLIP,
                 Code.SPEED_FILTERED} & set(reason_texts(smoothed(**SHORT, **options)[1]))
 
 
-def shaken(leg):
+def vibrating(leg):
     """Return a leg with vibration of 70 Hz + 4 Hz per m/s, sampled at 100 Hz without a filter."""
     t, rng = leg.t_imu, np.random.default_rng(1)
     speed = np.abs(np.gradient(leg.travel.at(t), t)) * leg.rough_scale
@@ -88,9 +88,9 @@ def shaken(leg):
 
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
-def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
+def test_aliased_vibration_is_an_imu_error_and_not_slip(noise):
     drive, config, leg = made(**SHORT, fix_noise=noise)
-    method = smooth(shaken(leg), config)
+    method = smooth(vibrating(leg), config)
     assert not reason_text(method)
     assert 'aliasing' in ' '.join(r.remedy for r in method.reasons
                                   if r.code is Code.IMU_WORSE_THAN_GRADE)
@@ -98,24 +98,24 @@ def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
 
 
 @pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
-def test_a_shock_of_a_short_drive_is_no_vibration(seconds, reported):
+def test_shock_in_a_short_drive_is_not_vibration(seconds, reported):
     spread = np.ones((60, VARIANCE_FACTOR_COUNT))
     spread[:seconds, ACCEL_NOISE] = 100.0
     fit = SimpleNamespace(variance_factors=spread, levels={'accel': 0.005**2})
     assert bool(mismatch._accelerometer_outlier_reasons(fit)) == reported
 
 
-def test_a_level_that_no_row_determines_is_not_reported():
-    """12 m/s in 40 s: no second speeds up by more than 0.5 m/s^2, where wheels may slip."""
+def test_level_without_information_is_not_reported():
+    """12 m/s in 40 s: no second has more than 0.5 m/s^2, from where wheels may slip."""
     drive = by_hand(lambda duration, rng: routes._route([
         (hold(30) + ramp(40, 12, 1.0) + hold(60) + ramp(40, -12, 1.0) + hold(20), hold(190))]))
     config = settings(drive, None)
     method = smooth(leg_of(drive.leg(), config), config)
-    assert method.details['noise']['along_hard'] == pytest.approx(0.01)     # where the fit began
+    assert method.details['noise']['along_hard'] == pytest.approx(0.01)     # initial value
     assert not reason_text(method)
 
 
-def test_travel_that_a_counter_loses_without_braking_is_no_slip():
+def test_travel_lost_by_a_counter_without_braking_is_not_slip():
     """A wheel that travels less than the vehicle slides, and brakes it."""
     drive, config, leg = made(**SHORT, fix_noise='rtk')
     t = np.arange(40.0, 150.0)
@@ -132,14 +132,14 @@ def test_travel_that_a_counter_loses_without_braking_is_no_slip():
 @pytest.mark.parametrize(('begin', 'metres', 'acceleration', 'sign'), [
     (10.0, 0.5, 1.0, 0), (10.0, 0.5, -2.0, 0), (10.0, -0.5, 1.0, -1), (10.0, -0.5, 0.0, -1),
     (10.0, -0.5, -0.3, -1), (10.0, -0.5, -2.0, 0), (4.0, 0.5, -2.0, 1), (4.0, -0.5, -2.0, 0)])
-def test_a_wheel_slips_only_as_a_force_makes_it(begin, metres, acceleration, sign, forward):
+def test_wheel_slips_only_in_the_direction_of_a_force(begin, metres, acceleration, sign, forward):
     t = np.arange(0.0, 20.0, 1.0)
     speed = begin + acceleration * np.clip(t - 9.0, 0.0, 2.0)
     assert unforced_sign(9.0, 2.0, forward * metres, t, forward * speed) == sign
 
 
-def test_a_speed_that_is_held_before_stops_is_no_slip():
-    """A wheel sensor that is silent below 0.5 m/s; the bus repeats its last value for 2 s."""
+def test_held_speed_before_stops_is_not_slip():
+    """A wheel sensor without output below 0.5 m/s; the bus repeats its last value for 2 s."""
     drive = simulate(SimOptions(scenario='town', seed=100, duration=300.0, imu_rate=50.0,
                                 odometer='speed', odometer_rate=10.0, imu_grade='industrial',
                                 fix_noise='rtk', fix_sigma=0.02))
@@ -165,31 +165,31 @@ def low_passed(leg, seconds):
     return replace(leg, travel=Travel(t, np.floor(s), leg.travel.quantum))
 
 
-def test_what_a_filter_leaves_when_the_speed_changes_is_no_slip():
-    """Three filters one after the other: of no first order, whose shape is taken out."""
+def test_residual_of_a_filter_at_speed_changes_is_not_slip():
+    """Three filters in series: not of first order, the type that the fit models."""
     _, config, leg = made(**SHORT, fix_noise='rtk')
     for _ in range(3):
         leg = low_passed(leg, 0.2)
     method = smooth(leg, config)
     assert reason_text(method, Code.SPEED_FILTERED)
     noise = method.details['noise']
-    # m/sqrt(s), what changes of speed add
+    # m/sqrt(s), from changes of speed
     assert np.sqrt(noise['along_hard']**2 - noise['along']**2) > 0.006
     assert not reason_text(method)
 
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
-def test_a_low_pass_filter_is_named_and_no_slip(noise):
+def test_low_pass_filter_is_named_and_is_not_slip(noise):
     _, config, leg = made(**SHORT, fix_noise=noise)
     method = smooth(low_passed(leg, 0.4), config)
-    # the fit's delay and noise take some of it
+    # the delay and the noise levels of the fit include a part of it
     seconds = reason_text(method, Code.SPEED_FILTERED).split('about ')[1].split(' s')[0]
     assert float(seconds) == pytest.approx(0.4, abs=0.04)
     assert not reason_text(method)
     assert not method.details['slips']
 
 
-def test_slip_of_a_filtered_odometer_is_said():
+def test_slip_of_a_filtered_odometer_is_reported():
     drive, config, leg = made(**SHORT)
     slipped, pulses = slipping(leg, 100.0, 3.0, 0.2)
     method = smooth(low_passed(slipped, 0.4), config)
@@ -199,7 +199,7 @@ def test_slip_of_a_filtered_odometer_is_said():
     assert 98.0 <= first['t'] <= 103.0
 
 
-def test_names_of_parameters_in_words():
+def test_parameter_names_in_reasons_are_words():
     arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
     assert join_names(arm) == 'the antenna lever arm'
     assert join_names(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
@@ -216,16 +216,16 @@ def slips(leg):
 
 
 @pytest.mark.parametrize('seed', [1, 2, 5])
-def test_spins_are_named_and_the_sigma_holds_what_they_did(seed):
+def test_spins_are_named_and_the_sigma_includes_their_effect(seed):
     made, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0, seed=seed)
     (reason,) = slips(leg)
     assert 'place' in reason.text
     scale = leg.methods['two_point'].estimates['scale_factor']
     assert abs(scale.value - made.truth.scale) < 2 * scale.sigma
     slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
-    assert slip.effects.shape[1] == 1       # spins add up rather than average
+    assert slip.effects.shape[1] == 1       # spins add up, they do not average down
     assert not slip.shared
-    # all spins together: about what they moved the scale by, within the two ends' fix noise
+    # all spins together: about their effect on the scale, within the fix noise of the two ends
     off = abs(scale.value / made.truth.scale - 1)
     assert abs(np.linalg.norm(slip.effects[0]) - off) < 0.5 * off + 1e-4
 
@@ -235,12 +235,12 @@ def test_spins_are_named_and_the_sigma_holds_what_they_did(seed):
     {'scenario': 'straight', 'slope': 0.15}, {'scenario': 'town', 'imu_grade': 'tactical'},
     {'scenario': 'straight', 'scale': 0.35, 'nominal_scale': 0.35},
     {'scenario': 'straight', 'odometer_delay': 0.1}])
-def test_no_slip_is_seen_where_there_is_none(options):
+def test_drive_without_slip_has_no_slip_reason(options):
     assert not slips(result(**options)[1])
 
 
-def held_up(leg, seconds, how):
-    """Return a leg whose speeds come late, or low-passed with that time constant."""
+def delayed(leg, seconds, how):
+    """Return a leg whose speeds are late, or low-passed with that time constant."""
     sent = leg.odometer
     if how == 'late':
         return replace(leg, odometer=replace(sent, stamp_ns=sent.stamp_ns + round(seconds * 1e9)))
@@ -252,28 +252,28 @@ def held_up(leg, seconds, how):
 
 
 @pytest.mark.parametrize('how', ['late', 'low pass'])
-def test_a_late_or_filtered_odometer_is_named_and_no_slip(how):
+def test_late_or_filtered_odometer_is_named_and_is_not_slip(how):
     made = drive(scenario='town', odometer='speed', seed=3, duration=300.0)
-    leg = calibrate(held_up(made.leg(), 0.4, how), settings(made, None))
+    leg = calibrate(delayed(made.leg(), 0.4, how), settings(made, None))
     assert not slips(leg)
     (text,) = (r.text for r in leg.reasons if r.code is Code.DELAY_SEEN)
-    # to the grid of 0.05 s, for a filter to the second order of its time
+    # to the grid of 0.05 s; for a filter to second order of its time
     assert float(text.split('about ')[1].split(' s')[0]) == pytest.approx(0.4, abs=0.06)
     assert 'odometer.time_offset = -0.' in text
 
 
 @pytest.mark.parametrize('how', ['late', 'low pass'])
-def test_spins_are_found_of_a_late_or_filtered_odometer(how):
+def test_spins_of_a_late_or_filtered_odometer_are_found(how):
     made = drive(scenario='straight', odometer='speed', slip_events=30.0, slip_size=1.0, seed=2)
     (sound,), (reason,) = (slips(calibrate(leg, settings(made, None))) for leg in (
-        made.leg(), held_up(made.leg(), 0.4, how)))
+        made.leg(), delayed(made.leg(), 0.4, how)))
     found, expected = (r.text.split('in total at ')[1].split(' place')[0] for r in (reason, sound))
     assert found == expected
 
 
 @pytest.mark.parametrize(('slip', 'bends'), [(1.0, False), (0.0, False), (0.0, True)])
-def test_a_bend_to_and_fro_is_no_slip(slip, bends):
-    """Two lanes across and back within a window: a yaw of 3 deg left out, turns press ahead."""
+def test_lane_change_and_return_is_not_slip(slip, bends):
+    """Two lanes across and back in a window: a neglected yaw of 3 deg gives a forward force."""
     t, speed, off = np.arange(0.0, 60.0, 0.02), 12.0, np.deg2rad(3.0)
     there = (t > 30) & (t < 34)
     rate = np.where(there & bends, 0.7 * np.sin(2 * np.pi * (t - 30) / 4), 0.0)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Each wheel beside the mean of both: ratio and track width on simulated drives, and refusals."""
+"""Both wheels separately: ratio and track width on simulated drives, and refusals."""
 
 from dataclasses import replace
 
@@ -27,19 +27,19 @@ SCALE = Estimate(0.02, 2e-6, 'm/pulse')
 
 @cached
 def result_of(given=0.0, **options):
-    """Return a drive and what the smoother says of it."""
+    """Return a drive and the result of the smoother."""
     made = drive(**TOWN | options)
     return made, smoothed(made, odometer__track_width=given)
 
 
 def smoothed(made, leg=None, **more):
-    """Return what the smoother says of a drive, or of its leg when changed."""
+    """Return the result of the smoother for a drive, or for its leg when changed."""
     config = settings(made, method='smoother', **more)
     return calibrate(leg or made.leg(), config).methods['smoother']
 
 
 def ratio_off(made, method):
-    """Return the error of right by left, relative, and its sigma."""
+    """Return the relative error of right over left, and its sigma."""
     left, right = (method.details['wheels'][side] for side in ('left', 'right'))
     true = made.truth.wheel_scales[1] / made.truth.wheel_scales[0]
     return right['ratio'] / left['ratio'] / true - 1, 2 * left['ratio_sigma']
@@ -59,7 +59,7 @@ def test_factors_and_width_are_within_their_sigmas(options):
     made, method = result_of(**options)
     found = method.estimates
     assert off(found, made, *SCALES, 'track_width') < SIGMAS
-    # 1 ppm of the ratio: what the attitudes err between the ends, 1 mrad by 0.8 m in 1300 m
+    # 1 ppm of the ratio: attitude errors between the ends, 1 mrad by 0.8 m in 1300 m
     error, sigma = ratio_off(made, method)
     assert abs(error) < SIGMAS * np.hypot(sigma, 1e-6)
     assert found['track_width'].sigma < 0.03 * found['track_width'].value
@@ -67,18 +67,18 @@ def test_factors_and_width_are_within_their_sigmas(options):
     assert mean == pytest.approx(found['scale_factor'].value, rel=1e-8)
 
 
-def test_the_sigma_of_the_ratio_is_that_of_the_walk():
-    """Wheels that slip by 10 mm/sqrt(s) each: of right by left sqrt(2 T) 10 mm in the path."""
+def test_sigma_of_the_ratio_is_that_of_the_random_walk():
+    """Wheels with slip of 10 mm/sqrt(s) each: right minus left has sqrt(2 T) 10 mm in the path."""
     made, method = result_of(seed=7, slip_walk=0.01)
-    driven = 280.0 - 2 * 10.0       # s from the start mark on, about: stops and rest are not
+    driven = 280.0 - 2 * 10.0       # s from the start mark, about: without stops
     expected = np.sqrt(2 * driven) * 0.01 / made.truth.distance
     _, sigma = ratio_off(made, method)
-    # a level by 200 increments is good to a tenth, the time driven to a fifth
+    # a level from 200 increments has an error of a tenth, the time driven of a fifth
     assert sigma == pytest.approx(expected, rel=0.4)
 
 
-def test_wheels_of_unlike_counters_have_factors_of_their_own():
-    """Right counts twice as often: the counters' mean is not that of both sides, K is its own."""
+def test_wheels_with_different_counters_have_separate_factors():
+    """Right counts twice as often: the mean of the counters is not that of both sides."""
     made, _ = result_of(seed=1)
     leg = made.leg()
     method = smoothed(made, replace(leg, odometer_right=changed(
@@ -91,7 +91,7 @@ def test_wheels_of_unlike_counters_have_factors_of_their_own():
     assert off(method, made, 'track_width') < SIGMAS
 
 
-def test_what_a_gap_of_one_wheel_hides_is_not_in_the_ratio():
+def test_travel_in_a_gap_of_one_wheel_does_not_affect_the_ratio():
     made, _ = result_of(seed=1)
     leg = made.leg()
     t = (leg.odometer.stamp_ns - leg.start_ns) * 1e-9
@@ -102,7 +102,7 @@ def test_what_a_gap_of_one_wheel_hides_is_not_in_the_ratio():
     assert abs(error) < SIGMAS * np.hypot(sigma, 1e-6) < 5e-5
 
 
-def test_a_straight_way_tells_the_ratio_and_no_track_width():
+def test_straight_path_determines_the_ratio_and_not_the_track_width():
     made, method = result_of(scenario='straight', seed=3)
     assert method.estimates['track_width'].value is None
     assert Code.TRACK_WIDTH_NOT_DETERMINED in codes(method)
@@ -111,9 +111,9 @@ def test_a_straight_way_tells_the_ratio_and_no_track_width():
     assert method.estimates['scale_factor_left'].value is not None
 
 
-def test_a_width_that_is_given_counts_as_taped():
+def test_configured_width_counts_as_measured_by_tape():
     made, method = result_of(scenario='straight', seed=3, given=1.6)
-    assert method.estimates['track_width'].value is None      # no more than the tape
+    assert method.estimates['track_width'].value is None      # not more accurate than the tape
     assert not {Code.TRACK_WIDTH_NOT_DETERMINED, Code.TRACK_WIDTH_FAR_FROM_GIVEN} & codes(method)
     left, right = (method.details['wheels'][side] for side in ('left', 'right'))
     assert left['y'] - right['y'] == pytest.approx(1.6, abs=0.02 * 1.6)
@@ -122,22 +122,22 @@ def test_a_width_that_is_given_counts_as_taped():
     assert abs(error) < SIGMAS * sigma
 
 
-def test_a_width_is_no_better_than_the_turns_are_known():
-    """By fixes of 30 m the gyro alone tells the turns: a scale off by 1 % is in the width."""
+def test_width_is_no_better_than_the_turns_are_known():
+    """With fixes of 30 m only the gyro measures turns: its scale error of 1 % is in the width."""
     made = drive(**TOWN | {'imu_grade': 'consumer', 'seed': 4, 'fix_sigma': 30.0,
                            'gyro_scale_error': 0.01})
     method = smoothed(made, gnss__max_sigma=100.0)
     assert off(method, made, 'track_width') < SIGMAS
     width = method.estimates['track_width']
     sold = GRADES['consumer'].gyro_scale_error
-    # the drive knows a little of it: heading at the ends to some degrees of 360 and more
+    # the drive gives some information: heading at the ends to some degrees of 360 and more
     assert 0.2 * sold < width.sigma / width.value < 1.2 * sold
 
 
-# what is said of them
+# statement of wheel values
 
 def pair(delta=2e-3, sigma=1e-6, width=1.6, width_sigma=1e-3):
-    """Return two wheels, mirrored as lines of one pair are."""
+    """Return two wheels with mirrored values, as the lines of one pair have."""
     return {name: Wheel(1 / (1 + side * delta), sigma, side * width / 2, width_sigma / 2, (1e-3,))
             for name, side in zip(SIDES, (1, -1), strict=True)}
 
@@ -148,7 +148,7 @@ def estimate(wheels, scale=SCALE, **changed_settings):
     return wheel_result.wheel_estimates(SIDES, wheels, scale, config)
 
 
-def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
+def test_sigma_of_a_wheel_combines_scale_and_ratio():
     found, reasons = estimate(pair(sigma=2e-4))
     assert reasons == []
     left = found['scale_factor_left']
@@ -157,8 +157,8 @@ def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
     assert (found['track_width'].value, found['track_width'].sigma) == pytest.approx((1.6, 1e-3))
 
 
-def test_wheels_that_are_not_known_are_not_stated_and_said():
-    # right by left is off by twice what either is off: 2.5 % is half of 5 %
+def test_undetermined_wheels_are_not_stated_but_reported():
+    # the ratio has twice the relative error of a wheel: 2.5 % is half of 5 %
     near, _ = estimate(pair(sigma=0.0124))
     assert near['scale_factor_left'].value is not None
     for wheels, text in ((pair(sigma=0.0126), '2.5 %'), ({}, 'is not known')):
@@ -166,24 +166,24 @@ def test_wheels_that_are_not_known_are_not_stated_and_said():
         assert found == wheel_result.unknown_wheels(SIDES, 'm/pulse')
         assert reason.code is Code.WHEELS_NOT_SEPARABLE
         assert text in reason.text
-    # why there is no scale the method says itself
+    # the method itself reports why there is no scale
     unknown = Estimate(None, None, '1')
     assert estimate(pair(), unknown) == (wheel_result.unknown_wheels(SIDES, '1'), [])
 
 
 @pytest.mark.parametrize(('width', 'sigma', 'given', 'code'), [
     (1.6, 0.1, 0.0, Code.TRACK_WIDTH_NOT_DETERMINED),       # 5 % is the limit
-    (0.05, 1e-3, 0.0, Code.TRACK_WIDTH_NOT_DETERMINED),     # no less than 0.1 m
+    (0.05, 1e-3, 0.0, Code.TRACK_WIDTH_NOT_DETERMINED),     # at least 0.1 m
     (-1.6, 1e-3, 0.0, Code.TRACK_WIDTH_NOT_DETERMINED),
-    (1.6, 0.017, 1.6, None)])                               # the tape knows it to 0.032 m
-def test_a_width_that_is_not_known_is_not_stated(width, sigma, given, code):
+    (1.6, 0.017, 1.6, None)])                               # known from the tape to 0.032 m
+def test_undetermined_width_is_not_stated(width, sigma, given, code):
     found, reasons = estimate(pair(width=width, width_sigma=sigma), odometer__track_width=given)
     assert found['track_width'].value is None
     assert found['scale_factor_left'].value is not None
     assert [r.code for r in reasons] == ([code] if code else [])
 
 
-def test_a_width_far_from_the_one_given_is_said():
+def test_width_far_from_the_configured_one_is_reported():
     found, (reason,) = estimate(pair(width=1.72), odometer__track_width=1.6)
     assert found['track_width'].value == pytest.approx(1.72)
     assert reason.code is Code.TRACK_WIDTH_FAR_FROM_GIVEN
@@ -195,7 +195,7 @@ def leg_of(wheels):
     return MethodResult('smoother', (), {}, details=wheel_result.wheel_details(wheels))
 
 
-def test_several_legs_are_a_mean_by_variance():
+def test_several_legs_are_averaged_by_variance():
     one, other = pair(delta=2e-3, sigma=1e-5), pair(delta=2.01e-3, sigma=2e-5, width=1.601)
     left, right = wheel_result.combine_wheels([leg_of(one), leg_of({}), leg_of(other)]).values()
     weight = np.array([4.0, 1.0]) / 5
@@ -209,5 +209,5 @@ def test_several_legs_are_a_mean_by_variance():
 def test_legs_that_differ_widen_the_sigma():
     legs = [leg_of(pair(delta=delta, sigma=1e-5)) for delta in (1e-3, 2e-3, 3e-3)]
     left, _ = wheel_result.combine_wheels(legs).values()
-    # 1 permille apart beside 10 ppm: their scatter decides
+    # 0.1 % apart beside 10 ppm: their scatter dominates
     assert left.ratio_sigma == pytest.approx(1e-3 / np.sqrt(3), rel=0.01)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A vehicle with two axles on uneven ground, simulated here: its frame is that of the contacts."""
+"""A two-axle vehicle on uneven ground, simulated here: its frame is that of the contacts."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.slow
 WHEELBASE, MOUNTING = 2.8, 0.02    # m, pitch in rad
-STEP = 0.0025   # s, of the truth: four to a sample of the IMU
+STEP = 0.0025   # s, of the truth: four per IMU sample
 
 
 def by_time(x):
@@ -30,7 +30,7 @@ def ground(east, north):
 
 
 def figures_of_eight():
-    """Return a leg with loops of 18 m, exact, and its mean roll to the right, rad."""
+    """Return a leg with loops of 18 m, without errors, and its mean roll to the right, rad."""
     t = np.arange(0.0, 260.0, STEP)
     pace = np.interp(t, [0, 20, 30, 240, 250, 260], [0, 0, 1, 1, 0, 0])
     pace = np.convolve(np.pad(pace, 400, mode='edge'), np.full(801, 1 / 801), 'valid')
@@ -64,12 +64,12 @@ def figures_of_eight():
     return leg, np.arctan2(up_v[1], up_v[2])
 
 
-def test_ground_that_rolls_the_vehicle_in_the_mean_does_not_change_the_pitch():
-    """The roll of the IMU is the mean of the leg, here 0.3 deg off; pitch was 5.9 sigma off."""
+def test_ground_with_a_mean_roll_does_not_change_the_pitch():
+    """IMU roll is the mean roll of the leg, here 0.3 deg wrong; pitch was wrong by 5.9 sigma."""
     leg, roll = figures_of_eight()
     assert abs(roll) > 0.005
     config = with_settings(Config(), {'imu.grade': 'tactical'})
     fit = best_fit(make_problem(leg, config), config)
-    # without noise, but for the prior of the centre of pitch
+    # without noise, except for the prior of the centre of pitch
     assert abs(fit.state.constants[PITCH] - MOUNTING) < 1.5 * np.sqrt(fit.covariance[PITCH, PITCH])
     assert fit.state.constants[LIFT] == pytest.approx(WHEELBASE / 2 * roll, rel=0.1)
