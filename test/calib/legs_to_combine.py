@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs to combine: linear ones whose batch solution is known, and those of the smoother."""
+"""Legs to combine: linear legs with a known batch solution, and legs of the smoother."""
 
 from dataclasses import replace
 
@@ -19,33 +19,33 @@ STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 
 
 class Toy:
-    """Legs of linear rows of unit variance: b = A (states) + B (constants) + noise."""
+    """Legs of linear rows with unit variance: b = A (states) + B (constants) + noise."""
 
     def __init__(self, rng, legs=LEGS, states=STATES, rows=ROWS):
         self.A = rng.standard_normal((legs, rows, states))
         self.B = rng.standard_normal((legs, rows, len(NAMES)))
-        self.B[:, :, 0] *= 100.0          # much information on ln K
-        # one leg is blind to z0 and to z1 - z2, another to k
+        self.B[:, :, 0] *= 100.0          # much information about ln K
+        # one leg does not observe z0 and z1 - z2, another does not observe k
         self.B[1, :, 1] = 0.0
         self.B[1, :, 3] = -self.B[1, :, 2]
         self.B[2, :, 0] = 0.0
         self.draw(rng)
 
     def draw(self, rng, constants=None):
-        """Draw the noise, and the states where it matters not."""
+        """Draw the noise and arbitrary states."""
         constants = np.tile(TRUTH, (len(self.A), 1)) if constants is None else constants
         self.b = np.einsum('jrc,jc->jr', self.B, constants) + rng.standard_normal(self.B.shape[:2])
         return self
 
     def walk(self, rng, change=0.0, since=3):
-        """Draw with a random walk of the first constant, which also changes once."""
+        """Draw a random walk of the first constant, with one additional step change."""
         constants = np.tile(TRUTH, (len(self.A), 1))
         constants[1:, 0] += np.cumsum(STEPS * rng.standard_normal(len(STEPS)))
         constants[since:, 0] += change
         return self.draw(rng, constants)
 
     def border(self, j, about=None):
-        """Return the border of a leg, linearised somewhere."""
+        """Return the marginal information of a leg at a linearisation point."""
         A, B, b = self.A[j], self.B[j], self.b[j]
         about = TRUTH + 0.1 * j if about is None else about
         free = B - A @ np.linalg.lstsq(A, B, rcond=None)[0]
@@ -57,9 +57,9 @@ class Toy:
 
     def batch(self, steps=STEPS, own=()):
         """
-        Return value and covariance of the last leg's constants by one dense fit of all rows.
+        Return value and covariance of the constants of the last leg by one dense fit of all rows.
 
-        own : (index, sigma) of constants that have an error of their own in each leg.
+        own : (index, sigma) of constants with a separate error in each leg.
         """
         J, R, n = self.A.shape
         z, k, d = J * n, J * n + len(NAMES) - 1, J * n + len(NAMES) - 1 + J
@@ -86,15 +86,15 @@ class Toy:
 
 
 def largest_deviation(a, b, covariance):
-    """Return the largest difference of two solutions, in sigmas."""
+    """Return the largest difference between two solutions, in sigmas."""
     return np.abs((a - b) / np.sqrt(np.diag(covariance))).max()
 
 
-NO_SCATTER = 1e-9, 1e-9, 1e-9       # of ln K, yaw and pitch between legs
+NO_SCATTER = 1e-9, 1e-9, 1e-9       # sigma of the change of ln K, yaw and pitch between legs
 
 
 def moved(result, name, by):
-    """Return a result whose border has another value of a constant."""
+    """Return a result with one constant of its marginal information shifted."""
     border = result.marginal
     at = np.arange(len(border.names)) == border.names.index(name)
     return replace(result, marginal=replace(border, point=border.point + by * at))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every source of the budget against what the same error does to the real dead reckoning."""
+"""Each source of the budget equals the effect of the same error on dead reckoning."""
 
 from dataclasses import replace
 
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.core
 K, YAW, PITCH = 0.02, 0.05, -0.03
 F = K * forward_b(YAW, PITCH)
 C0 = matrix_from_rpy([0.02, -0.01, 0.7])
-EARTH = np.zeros(3)      # its turn is left out of the budget, which says so
-SMALL = 1e-4             # errors small enough that what is of second order is below a part in 1e3
+EARTH = np.zeros(3)      # Earth rotation within the leg is not part of the budget
+SMALL = 1e-4             # errors so small that second-order terms are below a part in 1e3
 
 
 def parameters(f):
@@ -30,7 +30,7 @@ def parameters(f):
 
 
 class Reckoner:
-    """A leg of 300 s with turns and a hill, dead reckoned by the real thing."""
+    """A leg of 300 s with turns and a hill, dead reckoned by the product."""
 
     def __init__(self):
         self.t = np.arange(0.0, 300.0, 0.05)
@@ -43,13 +43,13 @@ class Reckoner:
         self.w = w
 
     def track(self, phi_n=(0, 0, 0), w_error=0.0, late=0.0):
-        """Return the track with an attitude error, gyro errors, an odometer that is late."""
+        """Return the track with an attitude error, gyro errors and an odometer delay."""
         q = quat_from_matrix(exp_so3(-np.asarray(phi_n, float)) @ C0)
         t, q_nb = attitude(self.t, self.w + w_error, q, EARTH)
         return dead_reckon(t, q_nb, Travel(self.t + late, self.s, 0.0))
 
     def solve(self, chord_n, off=0.0, **errors):
-        """Return (ln K, yaw, pitch) that a chord with an error and an erring track give."""
+        """Return (ln K, yaw, pitch) solved from a chord with an error and a track with errors."""
         return parameters(np.linalg.solve(self.track(**errors).P[-1], chord_n + off))
 
 
@@ -60,7 +60,7 @@ def leg():
 
 @pytest.fixture(scope='module')
 def truth(leg):
-    """Return track, true chord and the parameters it gives."""
+    """Return the track, the true chord and the parameters solved from them."""
     track = leg.track()
     chord = track.P[-1] @ F
     return track, chord, leg.solve(chord)
@@ -83,19 +83,19 @@ def sources(track, *, standing=True, cov=0.0, fix_scale=(1.0, 1.0, 1.0), more=No
     return {s.name: s for s in found}
 
 
-def test_the_gradient_is_the_derivative():
+def test_parameter_gradient_equals_finite_differences():
     rng = np.random.default_rng(1)
     for _ in range(20):
         f = K * forward_b(*rng.uniform(-1.0, 1.0, 2))
         columns = [(parameters(f + d) - parameters(f - d)) / (2e-6 * K)
                    for d in np.eye(3) * 1e-6 * K]
-        # central differences: error of second order, 1e-12 of the third derivative
+        # central differences: second-order error, 1e-12 times the third derivative
         np.testing.assert_allclose(parameter_gradient(f), np.array(columns).T, rtol=1e-6,
                                    atol=1e-6 / K)
 
 
 def on_axis(leg, axis, about):
-    """Return the gyro error of an axis that measures a share of the turn about another."""
+    """Return the error of a gyro axis that measures a share of the turn about another axis."""
     w = np.zeros_like(leg.w)
     w[:, axis] = SMALL * leg.w[:, about]
     return {'w_error': w}
@@ -121,31 +121,31 @@ CHANGE, ENDS = np.array([3.0, -5.0, 0.2]), np.diag([0.4, 0.4, 0.6])
      lambda *_: [{'off': CHANGE * 0.05}], 1e-3),
     ('antenna_lever_arm', {'more': {'lever_arm_sigma': 0.1}},
      lambda _, C: [{'off': e} for e in (C[-1] - C[0]).T * 0.1], 1e-3)])
-def test_a_column_is_what_its_error_does(leg, truth, name, figures, errors, tolerance):
+def test_budget_column_is_the_effect_of_its_error(leg, truth, name, figures, errors, tolerance):
     track, chord, _ = truth
     effects = sources(track, **figures)[name].effects
     real = np.stack([
         leg.solve(chord, **error) - leg.solve(chord, **{k: np.negative(v)
                                                         for k, v in error.items()})
         for error in errors(leg, matrix_from_quat(track.q_nb))], -1) / 2
-    # the sign of a source is free: only products of its columns enter; but all of it shares it
+    # the sign of a source is arbitrary, because only products enter, but common to its column
     real = real * np.sign((real * effects).sum())
-    assert np.abs(effects).max() > 1e-5     # turns at speed make a late odometer matter
+    assert np.abs(effects).max() > 1e-5     # turns at speed make an odometer delay observable
     for found, column in zip(real.T, effects.T, strict=True):
         np.testing.assert_allclose(found, column,
                                    atol=tolerance * np.abs(column).max() + 1e-7 * SMALL)
 
 
-def test_quantisation_is_that_of_two_roundings(truth):
+def test_quantisation_column_equals_two_rounding_errors(truth):
     track, chord, _ = truth
     column = sources(track, more={'quantum': 0.02})['quantisation'].effects[:, 0]
     rng = np.random.default_rng(2)
     rounding = rng.uniform(-0.01, 0.01, (20000, 2))
     sigma = (rounding[:, 0] - rounding[:, 1]).std() / np.linalg.norm(chord)
-    assert column[0] == pytest.approx(sigma, rel=0.03)       # 20000 draws: 0.5 %, and the bow
+    assert column[0] == pytest.approx(sigma, rel=0.03)       # 20000 draws: 0.5 %, plus curvature
 
 
-def test_height_makes_the_earth_larger(truth):
+def test_height_increases_the_earth_radius(truth):
     track, _, _ = truth
     found = sources(track, cov=100.0)['height']
     assert found.effects[0, 0] == pytest.approx(10.0 / 6378137, rel=1e-3)
@@ -153,11 +153,11 @@ def test_height_makes_the_earth_larger(truth):
 
 
 @pytest.mark.parametrize('name', ['gyro_noise', 'gyro_bias_walk'])
-def test_gyro_noise_and_walk_against_monte_carlo(leg, truth, name):
+def test_gyro_noise_and_walk_columns_agree_with_monte_carlo(leg, truth, name):
     """
-    200 runs: a variance within 5 * sqrt(2 / 200) = 50 %; sigmas within 0.71 to 1.22.
+    200 runs: variance within 5 * sqrt(2 / 200) = 50 %; sigmas within 0.71 to 1.22.
 
-    The walk is drawn in b and the budget turns it with n: alike in law for equal axes.
+    The walk is drawn in b, the budget uses n: both have the same distribution for equal axes.
     """
     density = {'gyro_noise': 1e-4, 'gyro_bias_walk': 2e-6}[name]
     source = sources(truth[0], **{name: density})[name]
@@ -171,12 +171,12 @@ def test_gyro_noise_and_walk_against_monte_carlo(leg, truth, name):
         errors.append(leg.solve(chord, w_error=w) - true)
     ratio = np.std(errors, axis=0) / np.sqrt((source.effects**2).sum(axis=1))
     assert ((ratio[1:] > 0.71) & (ratio[1:] < 1.22)).all(), ratio
-    # ln K sees only what of it lies along the chord, and the turn of the walk in b shows there
+    # ln K is affected only by the part along the chord, which the turn of the walk in b changes
     assert 0.6 < ratio[0] < 1.35, ratio
 
 
-def test_gyros_err_from_the_alignment_on(leg, truth):
-    """A minute of standing before the leg adds its drift to all of the way."""
+def test_gyro_errors_accumulate_from_the_alignment(leg, truth):
+    """A minute of standstill before the leg adds its drift to the whole path."""
     track, _, _ = truth
     t = np.concatenate([np.arange(-60.0, 0.0, 0.05), track.t])
     D = np.concatenate([np.zeros((1200, 3)), track.P @ F])
@@ -189,7 +189,7 @@ def test_gyros_err_from_the_alignment_on(leg, truth):
 
 
 class TestWhole:
-    """The budget of calibrate() against the same errors put into a whole simulated leg."""
+    """The budget of calibrate() equals the effect of the same errors in a simulated leg."""
 
     @pytest.fixture
     def made(self):
@@ -201,7 +201,7 @@ class TestWhole:
         return np.array([np.log(e[p].value) if p == 'scale_factor' else e[p].value
                          for p in PARAMETERS])
 
-    def test_the_parts_are_all_named_and_make_the_sigma(self, made):
+    def test_named_sources_sum_to_the_sigma(self, made):
         result = two_point(made.leg(), settings(made))
         total = sum(s.effects @ s.effects.T for s in result.sources)
         for i, p in enumerate(PARAMETERS):
@@ -214,8 +214,8 @@ class TestWhole:
             'initial_heading', 'initial_level', 'fix_latency', 'antenna_lever_arm',
             'odometer_delay', 'height', 'gyro_scale', 'gyro_axes'}
 
-    @pytest.mark.parametrize('start', [0.0, 40.0])       # s: the mark at rest, or in motion
-    def test_a_late_odometer_in_a_whole_leg(self, made, start):
+    @pytest.mark.parametrize('start', [0.0, 40.0])       # s: start mark at rest, or in motion
+    def test_budget_includes_the_odometer_delay_in_a_leg(self, made, start):
         leg, late = shifted(made.leg(), start=start), 40_000_000
         config = settings(made, odometer__time_sigma=late * 1e-9)
         source = next(s for s in two_point(leg, config).sources if s.name == 'odometer_delay')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale, mounting, counter or bias that change within a leg: found, and what is stated."""
+"""Step changes of scale, mounting, counter or bias within a leg are found and reported."""
 
 from dataclasses import replace
 import re
@@ -28,21 +28,21 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 DRIVE = {'imu_grade': 'industrial', 'duration': 240.0, 'fix_sigma': 0.3}
-AFTER = 1 / 3       # of the leg, which ends with a standstill
+AFTER = 1 / 3       # fraction of the leg after the change; the leg ends with a standstill
 SENSORS = {'f_b': 'accelerometer', 'w_b': 'gyro'}
 AT = 70.0       # s
 STEPS = {'f_b': (0.06, 0.06, -0.05), 'w_b': (0.001, -0.001, 0.0014)}     # 10 mg, 0.1 deg/s
 
 
 def recounted(leg, factor):
-    """Return a leg whose odometer counts more by a factor of each interval."""
+    """Return a leg whose odometer increments are multiplied by a factor."""
     sent = leg.odometer
     value = sent.value[0] + np.cumsum(np.append(0.0, np.diff(sent.value) * factor))
     return leg.with_rows(odometer=replace(sent, value=np.round(value).astype(int)))
 
 
 def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
-    """Return truth, estimates, reasons of a drive with a change: IMU by rad, counts relatively."""
+    """Return truth, estimates, reasons of a drive with an IMU turn, rad, and a scale change."""
     drive, config, _ = made(**DRIVE)
     leg = drive.leg()
     begin, end = leg.imu.stamp_ns[[0, -1]]
@@ -54,7 +54,7 @@ def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
 
 
 def equations_at(problem, fit, constants):
-    """Return the equations of a fit at other constants."""
+    """Return the equations of a fit at other values of the constants."""
     return Equations(problem, replace(fit.state, constants=constants), fit.priors,
                      fit.variance_factors, True)
 
@@ -67,7 +67,7 @@ def fitted():
 
 
 def column_of(problem, fit, constant, size):
-    """Return the whitened derivatives of the motion rows by a constant, by differences: (K, r)."""
+    """Return the derivatives of the whitened motion rows by a constant, by differences: (K, r)."""
     rows = fit.weighted[MotionRows]
     above, below = (equations_at(problem, fit, fit.state.constants + by * (
         np.arange(M) == constant)).factors['motion'].raw for by in (size, -size))
@@ -75,7 +75,7 @@ def column_of(problem, fit, constant, size):
 
 
 @pytest.mark.parametrize('constant', [YAW, PITCH])
-def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
+def test_step_size_equals_a_fit_with_one_more_constant(fitted, constant):
     problem, fit = fitted
     weighted, rows = fit.weighted, fit.weighted[MotionRows]
     solved = solve(weighted.normal())
@@ -98,11 +98,11 @@ def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
     whole = solve(wider)
     sigma = np.sqrt(whole.covariance[m, m])
     assert step.sigma == pytest.approx(sigma, rel=2e-3)
-    # the other unknowns are at their minimum to the limit of convergence
+    # the other unknowns have converged within the convergence limit
     assert step.size == pytest.approx(whole.step_constants[m], abs=CONVERGENCE.max_step * sigma)
 
 
-def test_a_shortened_last_step_does_not_change_the_steps(fitted):
+def test_shortened_last_iteration_does_not_change_the_steps(fitted):
     problem, fit = fitted
     constants = fit.state.constants.copy()
     constants[[LN_K, YAW]] += 0.01
@@ -116,20 +116,20 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
         found.append([step.size
                       for step in find_constant_steps(weighted.apply_step(solved), solved)])
     sigma = [step.sigma for step in fit.constant_steps]
-    # fixes beyond their tails lose weight with the full step
+    # fixes in the tails are down-weighted with the full step
     np.testing.assert_allclose(*found, atol=0.1 * max(sigma))
 
 
-def test_nothing_is_said_of_a_drive_without_a_change(fitted):
+def test_no_step_is_reported_without_a_change(fitted):
     _, fit = fitted
     assert {s.constant for s in fit.constant_steps} == {LN_K, YAW, PITCH}
-    # the largest of 15 places that overlap: beyond 4 sigma once in 1,000 drives
+    # the largest of 15 overlapping intervals exceeds 4 sigma in one of 1,000 drives
     assert all(abs(s.size) < 4 * s.sigma for s in fit.constant_steps)
     assert Code.CHANGE_IN_LEG not in changed()[2]
 
 
 @pytest.mark.parametrize('deg', [1.0, -1.0])
-def test_the_sigma_of_an_imu_that_was_turned_a_little_covers_both_angles(deg):
+def test_mounting_sigma_covers_both_angles_after_a_small_imu_turn(deg):
     truth, found, texts = changed(turn=(0.0, 0.0, np.deg2rad(deg)),
                                  **{'verdict.max_yaw_sigma': 0.05})
     yaw = found['yaw_mounting_angle']
@@ -140,7 +140,7 @@ def test_the_sigma_of_an_imu_that_was_turned_a_little_covers_both_angles(deg):
 
 
 @pytest.mark.parametrize(('axis', 'name'), [(2, 'yaw'), (1, 'pitch')])
-def test_an_imu_that_was_turned_by_degrees_has_no_angle_and_the_cause(axis, name):
+def test_imu_turn_of_degrees_removes_the_angle_and_names_the_cause(axis, name):
     _, found, texts = changed(turn=np.deg2rad(3.0) * np.eye(3)[axis])
     assert found[f'{name}_mounting_angle'].value is None
     assert f'the {name} mounting angle changes by about' in texts[Code.CHANGE_IN_LEG]
@@ -148,15 +148,15 @@ def test_an_imu_that_was_turned_by_degrees_has_no_angle_and_the_cause(axis, name
         assert 'see CHANGE_IN_LEG' in texts[Code.YAW_NOT_DETERMINED]
 
 
-def test_a_scale_that_changes_is_said_with_size_and_time():
+def test_scale_step_is_reported_with_size_and_time():
     _, _, texts = changed(scale=0.02)
     assert 'the scale factor changes by about -1.' in texts[Code.CHANGE_IN_LEG]
     near = float(texts[Code.CHANGE_IN_LEG].split('near t = ')[1].split(' s')[0])
     assert abs(near - (AFTER * DRIVE['duration'] - 20.0)) < DRIVE['duration'] / 8
 
 
-def test_a_scale_that_changes_gradually_has_no_step():
-    """It rises and falls by 0.3 %; the best step alone is 6 to 7 sigma."""
+def test_gradual_scale_change_is_not_reported_as_a_step():
+    """The scale rises and falls by 0.3 %; the best single step has 6 to 7 sigma."""
     drive, config, _ = made(imu_grade='tactical', duration=400.0, fix_sigma=0.02)
     leg = drive.leg()
     arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(leg.odometer.value) - 1))
@@ -166,7 +166,7 @@ def test_a_scale_that_changes_gradually_has_no_step():
 
 
 @pytest.mark.parametrize('constant', [LN_K, YAW])
-def test_a_change_that_does_not_matter_is_not_reported(constant):
+def test_change_without_effect_is_not_reported(constant):
     for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
         fit = SimpleNamespace(constant_steps=(ConstantStep(constant, 100.0, size, size / 7),))
         assert len(_change_reasons(fit)) == count
@@ -182,7 +182,7 @@ def test_a_change_that_does_not_matter_is_not_reported(constant):
     ([1.05] * 5 + [0.95] * 5, 0.05, ''), ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3, ''),
     (np.linspace(0.9, 1.1, 10), 1e-3, ''), ([1.0] * 5 + [np.nan] * 5, 1e-3, '')],
     ids=['halved', 'doubled', 'frozen', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
-def test_a_counter_that_changes_is_found_with_place_and_factor(ratio, sigma, text):
+def test_counter_change_is_found_with_place_and_factor(ratio, sigma, text):
     """Ten sections of 100 m in 10 s each."""
     edges = np.linspace(0.0, 1000.0, len(ratio) + 1)
     parts = Sections(edges[:-1], edges[1:], np.array(ratio), np.full(len(ratio), sigma))
@@ -200,7 +200,7 @@ def town():
 
 @pytest.mark.slow
 @pytest.mark.parametrize('factor', [1, 2, 4])
-def test_a_driver_that_decodes_each_edge_from_the_middle_of_the_drive_on(town, factor):
+def test_edge_decoding_that_changes_in_mid_drive_is_found(town, factor):
     leg = town.leg()
     late = leg.odometer.stamp_ns[1:] > (leg.start_ns + leg.stop_ns) // 2
     result = calibrate(recounted(leg, np.where(late, factor, 1)),
@@ -212,7 +212,7 @@ def test_a_driver_that_decodes_each_edge_from_the_middle_of_the_drive_on(town, f
 
 @pytest.mark.parametrize(('size', 'more'), [
     (1 / 9.80665, 0.0), (0.0, 0.1), (2.0, 0.0), (1.0, [0.0, 9.8, 0.0])])
-def test_an_accelerometer_changes_its_unit_or_range_but_not_in_a_bend_at_one_g(town, size, more):
+def test_accelerometer_unit_or_range_change_is_found_but_not_in_a_bend_at_1_g(town, size, more):
     leg = town.leg()
     force = leg.imu.f_i.copy()
     late = leg.imu.stamp_ns > (leg.start_ns + 2 * leg.stop_ns) // 3
@@ -225,7 +225,7 @@ def test_an_accelerometer_changes_its_unit_or_range_but_not_in_a_bend_at_one_g(t
 
 @cached
 def calibrated(stepping=None):
-    """Return a drive and its result, with the bias of one sensor stepping at AT."""
+    """Return a drive and its result; the bias of one sensor changes in a step at AT."""
     drive, config, leg = made(duration=200.0, imu_grade='industrial', fix_noise='rtk')
     if stepping:
         step = (leg.t_imu > AT)[:, None] * np.array(STEPS[stepping])
@@ -235,12 +235,12 @@ def calibrated(stepping=None):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('stepping', STEPS)
-def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
+def test_bias_step_is_reported_as_a_step_and_not_as_noise(stepping):
     drive, method = calibrated(stepping)
     _, plain = calibrated()
     for name in ('scale_factor', *ANGLES):
         assert off(method, drive, name) < 3.3
-        # one interval without the continuity of the bias, of 200
+        # one of 200 intervals has no continuity of the bias
         assert method.estimates[name].sigma < 1.3 * plain.estimates[name].sigma
     texts = reason_texts(method)
     assert not {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.WHEEL_SLIP,
@@ -249,6 +249,6 @@ def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
     found = re.fullmatch(f'the {SENSORS[stepping]} bias changes by ([0-9.]+) (deg/s|m/s\\^2) near '
                          't = ([0-9]+) s; estimated before and after', texts[Code.IMU_BIAS_STEP])
     unit = {'deg/s': np.deg2rad(1.0), 'm/s^2': 1.0}[found[2]]
-    # two digits; a step within an interval of a second
+    # two digits; the step occurs within an interval of 1 s
     assert float(found[1]) * unit == pytest.approx(np.linalg.norm(STEPS[stepping]), rel=0.1)
     assert abs(float(found[3]) - AT) <= 3

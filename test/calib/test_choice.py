@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which method gives which value; where methods differ, and legs of more than one vehicle."""
+"""Which method gives which value; methods that differ, and legs of different vehicles."""
 
 from dataclasses import replace
 
@@ -43,26 +43,26 @@ def several(*methods):
 
 
 def chosen(methods, setting, name='scale_factor'):
-    """Return the value chosen, and the methods that gave one."""
+    """Return the chosen value and the methods that determine it."""
     estimates, giving = choose(methods, setting)
     return estimates[name].value, giving
 
 
-def test_each_value_is_of_the_first_method_that_has_it_and_is_not_rejected():
+def test_each_value_comes_from_the_first_method_that_is_not_rejected():
     ends, refused = method('two_point'), method('two_point', None, None, [REFUSED])
     methods = several(ends, method('smoother', 2.1, None, [NO_YAW]))
     assert chosen(methods, 'all') == (2.1, ('smoother', 'two_point'))
     assert choose(methods, 'all')[0]['yaw_mounting_angle'].method == 'two_point'
     fell = method('smoother', 2.1, reasons=[REFUSED])
     assert chosen(several(fell, ends), 'auto')[0] == 2.0
-    # all are rejected; only one is asked for
+    # all methods are rejected; only one is required
     assert chosen(several(fell, refused), 'auto') == (2.1, ('smoother',))
     assert chosen(several(method('smoother', 2.1), refused), 'two_point') == (
         None, ('two_point',))
     assert choose(several(ends), 'wheels') == ({}, ())
 
 
-def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
+def test_end_points_do_not_give_a_pitch_that_the_smoother_cannot_determine():
     methods = several(*(replace(one, estimates=one.estimates | {
         'pitch_mounting_angle': Estimate(pitch, pitch and 1e-3, 'rad')}) for one, pitch in (
             (method('smoother'), None), (method('two_point'), 0.02))))
@@ -74,31 +74,31 @@ def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
     ('two_point', ('two_point',)), ('wheels', ('smoother', 'two_point')),
     ('patent', ('smoother', 'two_point')), ('auto', ('smoother', 'two_point')),
     ('all', ('smoother', 'two_point'))])
-def test_the_operators_own_marks_are_always_computed(setting, run):
+def test_two_point_is_always_computed_for_marks_of_the_operator(setting, run):
     assert deciding_methods(setting, shown=True) == run
 
 
-def test_reasons_about_a_value_that_another_method_gives_are_not_said():
+def test_reasons_about_a_value_from_another_method_are_not_reported():
     both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'all')
     alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'all')
     assert relevant_reasons([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
     assert relevant_reasons([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
 
 
-def test_a_rejected_method_is_named_where_one_behind_it_gives():
+def test_rejected_method_is_named_if_a_later_method_gives_the_value():
     fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
     found, = rejected_method_reasons(several(method('two_point'), fell), 'auto')
     assert found.code is Code.METHOD_REJECTED
     assert found.remedy.endswith('which may not detect this problem.')
     assert found.text == 'smoother is not used, because of CHORD_TOO_SHORT: a loop'
-    # said by the leg already; behind the one that gives; nothing gives; not asked for
+    # reported by the leg; after the method that gives the value; no method gives it; not required
     assert rejected_method_reasons(several(method('two_point'), fell), 'auto',
                                    {REFUSED.code}) == []
     loop = method('two_point', reasons=[REFUSED])
     assert rejected_method_reasons(several(loop, method('smoother')), 'auto') == []
     assert rejected_method_reasons(several(loop, fell), 'auto') == []
     assert rejected_method_reasons(several(method('two_point'), fell), 'two_point') == []
-    # that there is no second wheel is no fault of the drive
+    # a missing second wheel is not a fault of the drive
     none = method('smoother', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
     assert rejected_method_reasons(several(none, method('two_point')), 'all') == []
 
@@ -115,13 +115,13 @@ def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause(other,
 
 
 def leg(number, *methods, reasons=()):
-    """Return a leg of an hour of its own."""
+    """Return a leg of its own hour."""
     start = number * 3600 * 10**9
     return LegResult(start, start + 10**11, 1000.0, 100.0, 10_000, 5000, 500, 0, tuple(reasons),
                      several(*methods), C_bi=np.eye(3))
 
 
-def test_a_leg_is_good_by_one_method_unless_another_is_asked_for():
+def test_leg_is_accepted_by_one_method_unless_the_setting_requires_another():
     one = leg(1, method('two_point', None, None, [REFUSED]), method('smoother'))
     assert one.verdict is Verdict.ACCEPTED
     whole = combine([one], ALL)
@@ -133,7 +133,7 @@ def test_a_leg_is_good_by_one_method_unless_another_is_asked_for():
     assert replace(one, deciding=('two_point',)).verdict is Verdict.REJECTED
 
 
-def test_a_method_takes_only_the_legs_where_it_is_sound():
+def test_method_combines_only_the_legs_it_accepts():
     legs = [leg(1, method('two_point', 2.0), method('smoother', 2.02)),
             leg(2, method('two_point', 2.0), method('smoother', None, None, [REFUSED]))]
     whole = combine(legs, ALL)
@@ -142,14 +142,14 @@ def test_a_method_takes_only_the_legs_where_it_is_sound():
     assert [r.text for r in whole.reasons] == ['leg 2: not used for smoother: a loop']
 
 
-def test_a_method_rejected_on_every_leg_stays_rejected_in_the_combination():
+def test_method_rejected_on_every_leg_stays_rejected_in_the_combination():
     legs = [leg(i, method('two_point', 2.0, reasons=[REFUSED])) for i in (1, 2)]
     whole = combine(legs, Config())
     assert whole.verdict is Verdict.REJECTED
     assert whole.methods['two_point'].verdict is Verdict.REJECTED
 
 
-def test_what_rejects_a_leg_is_said_once():
+def test_rejection_of_a_leg_is_reported_once():
     fell = Reason(Code.ODOMETER_REVERSED, 'by the method')
     rejected = leg(1, method('smoother', reasons=[fell]), method('two_point'),
                    reasons=[Reason(Code.ODOMETER_REVERSED, 'by the leg')])
@@ -160,7 +160,7 @@ def test_what_rejects_a_leg_is_said_once():
     assert [r.text for r in alone.reasons if r.code is fell.code] == ['by the leg']
 
 
-def test_a_method_left_out_of_one_leg_of_two_is_said_once():
+def test_method_missing_in_one_leg_of_two_is_reported_once():
     fell = method('smoother', reasons=[REFUSED])
     one = leg(1, fell, method('two_point'),
               reasons=rejected_method_reasons(several(fell, method('two_point')), 'all'))
@@ -185,8 +185,8 @@ def inconsistencies(*legs):
     return [r.text for r in inconsistent_legs(list(enumerate(legs, 1)))]
 
 
-def test_legs_of_one_vehicle_are_fine():
-    # worn and new tyres, a mounting given 4 deg of play: LEGS_DISAGREE says it and widens
+def test_legs_of_one_vehicle_are_consistent():
+    # worn and new tyres, a mounting with 4 deg of play: LEGS_DISAGREE reports it, sigma increases
     assert inconsistencies(driven(1), driven(2, scale=0.0206, yaw=0.01 + 4 * DEG)) == []
     assert inconsistencies(driven(1)) == inconsistencies() == []
     assert inconsistencies(driven(1, yaw=179.9 * DEG), driven(2, yaw=-179.9 * DEG)) == []
@@ -199,7 +199,7 @@ def test_legs_of_one_vehicle_are_fine():
     (({}, {'scale': 0.03, 'yaw': 0.5}), ' and the yaw mounting of leg 2 is '),
     (({}, {'scale': 1.02, 'sigma': 1e-4, 'unit': '1'}, {}),
      'so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2'),
-    # an IMU that faces backwards
+    # an IMU that points backwards
     (({'yaw': 177 * DEG}, {'yaw': -177 * DEG}),
      'the yaw mounting of leg 2 is 6.0 deg above that of leg 1')])
 def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit(legs, text):
@@ -209,16 +209,16 @@ def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit(legs, text):
 
 @pytest.mark.parametrize('more', [
     {'scale': 0.03, 'sigma': 0.0021}, {'yaw': 0.5, 'yaw_sigma': 0.1}, {'yaw': None}])
-def test_what_sigmas_allow_is_no_other_vehicle(more):
+def test_difference_within_the_sigmas_is_not_another_vehicle(more):
     assert inconsistencies(driven(1), driven(2, **more)) == []
 
 
-def test_the_combination_is_rejected_or_its_sigma_judged():
+def test_combination_is_rejected_or_its_sigma_is_compared_with_the_limit():
     whole = combine([driven(1), driven(2, scale=0.03)], Config())
     assert whole.verdict is Verdict.REJECTED
     assert [r.code for r in whole.reasons if r.code.severity is Verdict.REJECTED] == [
         Code.LEGS_UNLIKE]
-    # 3 % apart: one vehicle, but a mean good to no 0.1 %
+    # 3 % apart: one vehicle, but the mean is not accurate to 0.1 %
     whole = combine([driven(1), driven(2, scale=0.0206)], Config())
     assert {Code.LEGS_DISAGREE, Code.SCALE_SIGMA_TOO_LARGE} <= {r.code for r in whole.reasons}
     assert whole.verdict is Verdict.CAUTION

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several legs: own errors average down, shared ones do not, disagreement widens."""
+"""Several legs: independent errors average down, common errors do not, disagreement widens."""
 
 from dataclasses import replace
 from itertools import count
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.core
 CONFIG = Config()
 LEGS = count(1)
 SCALE, YAW, PITCH = PARAMETERS
-OWN, HEADING = 1e-4, 1e-3       # of ln K and yaw; of yaw alone
+OWN, HEADING = 1e-4, 1e-3       # of ln K and yaw; of yaw only
 
 
 def method(scale=0.02, yaw=0.01, own=OWN, heading=HEADING, refused=(), reasons=()):
@@ -37,14 +37,14 @@ def method(scale=0.02, yaw=0.01, own=OWN, heading=HEADING, refused=(), reasons=(
 
 
 def leg(result, *codes):
-    start_ns = 1_000 * next(LEGS)        # one after the other
+    start_ns = 1_000 * next(LEGS)        # consecutive legs
     return LegResult(start_ns, start_ns + 900, 1e3, 100.0, 1, 1, 1, 0,
                      tuple(Reason(c, c.name) for c in codes),
                      {'two_point': result} if result else {}, C_bi=np.eye(3))
 
 
 @pytest.mark.parametrize('n', [2, 5, 16])
-def test_own_errors_average_down_and_shared_ones_stay(n):
+def test_independent_errors_average_down_and_common_errors_remain(n):
     e = combine_method('two_point', [method()] * n).estimates
     assert e[SCALE].value == pytest.approx(0.02)
     assert e[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(n))
@@ -55,27 +55,27 @@ def test_own_errors_average_down_and_shared_ones_stay(n):
 
 
 @pytest.mark.parametrize(('legs', 'mean'), [
-    # better legs weigh more
+    # more accurate legs have more weight
     ([method(yaw=0.010), method(yaw=0.0102, own=OWN / 3)], 0.0102 * 0.9 + 0.010 * 0.1),
-    # -1, 1 and 2 times 1e-4 beyond half a turn
+    # -1, 1 and 2 times 1e-4 from half a turn
     ([method(yaw=yaw) for yaw in (np.pi - 1e-4, 1e-4 - np.pi, 2e-4 - np.pi)], 2e-4 / 3 - np.pi)])
-def test_a_mean_is_weighed_and_may_lie_about_half_a_turn(legs, mean):
+def test_mean_is_weighted_and_may_be_near_half_a_turn(legs, mean):
     combined = combine_method('two_point', legs)
     assert combined.reasons == ()
     assert combined.estimates[YAW].value == pytest.approx(mean, abs=1e-12)
 
 
-def test_a_mean_is_never_worse_than_its_best_leg():
-    # one knows much of its own, and the heading rules it; another the other way round
+def test_mean_is_never_worse_than_its_best_leg():
+    # one leg has a small independent error and a large heading error; the other the opposite
     legs = [method(own=OWN / 10, heading=1e-2), method(own=OWN, heading=1e-4)]
     whole = combine_method('two_point', legs).estimates[YAW]
     assert whole.sigma <= legs[1].estimates[YAW].sigma * (1 + 1e-9)
-    # by own errors alone it would be 1e-2: that of the other
+    # with weights by independent errors only it is 1e-2, as of the first leg
     assert whole.sigma < 1.5e-4
 
 
-def test_a_shared_error_of_opposite_effect_cancels():
-    """An antenna that is off by as much on the way there and back leaves the mean alone."""
+def test_common_error_with_opposite_effects_cancels():
+    """An antenna offset with opposite effects on the outward and return legs leaves the mean."""
     one = method(heading=0.0)
     there, back = (replace(one, sources=(*one.sources, Source(
         'antenna_lever_arm', np.array([[arm], [0.0], [0.0]]), shared=True)))
@@ -85,30 +85,30 @@ def test_a_shared_error_of_opposite_effect_cancels():
         assert sigma / 0.02 == pytest.approx(np.hypot(OWN / np.sqrt(2), shared))
 
 
-def test_a_spread_beyond_the_sigmas_is_named_and_widens():
+def test_scatter_beyond_the_sigmas_is_named_and_widens_the_sigma():
     legs = [method(scale=0.02 * (1 + d)) for d in (-1e-3, 0.0, 1e-3)]
     whole = combine_method('two_point', legs)
-    # chi-square 200 on two degrees: ten times the spread that the sigmas allow
+    # chi-square 200 with two degrees of freedom: ten times the scatter expected from the sigmas
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(10 * OWN / np.sqrt(3), rel=1e-3)
     assert [r.code for r in whole.reasons] == [Code.LEGS_DISAGREE]
     assert whole.reasons[0].text == ('scale_factor: the scatter of 3 legs is 10.0 times their '
                                      'uncertainties')
 
 
-def test_a_spread_that_the_shared_error_explains_is_no_disagreement():
-    """The heading may act differently in two legs: what differs of it is allowed for."""
+def test_scatter_explained_by_the_common_error_is_not_a_disagreement():
+    """The heading error may affect two legs differently; the difference is accounted for."""
     legs = [method(yaw=0.01 + heading, heading=heading) for heading in (1e-3, -1e-3)]
     assert combine_method('two_point', legs).reasons == ()
-    # and legs drawn by their own sigmas disagree in a twentieth of cases
+    # legs drawn by their own sigmas disagree in one of twenty cases
     rng, named = np.random.default_rng(5), 0
     for _ in range(400):
         legs = [method(scale=0.02 * np.exp(OWN * z)) for z in rng.standard_normal(4)]
         named += any(r.text.startswith('scale') for r in combine_method('two_point', legs).reasons)
-    assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and the approximation's 1 %
+    assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and 1 % for the approximation
 
 
-def test_a_level_that_was_drawn_anew_is_no_disagreement():
-    """Legs of two power-ups have two accelerometer biases: allowed for, yet not averaged down."""
+def test_new_accelerometer_bias_of_each_leg_is_not_a_disagreement():
+    """Two power-ups have two accelerometer biases: accounted for, but not averaged down."""
     def pitched(value):
         one = method()
         return replace(one, estimates=one.estimates | {PITCH: Estimate(value, 5e-4, 'rad')})
@@ -119,25 +119,25 @@ def test_a_level_that_was_drawn_anew_is_no_disagreement():
 
 
 def weekly(scales):
-    """Return the combination of a leg a week."""
+    """Return the combination of one leg per week."""
     week = 7 * 86_400 * 10**9
     return combine([replace(leg(method(scale=scale)), start_ns=k * week, stop_ns=k * week + 900)
                     for k, scale in enumerate(scales)], CONFIG)
 
 
-WALK = CONFIG.verdict.scale_drift_per_day * 7**0.5      # of ln K in a week, 1 sigma
+WALK = CONFIG.verdict.scale_drift_per_day * 7**0.5      # sigma of ln K in a week
 
 
-def test_a_scale_that_walks_is_that_of_the_last_leg():
-    """Two legs: the first knows the last one's scale by OWN and the walk, the last by OWN."""
+def test_random_walk_scale_is_the_scale_of_the_last_leg():
+    """Two legs: the first constrains the last scale by OWN and the walk, the last by OWN."""
     first, last = OWN**2 + WALK**2, OWN**2
     e = weekly([0.02, 0.02 * np.exp(1e-4)]).estimates[SCALE]
     assert np.log(e.value / 0.02) == pytest.approx(1e-4 * first / (first + last))
     assert e.sigma / e.value == pytest.approx(np.sqrt(first * last / (first + last)))
 
 
-def test_the_sigma_of_a_walking_scale_holds_for_drawn_legs():
-    """1000 draws of six weeks: variance within 5 * sqrt(2/1000); a twentieth disagrees."""
+def test_sigma_of_a_random_walk_scale_holds_for_drawn_legs():
+    """1000 draws of six weeks: variance within 5 * sqrt(2/1000); one in twenty disagrees."""
     rng, z, named = np.random.default_rng(8), [], 0
     for _ in range(1000):
         true = np.cumsum(WALK * rng.standard_normal(6))
@@ -146,10 +146,10 @@ def test_the_sigma_of_a_walking_scale_holds_for_drawn_legs():
         z.append((np.log(e.value / 0.02) - true[-1]) * e.value / e.sigma)
         named += Code.LEGS_DISAGREE in {r.code for r in whole.reasons}
     assert 0.88 < np.sqrt(np.mean(np.square(z))) < 1.11
-    assert 0.02 < named / 1000 < 0.08     # 5 % +- 3 * 0.7 %, and the approximation's 1 %
+    assert 0.02 < named / 1000 < 0.08     # 5 % +- 3 * 0.7 %, and 1 % for the approximation
 
 
-def test_a_leg_without_a_yaw_still_gives_its_scale():
+def test_leg_without_a_yaw_still_gives_its_scale():
     whole = combine_method('two_point', [method(refused=[YAW]), method()])
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
     assert whole.estimates[YAW].sigma == pytest.approx(np.hypot(OWN, HEADING))
@@ -158,7 +158,7 @@ def test_a_leg_without_a_yaw_still_gives_its_scale():
     assert nobody.estimates[SCALE].value is not None
 
 
-def test_the_combined_sources_and_the_budget_make_the_combined_sigma():
+def test_combined_sources_and_budget_sum_to_the_combined_sigma():
     one = method()
     assert combine_method('two_point', [one]) is one
     whole = combine_method('two_point', [one, method(own=2 * OWN)])
@@ -172,7 +172,7 @@ def test_the_combined_sources_and_the_budget_make_the_combined_sigma():
     assert all(abs(rho) <= 1 + 1e-12 for rho in whole.details['correlation'].values())
 
 
-def test_a_rejected_leg_is_left_out_and_named_unless_all_are_rejected():
+def test_rejected_leg_is_excluded_and_named_unless_all_are_rejected():
     bad = leg(method(scale=0.05), Code.IMU_GAP)
     whole = combine([leg(method()), bad, leg(method())], CONFIG)
     assert whole.estimates[SCALE].value == pytest.approx(0.02)
@@ -191,7 +191,7 @@ def test_a_rejected_leg_is_left_out_and_named_unless_all_are_rejected():
     assert whole.imu_rotation_rpy is None
 
 
-def test_too_few_legs_are_a_caution_and_the_limits_are_asked_of_the_whole():
+def test_too_few_legs_are_a_caution_and_limits_apply_to_the_combination():
     config = with_settings(CONFIG, {'verdict.min_legs': 3})
     whole = combine([leg(method()) for _ in range(2)], config)
     assert [r.text for r in whole.reasons] == ['2 usable legs; required: 3']
@@ -202,13 +202,13 @@ def test_too_few_legs_are_a_caution_and_the_limits_are_asked_of_the_whole():
     assert combine([leg(wide) for _ in range(4)], CONFIG).reasons == ()
 
 
-def test_the_rotation_is_the_mounting_on_top_of_the_nominal_one():
+def test_rotation_is_the_mounting_times_the_nominal_mounting():
     turned = replace(leg(method()), C_bi=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
     rpy = combine([turned], CONFIG).imu_rotation_rpy
     assert rpy[2] == pytest.approx(np.pi / 2 + 0.01)
 
 
-def test_a_drive_given_twice_counts_once():
+def test_drive_given_twice_counts_once():
     one, apart = leg(method()), leg(method())
     again = replace(apart, start_ns=one.start_ns + 100, stop_ns=one.stop_ns + 100)
     whole = combine([one, again], CONFIG)

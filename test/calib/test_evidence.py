@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a report draws of a leg: residuals by direction, scale by section, fixes left out."""
+"""Data of the report plots: residuals by direction, scale by section, excluded fixes."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ END = 100.0                                  # s; 10 m/s, east for half of it, t
 
 
 def path_n(t):
-    """Return a drive at 10 m/s: standing for 10 s, east until t = 60, then north: (n, 3)."""
+    """Return a drive at 10 m/s: at rest for 10 s, east until t = 60, then north: (n, 3)."""
     s = 10.0 * np.clip(t - 10.0, 0.0, None)
     return np.stack([np.minimum(s, 500.0), np.maximum(s - 500.0, 0.0), 0.0 * t], -1)
 
 
 def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, set_ns=0, **streams):
-    """Return evidence of that drive; fixes lie by ``off`` to the east and north of the path."""
+    """Return evidence of that drive; fixes are ``off`` to the east and north of the path."""
     config = config or Config()
     t = np.arange(0.0, END, 0.02)
     yaw = np.where(t < 60.0, 0.0, np.pi / 2)
@@ -58,19 +58,19 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, set_ns=0, **streams):
                          (lambda t: 1.1 * path_n(t) + 7.0, lambda t: path_n(t) - 3.0), config)
 
 
-def test_residuals_are_split_by_the_direction_driven():
-    found = drive(off=(2.0, 1.0))            # the track lies 2 m west and 1 m south of the fixes
+def test_residuals_are_split_by_the_direction_of_travel():
+    found = drive(off=(2.0, 1.0))            # the track is 2 m west and 1 m south of the fixes
     east = (found.t_fix > 12) & (found.t_fix < 58)
     north = (found.t_fix > 62) & (found.t_fix < 98)
     np.testing.assert_allclose(found.residual[east], [[-2.0, -1.0]] * east.sum(), atol=1e-9)
     np.testing.assert_allclose(found.residual[north], [[-1.0, 2.0]] * north.sum(), atol=1e-9)
-    # as configured: 10 % too far, so 0.1 of the way so far on the axis driven
+    # as configured the scale is 10 % too large: error of 0.1 of the path length along the path
     late = found.t_fix > 62
     np.testing.assert_allclose(found.residual_before[late, 0],
                                -1.0 + 0.1 * (10.0 * (found.t_fix[late] - 10) - 500), atol=1e-9)
 
 
-def test_way_speed_and_turn_rate():
+def test_path_length_speed_and_turn_rate():
     found = drive()
     assert found.distance[-1] == pytest.approx(10.0 * (found.t[-1] - 10.0), rel=1e-12)
     steady = (found.t > 12) & (found.t < 58)
@@ -79,10 +79,10 @@ def test_way_speed_and_turn_rate():
     assert found.yaw_rate.sum() * 0.02 == pytest.approx(np.pi / 2, rel=0.001)
     np.testing.assert_allclose(found.yaw_rate[steady], 0.0, atol=1e-12)
     assert len(found.t) <= KEPT_ROWS
-    assert found.t[[0, -1]] == pytest.approx([0.0, 99.98])      # thinned out, both ends kept
+    assert found.t[[0, -1]] == pytest.approx([0.0, 99.98])      # decimated, both ends kept
 
 
-def test_fixes_left_out_are_named_with_the_reason():
+def test_excluded_fixes_are_named_with_the_reason():
     found = drive(bad=((3, 'status'), (5, 'sigma')))
     assert found.excluded == 2
     np.testing.assert_allclose(found.t_excluded, [0.6, 1.0])
@@ -92,31 +92,31 @@ def test_fixes_left_out_are_named_with_the_reason():
 
 
 def straight(path):
-    """Return the way east: (n, 3)."""
+    """Return a straight path to the east: (n, 3)."""
     return np.outer(path, [1.0, 0.0, 0.0])
 
 
-def test_a_section_gives_the_scale_whatever_the_heading():
+def test_section_scale_is_independent_of_the_heading():
     path = np.arange(0.0, 1000.0, 2.0)
     z = straight(path) + np.outer(30 * np.sin(path / 80), [0.0, 1.0, 0.0])
     turn = np.array([[np.cos(1.0), -np.sin(1.0), 0], [np.sin(1.0), np.cos(1.0), 0], [0, 0, 1]])
     found = sections(path, z, 1.003 * z @ turn.T + [5.0, 6.0, 7.0], np.full(len(path), 0.02))
     np.testing.assert_allclose(found.ratio, 1.003, rtol=1e-9)
     np.testing.assert_allclose([found.begin[0], found.end[-1]], [0.0, 998.0])
-    # on a straight, the closed form of a line through n points: sigma sqrt(12 / n) / length; 100
-    # residuals a section, ten sections: the median is good to some per cent
+    # closed form of a straight line through n points: sigma sqrt(12 / n) / length; with 100
+    # residuals per section and ten sections the median is accurate to some per cent
     z = straight(path)
     noisy = z + np.random.default_rng(1).normal(0.0, 0.02, z.shape)
     found = sections(path, z, noisy, np.full(len(path), 1.0))
     assert np.median(found.sigma) == pytest.approx(0.02 * np.sqrt(12 / 50) / 100, rel=0.1)
-    # perfect fixes: a hundredth of the stated sigma is the least
+    # fixes without error: the lower limit is a hundredth of the stated sigma
     found = sections(path, z, z, np.full(len(path), 2.0))
     assert (found.sigma >= 0.99 * 0.02 * np.sqrt(12 / 50) / 100).all()
 
 
 @pytest.mark.parametrize(('memory', 'white'), [(0.0, 0.0), (0.8, 0.0), (0.95, 0.0), (0.95, 1.0)])
-def test_the_sigma_of_a_section_holds(memory, white):
-    # a first-order process, 1 m, and white noise on it, 100 drives of 10 sections of 60 fixes
+def test_sigma_of_a_section_holds(memory, white):
+    # first-order process of 1 m plus white noise; 100 drives of 10 sections of 60 fixes
     rng = np.random.default_rng(20261101)
     path = np.arange(0.0, 6000.0, 10.0)
     z, pulls = straight(path), []
@@ -126,19 +126,19 @@ def test_the_sigma_of_a_section_holds(memory, white):
         noise += white * rng.standard_normal(noise.shape)
         found = sections(path, z, z + np.pad(noise, ((0, 0), (0, 1))), np.full(len(path), 3.0))
         pulls += list((found.ratio - 1.0) / found.sigma)
-    # 1000 pulls: 2.2 % of statistics. The process is matched to one drive, where 600 fixes of
-    # memory 0.95 are worth 15: sqrt(1 / (2 * 2 * 15)) = 13 % of its sigma. The longer of two
-    # memories counts: bars may be too long, by a half, but not too short
+    # 1000 pulls: 2.2 % statistical error. The process is estimated from one drive, where 600
+    # fixes with memory 0.95 count as 15: sqrt(1 / (2 * 2 * 15)) = 13 % of its sigma. The longer
+    # of two memories is used: error bars may be too long by a half, but not too short
     assert 0.6 < np.std(pulls) < 1.2
     assert abs(np.mean(pulls)) < 0.1
 
 
-def test_what_the_fixes_do_not_tell_is_nan_and_too_little_is_nothing():
+def test_undetermined_section_scale_is_nan_and_too_few_fixes_give_no_sections():
     path = np.linspace(0.0, 200.0, 20)
     z = straight(path)
     for n in (0, 5):
         assert len(sections(path[:n], z[:n], z[:n], np.ones(n)).ratio) == 0
-    with np.errstate(all='raise'):      # a path that stays where it is
+    with np.errstate(all='raise'):      # a path without motion
         assert np.isnan(sections(path, 0 * z, z, np.ones(20)).ratio).all()
     found = sections(path, z, z, np.full(20, 5e4))
     assert len(found.ratio) == 2
@@ -146,14 +146,14 @@ def test_what_the_fixes_do_not_tell_is_nan_and_too_little_is_nothing():
 
 
 @pytest.mark.filterwarnings('error')
-def test_a_negative_variance_is_a_row_like_others_without_a_warning():
+def test_negative_variance_of_a_fix_causes_no_warning():
     assert drive(bad=[(7, 'negative')]).fixes == drive().fixes
 
 
-def test_pauses_of_imu_and_odometer_are_kept_where_the_vehicle_moves():
+def test_gaps_of_imu_and_odometer_are_kept_if_the_vehicle_moves():
     t = np.arange(0.0, END, 0.02)
     imu = t[(t <= 30.0) | (t >= 32.0)]
-    rows = t[((t < 3.0) | (t >= 8.0)) & ((t <= 70.0) | (t >= 71.0))]     # stands until t = 10
+    rows = t[((t < 3.0) | (t >= 8.0)) & ((t <= 70.0) | (t >= 71.0))]     # at rest until t = 10
     found = drive(t_imu=imu, travel=Travel(rows, 10.0 * np.clip(rows - 10.0, 0.0, None), 0.0))
     assert [name for name, _, _ in found.gaps] == ['IMU', 'odometer']
     np.testing.assert_allclose([gap[1:] for gap in found.gaps], [(30.0, 32.0), (70.0, 71.0)],
@@ -161,7 +161,7 @@ def test_pauses_of_imu_and_odometer_are_kept_where_the_vehicle_moves():
     assert drive(t_imu=t, travel=Travel(t, t, 0.0)).gaps == ()
 
 
-def test_offsets_of_the_clocks_and_a_clock_that_was_set_are_followed():
+def test_clock_offsets_and_clock_steps_are_applied():
     config = with_settings(Config(), {'gnss.time_offset': 0.1, 'imu.time_offset': 0.03})
     found = drive(bad=((3, 'status'),), config=config)
     np.testing.assert_allclose(found.t_excluded, [0.67])

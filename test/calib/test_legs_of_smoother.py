@@ -30,22 +30,22 @@ SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 
 @pytest.fixture(scope='module')
 def legs():
-    """Return the truth, settings, and the smoother's results of three town drives."""
+    """Return the truth, the settings and the smoother results of three town drives."""
     drive, config, _ = made(**SHORT, seed=1)
     steady = with_settings(config, {'verdict.scale_drift_per_day': 0.0, 'method': 'smoother'})
     return drive.truth, steady, [smoothed(**SHORT, seed=seed)[1] for seed in (1, 2, 3)]
 
 
 def by_border(one, i):
-    """Return value and sigma of ln K, yaw or pitch that the border of a result gives."""
+    """Return value and sigma of ln K, yaw or pitch from the marginal information of a result."""
     found = fit_jointly([one.marginal], [])
-    # sizes are of the vehicle's priors, of which a border has none
+    # sizes belong to the priors of the vehicle, which marginal information does not include
     of_sizes, = (s.effects[i] for s in one.sources if s.name == 'imperfection_sizes')
     return found.value[i], np.sqrt(
         found.covariance[i, i] + MODEL_FLOOR[i]**2 + of_sizes @ of_sizes)
 
 
-def test_marginal_information_and_beliefs_determine_a_leg_of_the_smoother(legs):
+def test_marginal_information_and_priors_determine_a_leg_of_the_smoother(legs):
     for one in legs[2]:
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
             e, (found, sigma) = one.estimates[name], by_border(one, i)
@@ -54,11 +54,11 @@ def test_marginal_information_and_beliefs_determine_a_leg_of_the_smoother(legs):
             assert abs(found - value) < 1e-3 * sigma
 
 
-def test_legs_of_the_smoother_add_up_their_information(legs, monkeypatch):
+def test_information_of_smoother_legs_adds_up(legs, monkeypatch):
     monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
-    # one size of each imperfection, whichever leg it is of
+    # one size of each imperfection in all legs
     shared = several._share_sizes([r.marginal for r in results])
     used = np.max([b.relaxed_sigma for b in shared], axis=0)
     C = np.linalg.inv(sum(r.marginal.information for r in results) + np.diag(1 / used**2))
@@ -74,7 +74,7 @@ def test_legs_of_the_smoother_add_up_their_information(legs, monkeypatch):
     assert whole.estimates['gyro_bias_z'] == results[2].estimates['gyro_bias_z']
 
 
-def test_sources_of_legs_combined_make_their_sigma(legs):
+def test_sources_of_combined_legs_sum_to_their_sigma(legs):
     _, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
     total = sum(s.effects @ s.effects.T for s in whole.sources)
@@ -83,10 +83,10 @@ def test_sources_of_legs_combined_make_their_sigma(legs):
     assert np.sqrt(np.diag(total)) == pytest.approx(sigma)
     assert [s.name for s in whole.sources if not s.shared] == ['legs', 'model']
     assert 'fix_latency' in {s.name for s in whole.sources}
-    assert 'heading' not in {s.name for s in whole.sources}       # there was none
+    assert 'heading' not in {s.name for s in whole.sources}       # no heading sensor
 
 
-def test_a_shared_source_is_what_an_error_of_that_belief_does(legs, monkeypatch):
+def test_common_source_equals_the_effect_of_an_error_of_its_prior(legs, monkeypatch):
     monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
     _, config, results = legs
 
@@ -104,19 +104,19 @@ def test_a_shared_source_is_what_an_error_of_that_belief_does(legs, monkeypatch)
         == pytest.approx(effect[2], rel=1e-3)
 
 
-def test_a_scale_that_walks_is_that_of_the_last_leg(legs):
+def test_random_walk_scale_is_the_scale_of_the_last_leg(legs):
     _, config, results = legs
     day = 86400 * 10**9
     far = with_settings(config, {'verdict.scale_drift_per_day': 0.1})
     whole, last = combine_legs(results, [2 * day, 0, day], far), results[0]
-    # 10 % a day: days before say nothing of it
+    # with a walk of 10 % per day, earlier days have no scale information
     assert whole.estimates[SCALE].value == pytest.approx(last.estimates[SCALE].value, rel=1e-4)
     assert whole.estimates[SCALE].sigma > 0.9 * last.estimates[SCALE].sigma
-    # but of the yaw they do
+    # but they have yaw information
     assert whole.estimates[YAW].sigma < 0.8 * last.estimates[YAW].sigma
 
 
-def test_a_wheel_that_changes_on_the_way_is_in_the_marginal_information_too(legs):
+def test_marginal_information_includes_a_wheel_change_within_the_leg(legs):
     _, config, results = legs
     run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config,
                           wheel_slips=replace(NO_SLIPS, change=8e-4))
@@ -130,7 +130,7 @@ def disputes(whole):
     return [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
 
 
-def test_a_dispute_names_leg_and_parameter(legs):
+def test_dispute_names_leg_and_parameter(legs):
     _, config, results = legs
     whole = combine_legs([results[0], moved(results[1], YAW, 0.01), results[2]],
                          [0, 1, 2], config, [4, 7, 9])
@@ -138,19 +138,19 @@ def test_a_dispute_names_leg_and_parameter(legs):
     assert text.startswith('yaw_mounting_angle: the scatter of 3 legs')
     assert '; leg 7 differs most (+' in text
     assert whole.estimates[YAW].sigma > 0.002
-    # and what is not disputed is as sharp as before
+    # undisputed values keep their sigma
     assert whole.estimates[SCALE].sigma == pytest.approx(
         combine_legs(results, [0, 1, 2], config).estimates[SCALE].sigma, rel=0.1)
 
 
-def test_sections_of_a_leg_that_disagree_name_the_largest_deviation(legs):
+def test_disagreeing_sections_of_a_leg_name_the_largest_deviation(legs):
     _, config, (one, other, _) = legs
     whole = combine_legs([one, moved(other, 'odometer_delay', 0.1)], [0, 0], config)
     (text,) = [x for x in disputes(whole) if x.startswith('the scatter of 2 legs is ')]
     assert re.search('; odometer_delay differs most [(][0-9.]+ sigma[)]$', text)
 
 
-def test_small_deviations_are_no_cause():
+def test_small_deviations_are_not_named_as_the_cause():
     found = SimpleNamespace(names=('scale_factor', 'odometer_delay', 'gnss_delay'), scatter={
         'scale_factor': 1e-5}, deviation=np.array([[9, 1, 0], [0, -2.5, 1], [0, 1, -1.0]]))
     assert several._largest_deviation(found, [4, 7, 9]) == (
@@ -158,7 +158,7 @@ def test_small_deviations_are_no_cause():
 
 
 @pytest.mark.parametrize('off', [1e-3, -3e-3])
-def test_two_legs_whose_scales_differ_dispute_it(legs, off):
+def test_two_legs_with_different_scales_dispute_the_scale(legs, off):
     _, config, (one, other, _) = legs
     whole = combine_legs([one, moved(other, SCALE, off)], [0, 1], config)
     (text,) = disputes(whole)
@@ -168,11 +168,11 @@ def test_two_legs_whose_scales_differ_dispute_it(legs, off):
     assert not disputes(combine_legs([one, other], [0, 1], config))
 
 
-def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
+def test_yaw_undetermined_in_each_leg_may_be_determined_by_all_legs(legs):
     _, config, results = legs
 
     def refused(one):
-        """Return a result whose yaw is told to 0.8 deg only, as on a drive straight on."""
+        """Return a result with a yaw sigma of only 0.8 deg, as on a straight drive."""
         loose = one.marginal.with_leg_errors({YAW: 0.014})
         return replace(one, marginal=loose, estimates=one.estimates | {
             YAW: Estimate(None, None, 'rad')}, reasons=(Reason(Code.YAW_NOT_DETERMINED, 'no'),))

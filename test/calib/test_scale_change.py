@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs carried on without their rows, and a scale that changes between two of them."""
+"""Legs continued without their rows, and a scale that changes between two legs."""
 
 from dataclasses import replace
 import json
@@ -30,7 +30,7 @@ ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of 
 
 
 @pytest.mark.parametrize('first', [1, 2, 4])
-def test_legs_carried_on_are_one_fit_with_those_to_come(first):
+def test_continued_legs_equal_one_fit_with_the_later_legs(first):
     borders = Toy(np.random.default_rng(5)).borders()
     whole = fit_jointly(borders, STEPS, 'k')
     before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').information
@@ -40,11 +40,11 @@ def test_legs_carried_on_are_one_fit_with_those_to_come(first):
     assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 
 
-def test_a_walk_is_no_change_but_by_chance_and_a_change_is_found():
+def test_random_walk_is_rarely_a_change_and_a_change_is_found():
     rng = np.random.default_rng(6)
     toy = Toy(rng, states=6, rows=60)
     alarms = sum(len(scale_steps(toy.walk(rng).borders(), STEPS, 'k')) for _ in range(500))
-    # three legs of five can be held against others: one in 370 of 1500 is 4
+    # three legs of five can be compared with others: one in 370 of 1500 is 4
     assert 0 < alarms <= 12
     rng = np.random.default_rng(7)
     toy = Toy(rng, states=6, rows=60)
@@ -65,7 +65,7 @@ def session():
 
 
 def legs_of(results, change=0.0, since=2):
-    """Return legs of results, the scale of the later ones changed."""
+    """Return legs of results, with the scale of the later legs changed."""
     out = []
     for i, one in enumerate(results, 1):
         if i > since:
@@ -77,7 +77,7 @@ def legs_of(results, change=0.0, since=2):
 
 
 def compare(found, whole, share):
-    """Compare two calibrations by a share of their sigmas."""
+    """Compare two calibrations within a share of their sigmas."""
     for name in (SCALE, YAW):
         a, b = found.estimates[name], whole.estimates[name]
         assert a.value == pytest.approx(b.value, abs=share * b.sigma), name
@@ -88,23 +88,23 @@ def changed(calibration):
     return [r.text for r in calibration.reasons if r.code is Code.SCALE_CHANGED]
 
 
-def test_a_tyre_that_lost_air_is_said_and_the_scale_follows(session):
+def test_pressure_loss_of_a_tyre_is_reported_and_the_scale_follows(session):
     config, results = session
     before = combine(legs_of(results), config)
     assert changed(before) == []
     after = combine(legs_of(results, -0.009), config)
     (text,) = changed(after)
     assert text.startswith('the scale changed by -0.')
-    assert float(text.split()[4]) == pytest.approx(-0.9, abs=0.02)      # one leg's sigma
+    assert float(text.split()[4]) == pytest.approx(-0.9, abs=0.02)      # sigma of one leg
     assert 'since 1970-01-01 00:33 UTC, seen in leg 3: tyre pressure, wear, load' in text
     assert after.verdict is Verdict.CAUTION
     e, old = after.estimates[SCALE], before.estimates[SCALE]
     alone = legs_of(results, -0.009)[2].methods['smoother'].estimates[SCALE]
     assert abs(e.value - alone.value) < alone.sigma
     assert e.value < 0.995 * old.value
-    # what a tyre does not touch is as well known as before
+    # a tyre does not affect the yaw: the sigma is as before
     assert after.estimates[YAW].sigma == pytest.approx(before.estimates[YAW].sigma, rel=0.05)
-    # without leg.automatic a leg that differs widens the sigma instead
+    # without leg.automatic, a leg that differs widens the sigma instead
     off = with_settings(config, {'leg.automatic': False})
     plain = combine(legs_of(results, -0.009), off)
     assert changed(plain) == []
@@ -112,7 +112,7 @@ def test_a_tyre_that_lost_air_is_said_and_the_scale_follows(session):
     assert Code.LEGS_DISAGREE in {r.code for r in plain.reasons}
 
 
-def test_a_result_on_the_disk_goes_on(session, monkeypatch):
+def test_combination_continues_from_a_result_on_disk(session, monkeypatch):
     monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
     config, results = session
     legs = legs_of(results)
@@ -126,7 +126,7 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
         found = combine(legs[2:], config, before)
         compare(found, whole, 1e-3)
         assert found.carried.legs == 3
-    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
+    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # a rejected leg adds nothing
     assert add_to_carried([rejected], config, carried) is carried
     assert found.carried.includes(carried)
     assert not carried.includes(found.carried)
@@ -134,21 +134,21 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
     assert text.startswith('the scale changed by +')
     assert float(text.split()[4]) == pytest.approx(2.0, abs=0.1)
     assert 'seen in leg 1' in text
-    # a clock that went back, or an odometer of another kind: they do not belong together
+    # a clock set back or another kind of odometer: results are not combined
     for other in (replace(carried, last_ns=10**18), replace(carried, unit='1')):
         alone = combine(legs[2:], config, other)
         assert alone.estimates[SCALE].value == results[2].estimates[SCALE].value
 
 
 def imu_of(legs, config, folder):
-    """Return settings with the IMU that a calibration of some legs left, and that IMU."""
+    """Return settings with the IMU constants of a calibration of these legs, and the IMU."""
     path = folder / 'calibration.json'
     path.write_text(json.dumps(as_json(combine(legs, config), config, [], 'now')))
     own = with_settings(config, {'imu.constants': str(path)})
     return own, known_imu(own)
 
 
-def test_an_imu_known_by_rtk_tells_the_scale_by_slow_fixes(tmp_path):
+def test_imu_known_from_rtk_determines_the_scale_with_correlated_fixes(tmp_path):
     results = []
     for seed, noise in ((1, 'rtk'), (2, 'correlated')):
         drive, config, leg = made(duration=200.0, imu_grade='industrial', seed=seed,
@@ -160,19 +160,19 @@ def test_an_imu_known_by_rtk_tells_the_scale_by_slow_fixes(tmp_path):
     _, imu = imu_of(legs[:1], config, tmp_path)
     alone, found, whole = (combine(some, config, imu=of).estimates[SCALE] for some, of in (
         (legs[1:], None), (legs[1:], imu), (legs, None)))
-    # no scale is taken along: less than both legs together tell, and four times what one does
+    # no scale is transferred: less information than both legs, but much more than one leg
     assert 3 * whole.sigma < found.sigma < 0.4 * alone.sigma
     for e in (alone, found):
         assert abs(e.value - drive.truth.scale) < 3 * e.sigma
 
 
-def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
+def test_imu_belongs_to_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
     config, results = session
     config = with_settings(config, {'leg.automatic': False, 'vehicle': 'van'})
     legs = legs_of(results)
     own, imu = imu_of(legs[:2], config, tmp_path)
     assert {name.split('_')[0] for name in imu.marginal.names} == {'gyro', 'accelerometer'}
-    # a leg that is in it already does not count twice, an IMU of another vehicle not at all
+    # a leg that it includes does not count twice; an IMU of another vehicle is rejected
     assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
         1].estimates[YAW].sigma
     for other in ({'vehicle': 'lorry'}, {'imu.mounting_rpy': (0.0, 0.0, 1.5)}):
@@ -180,8 +180,8 @@ def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
             known_imu(with_settings(own, other))
 
 
-def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
-    """One leg more or less tells half of what three do of a sigma between them: 10 % of others."""
+def test_scatter_information_of_combined_legs_is_continued(session):
+    """One leg changes the scatter known from three legs by half, and other sigmas by 10 %."""
     config, results = session
     legs = legs_of(results)
     whole = combine(legs, config)

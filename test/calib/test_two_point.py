@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The two-point method on simulated drives: what it finds, and what it refuses."""
+"""The two-point method on simulated drives: results and refusals."""
 
 from dataclasses import replace
 
@@ -40,10 +40,10 @@ def found(made, config=None, leg=None):
         'paper, counts', 'paper, angle', 'paper, speed'])
 def test_error_free_data_give_the_truth(options):
     """
-    What remains is the trapezoid rule of attitude over travel in turns, 20 ms a step.
+    The remaining error is the trapezoid rule of attitude and travel in turns, 20 ms a step.
 
-    A turn of w rad/s bends a step by w^2 dt^2 / 12 of itself: at 0.3 rad/s 3e-6, on the quarter
-    of the way that is turns; yaw and pitch alike.
+    A turn of w rad/s changes a step by w^2 dt^2 / 12 of itself: at 0.3 rad/s 3e-6, in the
+    quarter of the path length in turns; the same for yaw and pitch.
     """
     made = drives.drive(**CLEAN | options)
     scale, yaw, pitch = found(made)
@@ -52,7 +52,7 @@ def test_error_free_data_give_the_truth(options):
     assert pitch == pytest.approx(made.truth.pitch, abs=1e-5)
 
 
-def test_the_ratio_is_to_the_nominal_scale_and_without_one_is_unknown():
+def test_ratio_refers_to_the_nominal_scale_and_is_unknown_without_one():
     made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
     e = drives.two_point(made.leg(), drives.settings(made)).estimates['scale_ratio']
     assert e.value == pytest.approx(made.truth.scale_ratio, rel=1e-6)
@@ -67,8 +67,8 @@ def test_plane_and_geodesic_agree_with_the_solution_in_space(kind, ellipsoid):
     """
     Ratios of chords in any plane: the scale of the plane cancels in S1 / S2.
 
-    Between ends 1.2 times as far apart it changes by less than 1e-7 a km; 116 deg lies 1 deg
-    from the meridian of its zone. The plane's bearings differ by its convergence, alike for both.
+    Between ends 1.2 times as far apart it changes by less than 1e-7 a km; 116 deg lies 1 deg from
+    the meridian of its zone. Bearings in the plane differ by its convergence, equal for both.
     """
     made = drives.drive(**CLEAN, scenario='straight', duration=200.0, height=1500.0)
     result = drives.two_point(made.leg(), drives.settings(made, projection__kind=kind,
@@ -80,16 +80,16 @@ def test_plane_and_geodesic_agree_with_the_solution_in_space(kind, ellipsoid):
 
 
 def surveyed(fix, k):
-    """Return a fix as a surveyed point, good to 1 cm."""
+    """Return a fix as a surveyed point, accurate to 1 cm."""
     return tuple(map(float, (np.rad2deg(fix.latitude[k]), np.rad2deg(fix.longitude[k]),
                              fix.height[k], 0.01)))
 
 
-def test_surveyed_points_take_the_place_of_fixes():
+def test_surveyed_points_replace_fixes():
     made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
     leg, fix = made.leg(), made.fix
     ends = [surveyed(fix, k) for k in (0, -1)]
-    # fixes that are 50 m off, all alike but the last part: only the survey is right
+    # fix errors of 50 m, common except for the last part: only the survey is correct
     off = drives.changed(fix, latitude=lambda a: a + 1e-6 * np.linspace(0, 8, len(a)))
     config = drives.settings(made, reference__start=ends[0], reference__end=ends[1])
     scale, yaw, _ = found(made, config, replace(leg, fix=off))
@@ -98,11 +98,11 @@ def test_surveyed_points_take_the_place_of_fixes():
     sources = {s.name: s for s in drives.two_point(replace(leg, fix=off), config).sources}
     track_n = calibrate(leg, config).track_n
     length = np.hypot(*(track_n[-1][:2] - track_n[0][:2]))
-    # 1 cm at each end; residuals of the bad fixes may widen it
+    # 1 cm at each end; residuals of the wrong fixes may widen it
     assert sources['fix_end'].effects[0] @ sources['fix_end'].effects[0] >= (0.009 / length)**2
 
 
-def test_a_surveyed_end_is_not_taken_for_where_a_holdout_ends():
+def test_surveyed_end_is_not_used_as_the_end_of_a_holdout():
     made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
     config = drives.settings(made, reference__end=surveyed(made.fix, -1))
     result = calibrate(made.leg(), config, holdout=True)
@@ -115,17 +115,17 @@ def test_marks_in_motion_are_fitted_and_their_time_errors_are_budgeted():
     moving = drives.shifted(made.leg(), start=30.0, stop=-90.0)       # both at 12 m/s
     result = calibrate(moving, drives.settings(made))
     assert all(abs(z) < 4 for z in drives.errors_in_sigmas(result, made.truth).values())
-    # only the stop moves now: 12 m/s times 0.05 s over the chord
+    # only the stop mark is in motion now: 12 m/s times 0.05 s over the chord
     half = calibrate(drives.shifted(made.leg(), stop=-90.0), drives.settings(made))
     latency = half.methods['two_point'].details['budget']['fix_latency']
     length = np.hypot(*(half.track_n[-1] - half.track_n[0])[:2])
     assert latency['scale_factor'] / made.truth.scale == pytest.approx(0.6 / length, rel=0.05)
-    # both at the same speed: the chord is late by as much at both ends
+    # the same speed at both ends: the chord is late by the same distance at both ends
     both = result.methods['two_point'].details['budget']['fix_latency']
     assert both['scale_factor'] < 0.1 * latency['scale_factor']
 
 
-def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
+def test_without_heights_the_scale_is_given_and_the_pitch_is_refused():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', pitch=0.4 * DEG)
     flat = replace(made.leg(), fix=drives.changed(made.fix, height=lambda a: a * np.nan))
     result = calibrate(flat, drives.settings(made))
@@ -133,14 +133,14 @@ def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
     assert e['pitch_mounting_angle'].value is None
     assert Code.PITCH_NOT_DETERMINED in drives.everything_said(result)
     assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
-    # the pitch that is not known is half its square in the scale (152 ppm a degree), and the
-    # height above the ellipsoid that is not known is 800 m of the Earth's radius
+    # an unknown pitch adds half its square to the scale (152 ppm per degree), and an unknown
+    # height above the ellipsoid is 800 m of the Earth's radius
     budget = result.methods['two_point'].details['budget']
     assert budget['height']['scale_factor'] / made.truth.scale == pytest.approx(1.254e-4, rel=0.01)
     assert e['scale_factor'].sigma / made.truth.scale > 5e-4
 
 
-def test_fixes_off_the_track_are_stated_in_metres_with_both_causes():
+def test_deviation_of_fixes_is_stated_in_metres_with_both_causes():
     made = drives.drive(scenario='town', duration=300.0, imu_grade='tactical',
                         fix_noise='correlated')
     reason, = (r for r in drives.two_point(made.leg(), drives.settings(made)).reasons
@@ -156,7 +156,7 @@ def test_heights_that_give_a_pitch_beyond_the_limit_reject_the_method():
     assert why.text == 'the heights of the marks give a pitch of +20 deg; the limit is 15 deg'
 
 
-def test_a_closed_loop_is_refused_with_what_would_help():
+def test_closed_loop_is_refused_with_the_action():
     made = drives.drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
     result = calibrate(made.leg(), drives.settings(made))
     texts = drives.everything_said(result)
@@ -164,7 +164,7 @@ def test_a_closed_loop_is_refused_with_what_would_help():
     assert '--leg' in Code.CHORD_TOO_SHORT.remedy
     assert all(e.value is None for e in result.methods['two_point'].estimates.values())
     assert result.verdict.value == 'rejected'
-    # its way out alone is a leg
+    # the outward path alone is a leg
     t = drives.seconds(made.leg(), made.imu)
     stop = float(t[-1]) / 2 - 20.0
     part = replace(made.leg(), stop_ns=made.truth.start_ns + round(stop * 1e9))
@@ -172,7 +172,7 @@ def test_a_closed_loop_is_refused_with_what_would_help():
     assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
 
 
-def test_a_track_that_loops_where_the_fixes_do_not_is_refused():
+def test_track_that_loops_where_the_fixes_do_not_is_refused():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
     spun = drives.changed(made.imu, w_i=lambda a: a + [0.0, 0.0, 0.5] * (
         drives.seconds(made.leg(), made.imu) > 5.0)[:, None])
@@ -181,7 +181,7 @@ def test_a_track_that_loops_where_the_fixes_do_not_is_refused():
 
 
 @pytest.mark.parametrize(('sigma', 'given'), [(0.05, False), (0.004, True)])
-def test_a_heading_worse_than_the_asked_yaw_refuses_the_yaw_only(sigma, given):
+def test_heading_less_accurate_than_the_required_yaw_refuses_only_the_yaw(sigma, given):
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=sigma,
                                                    verdict__max_yaw_sigma=0.0087))
@@ -191,7 +191,7 @@ def test_a_heading_worse_than_the_asked_yaw_refuses_the_yaw_only(sigma, given):
     assert e['scale_factor'].value == pytest.approx(made.truth.scale, rel=2e-3)
 
 
-def test_the_course_is_no_heading_to_find_a_yaw_by():
+def test_course_is_not_used_as_the_heading_for_the_yaw():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='consumer')
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=None))
     assert 'course' in drives.everything_said(result)[Code.YAW_NOT_SEPARABLE]
@@ -202,10 +202,10 @@ def test_the_course_is_no_heading_to_find_a_yaw_by():
 
 
 @pytest.mark.parametrize(('setting', 'late', 'scenario', 'stop'), [
-    ('odometer__time_offset', 'odometer_delay', 'town', 0.0),       # turns show it
-    ('gnss__time_offset', 'fix_delay', 'straight', -90.0)])         # a mark at 12 m/s shows it
-def test_time_offsets_have_the_sign_of_being_added(setting, late, scenario, stop):
-    """A sensor whose stamps are 0.2 s late is put right by -0.2, twice as wrong by +0.2."""
+    ('odometer__time_offset', 'odometer_delay', 'town', 0.0),       # observable in turns
+    ('gnss__time_offset', 'fix_delay', 'straight', -90.0)])         # observable at 12 m/s
+def test_time_offsets_are_added_to_the_stamps(setting, late, scenario, stop):
+    """Stamps that are 0.2 s late are corrected by -0.2; +0.2 doubles the error."""
     made = drives.drive(**CLEAN, scenario=scenario, duration=200.0, seed=2, **{late: 0.2})
     leg = drives.shifted(made.leg(), stop=stop)
     truth = np.array([made.truth.scale, made.truth.yaw])
@@ -217,7 +217,7 @@ def test_time_offsets_have_the_sign_of_being_added(setting, late, scenario, stop
     assert off[0.2][worst] == pytest.approx(2 * off[0.0][worst], rel=0.05)
 
 
-def test_the_imus_offset_is_that_of_the_others_turned_round():
+def test_imu_offset_is_the_negative_offset_of_the_other_sensors():
     made = drives.drive(**CLEAN, scenario='town', duration=200.0, seed=2)
     late = replace(made.leg(), imu=drives.changed(made.imu, stamp_ns=lambda a: a + 200_000_000),
                    start_ns=made.truth.start_ns + 200_000_000,
@@ -226,7 +226,7 @@ def test_the_imus_offset_is_that_of_the_others_turned_round():
                                found(made), rtol=1e-6)
 
 
-def test_a_mark_between_fixes_far_apart_still_finds_one():
+def test_mark_between_rare_fixes_uses_one_of_them():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', fix_rate=0.2)
     for every in (1, 3):
         few = take(made.fix, np.arange(len(made.fix.stamp_ns)) % every == 0)
