@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of two wheels on a plane for the wheels' search: simulated drives, and a lawn."""
+"""Planar legs of two wheels for the wheel search: simulated drives, and a lawn."""
 
 from drives import cached, drive
 import numpy as np
@@ -20,12 +20,12 @@ DRIVES = {
     'out and back': RTK | {'scenario': 'out_and_back', 'duration': 400.0},
     'straight': {'scenario': 'straight', 'two_wheels': True, 'duration': 400.0},
     'paper': {'scenario': 'paper', 'two_wheels': True, 'odometer': 'angle'}}
-TRUE = np.array([0.99, 1.015, 0.03])       # of the drives on a plane
+TRUE = np.array([0.99, 1.015, 0.03])       # K_L, K_R and yaw of the simulated planar drives
 
 
 @cached
 def simulated(heading_error=0.0, **options):
-    """Return a simulated drive and its planar leg, heading given wrong by an angle from north."""
+    """Return a simulated drive and its planar leg with an error of the heading from north."""
     made = drive(**options)
     scale, pitch = made.options.nominal_scale, made.options.pitch
     grade = made.options.imu_grade
@@ -44,9 +44,9 @@ def simulated(heading_error=0.0, **options):
 
 def on_a_plane(lanes=8, sigma=0.02, seed=0, length=15.0, k=600):
     """
-    Return a robot's leg up and down a lawn: (K_L L + K_R R) / 2 turned by the heading, and noise.
+    Return a robot's leg on parallel lanes: (K_L L + K_R R) / 2 rotated by heading, with noise.
 
-    Not in circles: on a circle left and right differ by a multiple of the position itself.
+    Not in circles: on a circle, left minus right is proportional to the position itself.
     """
     path = np.linspace(0.0, lanes * (length + 3.0), 20 * k + 1)
     lane, along = np.divmod(path, length + 3.0)

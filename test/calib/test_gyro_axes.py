@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Axes of the gyro against gravity and the course of the fixes."""
+"""Axes of the gyro compared with gravity and the course of the fixes."""
 
 from dataclasses import replace
 from functools import cache
@@ -40,12 +40,12 @@ def town():
 
 
 def with_imu(made, M=SAME, **more):
-    """Return the leg of a drive whose gyro sends M w, or other columns."""
+    """Return the leg of a drive whose gyro outputs M w, or with other columns changed."""
     return replace(made.leg(), imu=changed(made.imu, **({'w_i': lambda w: w @ M.T} | more)))
 
 
 def of_gyro(made, M=SAME, C=SAME, **options):
-    """Return what a leg says whose gyro sends M w, and whose Imu sits turned by C (b to i)."""
+    """Return the reasons of a leg with gyro output M w and an IMU rotated by C (b to i)."""
     config = with_settings(settings(made), options)
     leg = with_imu(made, M @ C, f_i=lambda f: f @ C.T)
     return {r.code: r for r in faults(screen_leg(leg, config), config)}
@@ -56,10 +56,10 @@ X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])}
 
 @pytest.mark.parametrize(('changes', 'code', 'do'), [
     *(({'M': AXES[name]}, Code.GYRO_AXES, f': {DO[name]}') for name in AXES),
-    # an axis of the accelerometer is not blamed on the gyro
+    # an accelerometer axis error is not attributed to the gyro
     (X_MIRRORED, Code.IMU_AXES, 'negate linear_acceleration.x'),
     (Y_MIRRORED, Code.IMU_AXES, 'negate linear_acceleration.y')], ids=[*AXES, 'f x', 'f y'])
-def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(changes, code, do):
+def test_wrong_axis_rejects_the_leg_and_names_the_correction(changes, code, do):
     result = calibrate(with_imu(town(), **changes), settings(town()))
     assert rejecting(result) == {code} == set(everything_said(result))
     assert do in next(r.do for r in result.reasons)
@@ -67,8 +67,8 @@ def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(changes, code,
 
 @pytest.mark.parametrize('seed', [5, 6])
 @pytest.mark.parametrize('name', ['mirrored x', 'x and y swapped'])
-def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
-    """On gentle hills three segments determine the roll: 1.00 ± 0.04, ± 0.06."""
+def test_precise_coefficient_of_three_segments_names_the_axis(seed, name):
+    """On gentle hills three segments determine the roll coefficient: 1.00 ± 0.04, ± 0.06."""
     made = drive(scenario='town', duration=300.0, imu_rate=50.0, imu_grade='industrial',
                  odometer_rate=20.0, fix_rate=5.0, fix_noise='rtk', slope=0.03, seed=seed)
     assert 'measures the rotation of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
@@ -77,8 +77,8 @@ def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
 
 @pytest.mark.parametrize(('name', 'pitch'), [('mirrored x', 0.4), ('x and y swapped', 0.4),
                                              ('x and y swapped', 2.0)])
-def test_wrong_axes_that_flat_ground_does_not_show_are_a_skew_of_the_accelerometer(name, pitch):
-    """Turns show the pitch by the gyro, accelerations by the accelerometer: they contradict."""
+def test_wrong_axes_hidden_by_flat_ground_are_reported_as_accelerometer_skew(name, pitch):
+    """Turns give the pitch by the gyro, accelerations by the accelerometer: they contradict."""
     made = drive(scenario='town', duration=400.0, imu_grade='industrial', slope=0.0, seed=5,
                  fix_rate=5.0, pitch=pitch * DEG)
     config = settings(made, method='smoother')
@@ -92,8 +92,8 @@ def test_wrong_axes_that_flat_ground_does_not_show_are_a_skew_of_the_acceleromet
 @pytest.mark.parametrize('segments', [1.5, 3.0, 12.0])
 @pytest.mark.parametrize(('found', 'nearest'), [(1j, 0.0), (-1.0, 0.0), (0.5 + 0.3j, 0.5),
                                                 (1.2, 1.0)])
-def test_the_chance_of_a_coefficient_is_that_of_f(segments, found, nearest):
-    """A complex mean has two degrees of freedom, its scatter two for each segment but one."""
+def test_chance_of_a_coefficient_follows_the_f_distribution(segments, found, nearest):
+    """A complex mean has two degrees of freedom, its scatter two per segment minus two."""
     fit = GravityFit(np.array([found]), np.array([0.1]), np.array([segments]))
     assert fit.chance(0, 1.0) == pytest.approx(
         f_distribution.sf(abs(found - nearest)**2 / 0.1**2, 2, 2 * (segments - 1)), rel=1e-9)
@@ -101,8 +101,8 @@ def test_the_chance_of_a_coefficient_is_that_of_f(segments, found, nearest):
 
 @pytest.mark.parametrize(('x', 'y', 'named'), [
     (-1.36j, 0.98j, []), (-1.0, 0.98j, ['x']), (1j, 0.9, ['x', 'y'])])
-def test_two_gyro_axes_that_measure_one_axis_are_no_fault_of_the_axes(monkeypatch, x, y, named):
-    """The first are those of a zoo drive with correct axes, whose chance is 7e-6."""
+def test_two_gyro_axes_with_the_same_signal_are_not_an_axis_fault(monkeypatch, x, y, named):
+    """The first coefficients are from a zoo drive with correct axes; their chance is 7e-6."""
     fit = GravityFit(np.array([x, y, 0.0]), np.array([0.1, 0.05, 0.02]), np.full(3, 12.0))
     monkeypatch.setattr('odocal_ros.calib.gyro_axes.gravity_fit', lambda *_: fit)
     inputs = SimpleNamespace(t_imu=None, travel=None)
@@ -116,15 +116,15 @@ def test_two_gyro_axes_that_measure_one_axis_are_no_fault_of_the_axes(monkeypatc
      'longitude (x and y) are swapped, or linear_acceleration is negated'),
     ('fix', {'longitude': np.negative}, 'longitude (x and y) are swapped, or linear_acceler'),
     ('imu', {'w_i': np.negative, 'f_i': lambda f: np.full_like(f, np.nan)}, 'instead of 1)')])
-def test_the_sign_that_is_wrong_is_found_by_the_third_sensor(topic, changes, cause):
+def test_third_sensor_identifies_the_wrong_sign(topic, changes, cause):
     leg = replace(town().leg(), **{topic: changed(getattr(town(), topic), **changes)})
     (found,) = (r for r in calibrate(leg, settings(town())).reasons if r.code is Code.GYRO_SIGN)
     assert cause in found.text
     assert ('Set imu.mounting_rpy' in found.do) == ('f_i' in changes and cause == 'instead of 1)')
 
 
-def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
-    """Where the course of few fixes says nothing, the accelerometer does."""
+def test_mirrored_gyro_is_found_by_accelerations_with_few_fixes():
+    """The course of five fixes is not conclusive; accelerations in turns show the sign."""
     fix = town().fix
     few = replace(town(), fix=take(fix, np.linspace(0, len(fix.stamp_ns) - 1, 5).astype(int)))
     assert Code.GYRO_SIGN not in of_gyro(few)
@@ -135,8 +135,8 @@ def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
 @pytest.mark.parametrize(('sensor', 'wrong', 'yaw'), [
     ('w_i', [1.0, 1.0, -1.0], 0.0), ('f_i', [1.0, -1.0, 1.0], 0.0),
     ('f_i', [-1.0, 1.0, 1.0], np.pi)])
-def test_a_mirrored_axis_does_not_hide_the_mounting(sensor, wrong, yaw):
-    """Else only the orientation is asked for, and the fault not named."""
+def test_mirrored_axis_does_not_hide_the_mounting(sensor, wrong, yaw):
+    """Otherwise only the orientation is reported, and not the fault."""
     made, C = town(), matrix_from_rpy((np.pi / 2, 0.0, np.pi / 2))
     sent = {name: getattr(made.imu, name) for name in ('w_i', 'f_i')}
     sent[sensor] = sent[sensor] * wrong
@@ -146,13 +146,13 @@ def test_a_mirrored_axis_does_not_hide_the_mounting(sensor, wrong, yaw):
     assert found.C_bi == pytest.approx(matrix_from_rpy((0.0, 0.0, yaw)) @ C, abs=1e-9)
 
 
-def test_axes_are_those_of_the_messages_whatever_the_mounting():
-    """An Imu that lies on its side and looks back has its x along another axis of the vehicle."""
+def test_axes_are_those_of_the_messages_for_any_mounting():
+    """An IMU that is rolled and points backwards has its x along another vehicle axis."""
     rpy = (np.pi / 2, 0.0, np.pi / 2)
     C = matrix_from_rpy(rpy).T
     for name in ('mirrored x', 'mirrored y'):
         reasons = of_gyro(town(), AXES[name], C, **{'imu.mounting_rpy': rpy})
-        if Code.GYRO_SIGN in reasons:      # the one that turns with the course
+        if Code.GYRO_SIGN in reasons:      # the axis that turns with the course
             continue
         assert DO[name] in reasons[Code.GYRO_AXES].do, name
     assert not {Code.GYRO_SIGN, Code.GYRO_AXES} & set(
@@ -161,7 +161,7 @@ def test_axes_are_those_of_the_messages_whatever_the_mounting():
 
 @pytest.mark.parametrize('up', [(0.1, -0.05, 0.99), (0.0, 0.1, -0.99), (0.99, 0.1, 0.0),
                                 (0.1, -0.99, 0.1)])
-def test_level_axes_are_right_handed_and_named_by_the_sensor_axis_next_to_them(up):
+def test_level_axes_are_right_handed_and_named_by_the_nearest_sensor_axis(up):
     up = np.array(up) / np.linalg.norm(up)
     axes, names = level_axes(up)
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
@@ -175,12 +175,12 @@ def test_level_axes_are_right_handed_and_named_by_the_sensor_axis_next_to_them(u
     ('town', {'slope': 0.04}), ('straight', {'slope': 0.04}),
     ('town', {'slope': 0.04, 'imu_grade': 'consumer'}), ('town', {}),
     ('straight', {'imu_grade': 'consumer'})])
-def test_a_sound_gyro_is_not_accused(scenario, more):
+def test_correct_gyro_is_not_reported(scenario, more):
     made = drive(duration=300.0, seed=11, scenario=scenario, **more)
     assert Code.GYRO_AXES not in of_gyro(made)
 
 
-def test_the_fit_finds_each_coefficient_within_its_sigma():
+def test_fit_finds_each_coefficient_within_its_sigma():
     made = town()
     inputs = screen_leg(made.leg(), settings(made)).inputs
     axes, _ = level_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The cause of an IMU noise is named by its evidence; the noise of a twist is that of drives."""
+"""The cause of IMU noise is named by evidence; twist noise agrees with simulated drives."""
 
 from types import SimpleNamespace
 
@@ -28,15 +28,15 @@ def leg(step_w, step_f, noise=0.5, n=20_000):
     return SimpleNamespace(t_imu=np.arange(n) / RATE, w_b=w, f_b=f)
 
 
-def test_the_step_of_a_signal_is_found_and_none_where_there_is_none():
-    without_noise = {'gyro': 0.0, 'accel': 0.0}       # any step explains it
+def test_quantisation_step_of_a_signal_is_found_or_zero():
+    without_noise = {'gyro': 0.0, 'accel': 0.0}       # any step explains zero noise
     assert find_quantised(leg(np.deg2rad(0.25), 0.0), without_noise) == {
         'gyro': pytest.approx(np.deg2rad(0.25), rel=0.01)}
 
 
-def test_quantisation_explains_noise_of_its_own_size_only():
+def test_quantisation_explains_only_noise_of_its_size():
     step = 0.125
-    white = step * np.sqrt(1 / 12 / RATE)        # the closed form of rounding
+    white = step * np.sqrt(1 / 12 / RATE)        # closed form of rounding
     coarse = leg(0.0, step)
     assert find_quantised(coarse, {'gyro': 1.0, 'accel': 1.4 * white}) == {
         'accel': pytest.approx(step, rel=0.01)}
@@ -44,14 +44,14 @@ def test_quantisation_explains_noise_of_its_own_size_only():
 
 
 def problem(leg, rest):
-    """Return what the cause is found by; rest: s of standstill in front."""
+    """Return the input of the cause search; rest: s of standstill before the drive."""
     keys = np.arange(0.0, leg.t_imu[-1], 1.0)
     return SimpleNamespace(leg=leg, at_rest=keys < rest,
                            imu=SimpleNamespace(t=keys, key=np.arange(len(keys))))
 
 
 def noisy(moving, rest, rest_s=60.0, n=20_000):
-    """Return a leg whose samples vary so, white as rad/s/sqrt(Hz), in motion and at rest."""
+    """Return a leg with white noise, rad/s/sqrt(Hz), in motion and at rest."""
     one = leg(0.0, 0.0, noise=0.0, n=n)
     sigma = np.where(one.t_imu < rest_s, rest, moving)[:, None] * np.sqrt(RATE)
     rng = np.random.default_rng(4)
@@ -59,7 +59,7 @@ def noisy(moving, rest, rest_s=60.0, n=20_000):
     return problem(one, rest_s)
 
 
-def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknown():
+def test_noise_only_in_motion_is_vibration_and_noise_at_rest_is_the_sensor():
     for moving, rest, gyro, cause, other in (
             (1e-2, 1e-3, 5e-3, 'vibration: gyro samples vary 10 times as much in motion as at '
              'rest', 'imu.gyro_noise'),
@@ -71,7 +71,7 @@ def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknow
         assert other not in text
 
 
-def test_a_cause_of_one_sensor_is_not_stated_for_both():
+def test_cause_of_one_sensor_is_not_stated_for_both():
     one = noisy(1e-2, 1e-2)
     sigma = np.where(one.leg.t_imu < 60.0, 0.01, 0.1)[:, None]
     one.leg.f_b = sigma * np.random.default_rng(5).standard_normal((len(sigma), 3))
@@ -82,7 +82,7 @@ def test_a_cause_of_one_sensor_is_not_stated_for_both():
     assert text.startswith('The cause is vibration: ')
 
 
-def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unknown():
+def test_unexplained_noise_without_a_standstill_is_vibration_or_unknown():
     one = noisy(1e-2, 1e-2, rest_s=0.0)
     vibrating = find_noise_cause(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])
     assert 'gyro samples vary 10 times as much as their means over seconds' in vibrating
@@ -90,7 +90,7 @@ def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unkno
         one, {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
 
 
-def test_a_quantised_sensor_is_named_beside_another_cause():
+def test_quantised_sensor_is_named_beside_another_cause():
     one = noisy(1e-2, 8e-3)
     one.leg.f_b = np.round(np.cumsum(np.full((20_000, 3), 1e-3), axis=0) / 0.125) * 0.125
     white = 0.125 * np.sqrt(1 / 12 / RATE)
@@ -101,7 +101,7 @@ def test_a_quantised_sensor_is_named_beside_another_cause():
 
 
 @pytest.mark.parametrize(('name', 'tyres'), [('odometer_delay', False), ('scale_factor', True)])
-def test_legs_that_differ_in_a_delay_blame_no_tyre(name, tyres):
+def test_legs_that_differ_in_a_delay_are_not_attributed_to_a_tyre(name, tyres):
     found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], disputed=[name],
                             factor=1.0)
     reason, = _disagreement_reasons(found, [1, 2])
@@ -110,16 +110,16 @@ def test_legs_that_differ_in_a_delay_blame_no_tyre(name, tyres):
 
 
 def errors_over_sigma(made):
-    """Return rms error over sigma of the speed, and of the turn rate if two wheels give it."""
+    """Return rms error over sigma of the speed, and of the turn rate with two wheels."""
     config = settings(made, heading_sigma=None, method='smoother')
     result = combine([calibrate(made.leg(), config)], config)
     noise, estimates = twist_noise(result), result.estimates
     t = (made.odometer.stamp_ns - made.options.start_ns) * 1e-9
     state, T = made.motion.at(t), np.diff(t)
-    if made.options.odometer == 'speed':        # of a moment
+    if made.options.odometer == 'speed':        # instantaneous
         factor = estimates.get(AS_SENT, estimates['scale_factor']).value
         v, w, wheels = state.speed[1:], state.yaw_rate[1:], [factor * made.odometer.value[1:]]
-    else:                                       # the mean between two messages
+    else:                                       # mean between two messages
         sides = ('_left', '_right') if len(made.wheels) > 1 else ('',)
         v, w = np.diff(state.travel) / T, (state.yaw_rate[1:] + state.yaw_rate[:-1]) / 2
         wheels = [estimates[f'scale_factor{side}'].value * np.diff(wheel.value) / T
@@ -142,11 +142,11 @@ def errors_over_sigma(made):
     {'odometer': 'speed', 'seed': 12, 'real': Real(speed_step=1 / 3.6), 'duration': 500.0},
     {'odometer': 'speed', 'speed_noise': 0.005, 'scenario': 'motorway',
      'real': Real(speed_law=0.01)}], ids=str)
-def test_errors_over_sigma_are_one(options):
+def test_errors_over_sigma_have_rms_one(options):
     """
     With 300 s at 10 Hz or more, the rms of independent errors is within 1.3 % of one.
 
-    The tolerance is for what is not independent: constants, one cruise of a quantised speed.
+    The tolerance allows dependent errors: constants, one constant quantised speed.
     """
     made = drive(**({'scenario': 'town', 'duration': 300.0, 'seed': 4, 'imu_grade': 'industrial',
                      'odometer_rate': 10.0} | options))

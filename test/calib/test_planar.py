@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The planar estimate: closed forms, truth within sigma, the bound by the information."""
+"""The planar estimate: closed forms, truth within sigma, the Cramer-Rao bound."""
 
 from dataclasses import replace
 
@@ -36,9 +36,9 @@ def body(moves):
 def run_of(d, kind='differential', arc=0.0, lateral=0.95, slip=0.0, noise=1e-4, every=1, rng=None,
            offset=0.0, count=4):
     """
-    Return a Run of body increments; slip m/sqrt(m) of each wheel, noise m of positions.
+    Return a Run from body increments; slip m/sqrt(m) of each wheel, noise m of positions.
 
-    lateral : motion over rolling of mecanum wheels.   offset, count : of omni wheels.
+    lateral : motion over wheel travel of mecanum wheels.   offset, count : of omni wheels.
     """
     turn = np.append(0.0, np.cumsum(d[:, 2])) + 0.3
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
@@ -77,7 +77,7 @@ OMNI = [(count, offset) for count in (3, 4) for offset in (0.0, 0.5, -2.0)]
 
 
 @pytest.mark.parametrize(('moves', 'options', 'expected', 'loose'), [
-    # squares in both directions, where ratio and width act differently
+    # squares in both directions separate ratio and width
     (SQUARES, {}, (LEFT, RIGHT, 1 / WIDTH), 2e-7),
     (SIDEWAYS * 2, {'kind': 'mecanum', 'lateral': 0.9}, (*SCALES, 1 / WIDTH, 0.9), 1e-5),
     *((SIDEWAYS * 2, {'kind': 'omni', 'offset': offset, 'count': count},
@@ -85,7 +85,7 @@ OMNI = [(count, offset) for count in (3, 4) for offset in (0.0, 0.5, -2.0)]
     # turns on the spot and arcs of two radii: the width changes by a third
     ([*SQUARES, (2, 0, 1.2), (1.5, 0, -0.8), (2, 0, -2.0), (1, 0, 2.0)],
      {'kind': 'skid', 'arc': 1.0}, (LEFT, RIGHT, 1 / WIDTH, 1.0), 1e-5)])
-def test_without_noise_the_fit_is_exact(moves, options, expected, loose):
+def test_fit_without_noise_is_exact(moves, options, expected, loose):
     found = fit_run(run_of(body(moves), **options), PriorKnowledge())
     assert found.converged
     assert_allclose(found.value[:len(expected)], expected, rtol=loose)
@@ -94,7 +94,7 @@ def test_without_noise_the_fit_is_exact(moves, options, expected, loose):
 
 
 def test_offset_of_the_tracked_point_is_estimated_exactly():
-    """A point 0.1 m ahead and 0.05 m right of the axle moves as the robot turns."""
+    """A point 0.1 m ahead and 0.05 m right of the axle moves when the robot turns."""
     run = run_of(body(SQUARES))
     psi = np.append(0.0, np.cumsum(body(SQUARES)[:, 2])) + 0.3
     arm = (0.1 - 0.05j) * np.exp(1j * psi)
@@ -104,8 +104,8 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
     assert_allclose(found.value[2], 1 / WIDTH, rtol=1e-5)
 
 
-def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch):
-    """A turn and no sideways motion: one difference of four wheels has its prior alone."""
+def test_wheels_that_differ_by_a_few_per_cent_do_not_affect_the_scale(monkeypatch):
+    """Without sideways motion, one difference of four wheels is known from its prior only."""
     run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
     sigma = np.sqrt(np.diag(fit_run(run, PriorKnowledge()).covariance)[:4])
     assert (sigma < 1.2 * WHEEL_DIFFERENCE * SCALES).all()
@@ -114,14 +114,14 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
 
 
 @pytest.mark.parametrize('kind', ['differential', 'mecanum', 'omni'])
-def test_wheels_by_their_rows_give_the_motion_that_rolled_them(kind):
+def test_wheel_table_inverts_the_wheel_rows(kind):
     """The table is the pseudo-inverse of the rows: numpy.linalg.pinv."""
     rows = wheel_rows(kind, 5, 0.3)
     table = Wheels(np.zeros((1, len(rows))), rows, kind).body_by_wheel
     assert_allclose(table, np.linalg.pinv(rows) * [[1], [1], [2]], atol=1e-12)
 
 
-def test_omni_rows_are_those_of_omni_wheel_drive_controller():
+def test_omni_rows_agree_with_omni_wheel_drive_controller():
     """ros2_controllers, test_odometry.cpp: 1 m/s turns wheels of 0.1 m by 0, 10, 0, -10 rad/s."""
     forward, left, turn = (wheel_rows('omni', 4) @ np.eye(3) / 0.1).T
     assert_allclose(forward, (0, 10, 0, -10), atol=1e-12)
@@ -137,9 +137,9 @@ def test_gyro_scale_and_bias_are_exact():
     assert_allclose(value(found, 'gyro_bias')[0], 0.01 / 1.02, rtol=1e-3)
 
 
-def test_sigma_is_the_bound_of_a_straight_run():
+def test_sigma_of_a_straight_run_equals_the_bound():
     """
-    Positions at both ends only, and a gyro that says straight: one equation for the scale.
+    Positions at both ends and a gyro without turns give one equation for the scale.
 
     Variance of the distance: two white errors, the change of the drift, slip along the path.
     """
@@ -151,13 +151,13 @@ def test_sigma_is_the_bound_of_a_straight_run():
     found = fit_run(run, known)
     path = noise_path(run, LEFT)
     level = {name: sigma**2 for name, sigma in found.levels.items()}
-    student = 6 / 8         # information of Student's distribution
+    student = 6 / 8         # information of the Student distribution
     variance = (level['white'] / student * (0.01**2 + 0.02**2)
                 + 2 * level['drift'] / student * (1 - np.exp(-path.sum() / known.drift_length))
                 + level['along'] * path.sum())
     mean = np.array([0.5, 0.5])
     sigma = np.sqrt(mean @ found.covariance[:2, :2] @ mean)
-    # prior of each factor, 0.35
+    # prior sigma of each factor: 0.35
     information = 8**2 / variance + 2 / 0.35**2
     assert_allclose(sigma / LEFT, information**-0.5, rtol=2e-2)
     assert level['along'] == pytest.approx(LEVELS['along'], rel=0.5)
@@ -181,6 +181,6 @@ def test_truth_is_within_sigma(kind):
         off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
                     for n in found.names[:found.names.index('ahead')]])
     rms = np.sqrt(np.mean(np.square(off), axis=0))
-    # the rms of 10 is 1 +- 0.22; left and right are nearly one draw
+    # the rms of 10 is 1 +- 0.22; left and right are almost the same draw
     assert (rms < 1.6).all(), rms
     assert (rms > 0.4).all(), rms

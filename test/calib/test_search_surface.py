@@ -29,12 +29,12 @@ from odocal_ros.calib.wheel_search.planar import (
 from odocal_ros.settings.config import WheelsConfig
 
 FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
-# on the straight ones positions are blind to left against right: nothing to agree on
+# on straight drives, left against right is not observable: nothing to compare
 TURNING = ['town', 'another town', 'noisy town', 'out and back']
 RANGES = ranges_of(WheelsConfig())
 
 
-def test_distances_are_those_of_the_source_summed_step_by_step(monkeypatch):
+def test_distances_equal_those_of_the_source_summed_step_by_step(monkeypatch):
     rng = np.random.default_rng(1)
     steps, yaw = rng.uniform(0.1, 0.3, (40, 2)), np.cumsum(rng.normal(0, 0.2, 40))
     path = np.cumsum(steps * np.exp(1j * yaw)[:, None], axis=0)
@@ -56,13 +56,13 @@ def test_distances_are_those_of_the_source_summed_step_by_step(monkeypatch):
         assert_allclose(found.loss, (d**2).mean(axis=1), rtol=1e-12)
 
 
-def test_the_true_set_meets_perfect_fixes_and_only_it():
+def test_only_the_true_set_fits_perfect_fixes():
     made, leg = simulated(scenario='town', duration=300.0, two_wheels=True, odometer='angle',
                           imu_grade='perfect', fix_sigma=0.0, yaw=0.0, odometer_rate=50.0,
                           antenna_lever_arm=(1.0, 0.3, 1.5), pitch=0.0)
     true = np.array([[*made.truth.wheel_scales, 0.0]])
-    # trapezoid over 20 ms, 20 ms rows between which travel is linear: acceleration * dt^2 / 8
-    # at each of fewer than 50 places where it changes, and turns of 0.4 rad/s on 12 m/s
+    # trapezoid rule over 20 ms; 20 ms rows with linear travel between: acceleration * dt^2 / 8
+    # at each of fewer than 50 changes of acceleration, and turns of 0.4 rad/s at 12 m/s
     assert score(leg, true).max[0] < 0.02
     assert score(leg, leg.start).max[0] > 1.0
     without = replace(leg, lever_n=np.zeros((1, 2)))
@@ -76,7 +76,7 @@ def test_fixes_beyond_the_tracks_are_left_out():
     assert len(leg.t) <= between.sum() < len(made.fix.stamp_ns)
 
 
-def test_course_differs_by_what_the_track_is_turned_by():
+def test_course_difference_equals_the_rotation_of_the_track():
     leg = on_a_plane(sigma=0.0)
     off = np.deg2rad([0.0, 3.0, -20.0])
     found = score(leg, TRUE + off[:, None] * [0.0, 0.0, 1.0])
@@ -90,14 +90,14 @@ def test_course_differs_by_what_the_track_is_turned_by():
     assert score(still, TRUE).row(0)['course_mean_deg'] is None
 
 
-def test_course_is_taken_over_a_way_that_fixes_can_tell():
+def test_course_uses_a_path_length_that_fixes_can_resolve():
     line = np.stack([np.arange(0.0, 400.0), np.zeros(400)], -1)
     assert np.diff(course_pieces(line, np.full(400, 0.02))).tolist() == [[10]] * 39
     assert np.diff(course_pieces(line, np.full(400, 1.5))).tolist() == [[30]] * 13
     assert course_pieces(line[:0], np.empty(0)).shape == (0, 2)
 
 
-def test_hubers_loss_and_its_weights_belong_together():
+def test_weights_are_those_of_the_huber_loss():
     d2, sigma = np.array([0.0, 1.0, 8.9, 9.1, 400.0]), np.array([1.0, 2.0, 1.5, 1.5, 0.5])
     step = 1e-6
     for robust in (False, True):
@@ -105,12 +105,12 @@ def test_hubers_loss_and_its_weights_belong_together():
             more = d2 + step * (np.arange(5) == k)
             rise = (loss(more[None], sigma, robust) - loss(d2[None], sigma, robust))[0] / step
             assert rise * 5 == pytest.approx(weights(d2, sigma, robust)[k], rel=1e-4)
-    # beyond HUBER sigmas the pull, weight times distance, no longer grows
+    # beyond HUBER sigmas the influence, weight times distance, is constant
     far = weights(np.array([1e2, 1e4]), np.ones(2), True) * [10.0, 100.0]
     assert_allclose(far, HUBER)
 
 
-def test_a_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
+def test_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
     rng = np.random.default_rng(4)
     H, g = rng.normal(size=(3, 3)), rng.normal(size=3)
     H = H + H.T
@@ -128,7 +128,7 @@ def test_a_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
 
 
 @pytest.mark.parametrize('definite', [True, False])
-def test_the_minimum_in_a_box_is_the_least_value_there(definite):
+def test_minimum_in_a_box_is_the_least_value_there(definite):
     rng = np.random.default_rng(5)
     grid = np.stack([a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, 21)] * 3)], -1)
     for _ in range(50):
@@ -161,14 +161,14 @@ def test_surface_and_least_squares_agree(name, space, robust):
     assert found.converged
     assert not found.on_edge
     assert (np.abs(found.x - direct.x) <= 1e-4 * 2 * RANGES.half).all()
-    # kinks of Huber's function within a box over which it changes by 1e-6 (DROWNED)
+    # kinks of the Huber function within a box over which it changes by 1e-6 (DROWNED)
     assert found.value == pytest.approx(direct.value, rel=1e-5 if robust else 1e-9)
 
 
 @pytest.mark.parametrize('space', [FREE, HELD], ids=['free', 'together'])
 @pytest.mark.parametrize('beyond', [0.051, 0.06, 0.3])
-def test_the_range_is_kept_where_it_may_not_be_widened(space, beyond):
-    def cone(x):       # a ridge between wheels that differ, its tip outside the range
+def test_range_is_kept_if_it_may_not_be_widened(space, beyond):
+    def cone(x):       # a ridge between wheels that differ, with its peak outside the range
         return np.abs(x[:, 0] - beyond) + 3 * np.abs(x[:, 1] - beyond) + np.abs(x[:, 2])**0.5
     found = refine(cone, np.array([0.03, 0.02, 0.01]), RANGES.step, RANGES.half, space,
                    widen=False)

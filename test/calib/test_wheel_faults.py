@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slips of one wheel, swapped wheels and changed ratios are named; sound wheels are not."""
+"""Slip of one wheel, swapped wheels and changed ratios are named; good wheels have no reasons."""
 
 from dataclasses import replace
 from functools import reduce
@@ -25,7 +25,7 @@ COUNT = 0.0213      # m
 
 @cached
 def prepared(**options):
-    """Return the inputs of a drive, its track, latitude and rough scale."""
+    """Return the inputs of a drive, its track, latitude and approximate scale."""
     made = drive(**options)
     config = settings(made)
     found, _ = prepare(made.leg(), screen(made.leg(), config)[0], config)
@@ -33,7 +33,7 @@ def prepared(**options):
 
 
 def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=prepared, **more):
-    """Return reasons and slips of a drive with changed ways; sides : with that on the sides."""
+    """Return reasons and slips of a drive with changed travel; sides : include ODOMETER_CHOSEN."""
     also = set() if more.pop('sides', False) else {Code.ODOMETER_CHOSEN}
     inputs, track, latitude, metres = prepare(**options)
     wheels = [replace(w, s=change(w.s)) for w, change in (
@@ -46,24 +46,24 @@ def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=pre
 
 
 def spun(options, at, length, size):
-    """Return a change of a way by a spin, in whole counts, as an encoder would give it."""
+    """Return a function that adds a spin to a travel, in whole counts like an encoder."""
     t = prepared(**options)[0].travels[0].t
     return lambda s: s + np.floor(np.clip((t - at) / length, 0, 1) * size / COUNT)
 
 
 def counts_more(since):
-    """Return a change of a way by a hundredth from a way on."""
+    """Return a function that adds 1 % to a travel, from the travel since(s) on."""
     return lambda s: s + np.floor(0.01 * np.maximum(s - since(s), 0.0))
 
 
 def assert_place(slips, begin, length, size, loose_s, loose_m):
-    """Assert where the first slip is, s, and its size, m."""
+    """Assert the time, s, and the size, m, of the first slip."""
     assert abs(abs(slips.size[0]) - abs(size)) < loose_m
     assert abs(slips.begin[0] - begin) < loose_s
     assert abs(slips.end[0] - begin - length) < loose_s
 
 
-def test_swapped_wheels_are_told_by_the_gyro():
+def test_swapped_wheels_are_found_by_the_gyro():
     for seed in (1, 2, 3):
         options = TOWN | {'seed': seed}
         reasons, _ = faults(options, swap=True)
@@ -73,7 +73,7 @@ def test_swapped_wheels_are_told_by_the_gyro():
 
 
 @pytest.mark.parametrize('swap', [False, True])
-def test_a_drive_without_turns_does_not_tell_swapped_wheels_and_says_so(swap):
+def test_swapped_wheels_are_not_observable_without_turns_which_is_reported(swap):
     (reason,), _ = faults(STRAIGHT, swap=swap, sides=True)
     assert reason.code is Code.ODOMETER_CHOSEN
     assert 'too few turns to test whether' in reason.text
@@ -81,8 +81,8 @@ def test_a_drive_without_turns_does_not_tell_swapped_wheels_and_says_so(swap):
 
 
 @pytest.mark.parametrize(('scenario', 'seeds'), [('straight', 50), ('town', 10)])
-def test_nothing_is_said_of_clean_drives(scenario, seeds):
-    """No alarm in 50 drives: at a rate of 6 % one run of this test in 20 would see none."""
+def test_drives_without_faults_have_no_reasons(scenario, seeds):
+    """No alarm in 50 drives: with a rate of 6 % this test would still pass in 1 run of 20."""
     for seed in range(seeds):
         options = TOWN | {
             'scenario': scenario, 'duration': 200.0 if scenario == 'straight' else 300.0,
@@ -96,23 +96,23 @@ def test_nothing_is_said_of_clean_drives(scenario, seeds):
 
 @pytest.mark.parametrize('size', [0.3, 1.0, -0.5])
 @pytest.mark.parametrize('side', ['left', 'right'])
-def test_a_slip_of_one_wheel_is_named_with_place_and_size(side, size):
+def test_slip_of_one_wheel_is_named_with_place_and_size(side, size):
     options = STRAIGHT | {'seed': 8}
     (reason,), slips = faults(options, **{side: spun(options, 120.0, 1.5, size)})
     assert reason.code is Code.WHEEL_SLIP
     assert reason.text.startswith(f'the {side} wheel {"spins" if size > 0 else "slides"} by')
     assert slips.wheel.tolist() == [1 if side == 'right' else -1]
-    # the mean over ten rounded rows at each end of each wheel, 5 sigma, and the count lost by
-    # rounding the spin
+    # the mean over ten rounded rows at each end of each wheel, 5 sigma, and the count that
+    # rounding removes from the spin
     assert np.sign(slips.size[0]) == np.sign(size)
     assert_place(slips, 120.0, 1.5, size, 0.5, 5 * COUNT * np.sqrt(4 / 12 / 10) + COUNT)
 
 
-def test_a_gyro_that_warms_up_is_no_slip():
+def test_gyro_that_warms_up_is_not_slip():
     made = drive(**TOWN | {'scenario': 'yard', 'odometer': 'angle', 'imu_grade': 'consumer',
                            'duration': 600.0})
     since = seconds(made.leg(), made.imu)
-    drift = np.deg2rad(0.4) * (1 - np.exp(-since / 100.0))      # real ones: 0.5 to 1.3 deg/s
+    drift = np.deg2rad(0.4) * (1 - np.exp(-since / 100.0))      # real gyros: 0.5 to 1.3 deg/s
     warm = changed(made.imu, w_i=lambda w: w + drift[:, None] * [0, 0, 1])
     leg = replace(made.leg(), imu=warm)
     found = prepare(leg, screen(leg, settings(made))[0], settings(made))[0].wheel_slips
@@ -121,19 +121,19 @@ def test_a_gyro_that_warms_up_is_no_slip():
 
 
 @pytest.mark.parametrize(('length', 'certain'), [(8.0, True), (18.0, False)])
-def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(length, certain):
-    """Acceleration tells of a slip's begin and end; over many seconds it drifts too far."""
+def test_long_slip_is_found_whole_and_names_a_wheel_only_with_evidence(length, certain):
+    """Acceleration shows start and end of a slip; over many seconds its integral drifts."""
     options = TOWN | {'seed': 3}
     (reason,), slips = faults(options, left=spun(options, 100.0, length, 0.5 * length))
     assert reason.text.startswith('the left wheel spins' if certain else
                                   'one of the wheels deviates')
-    # scrub in turns may be a hundredth of the track width times the turn of 90 deg: 3 cm
+    # scrub in turns may be 1 % of the track width times the turn of 90 deg: 3 cm
     assert_place(slips, 100.0, length, 0.5 * length, 0.2 * length, 0.1)
 
 
 @pytest.mark.parametrize('side', ['left', 'right'])
-def test_a_wheel_that_slips_on_and_on_is_said(side):
-    """A hundredth from 150 s on, where about half the way is driven: no place stands out."""
+def test_continuous_slip_of_a_wheel_is_reported(side):
+    """1 % from 150 s on, after about half the path length: no single place is found."""
     options = TOWN | {'seed': 3}
     k = np.searchsorted(prepared(**options)[0].travels[0].t, 150.0)
     (reason,), slips = faults(options, **{side: counts_more(lambda s: s[k])})
@@ -144,34 +144,34 @@ def test_a_wheel_that_slips_on_and_on_is_said(side):
 
 
 @pytest.mark.parametrize('begin', [18.0, 120.0])
-def test_a_slow_slip_is_no_ratio_of_the_drive(begin):
-    """Half a per cent for 45 s of 250: a line through all of it takes a part of the slip."""
+def test_slow_slip_is_not_included_in_the_ratio(begin):
+    """0.5 % for 45 s of 250 s: a line through the whole drive would include a part of the slip."""
     options = STRAIGHT | {'seed': 15}
     (reason,), slips = faults(options, left=spun(options, begin, 45.0, -2.9))
     assert reason.code is Code.WHEEL_SLIP
-    # what rounding may do at the ends of each wheel, and the tenth at begin and end
+    # rounding at the ends of each wheel, and 10 % at start and end
     assert_place(slips, begin, 45.0, 2.9, 0.2 * 45, 0.3 + 4 * COUNT)
     assert not slips.change
 
 
 @pytest.mark.parametrize('share', [0.25, 0.75])
-def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
+def test_ratio_change_at_any_place_is_reported_with_the_place(share):
     (reason,), slips = faults(TOWN | {'seed': 3}, right=counts_more(lambda s: share * s[-1]))
     assert f'after about {100 * share:.0f} % of the path' in reason.text
     percent = float(reason.text.split('the right wheel counts ')[1].split()[0])
     assert abs(percent - 1.0) < 0.1
-    # either part may be the right one: as far off as 1 % of the shorter or of the longer one
+    # either part may be correct: 1 % of the shorter or of the longer one
     assert 0.005 < slips.change / 2 < 0.0075
 
 
-def test_one_counter_sent_twice_in_two_resolutions_is_no_second_wheel():
+def test_copy_of_a_counter_with_another_resolution_is_not_a_second_wheel():
     options = TOWN | {'seed': 3}
-    copied = np.floor(prepared(**options)[0].travels[0].s / 2)      # in another resolution
+    copied = np.floor(prepared(**options)[0].travels[0].s / 2)      # another resolution
     reasons, _ = faults(options, right=lambda s: copied, rough=4 / 3, track_width=1.6)
     assert 'one counter is sent twice' in {r.code: r.text for r in reasons}[Code.WHEEL_DEAD]
 
 
-def test_slips_by_the_dozen_are_counted():
+def test_many_slips_are_counted():
     options = STRAIGHT | {'seed': 8}
     at = np.arange(60.0, 240.0, 30.0)
     spins = [spun(options, t, 1.0, 0.4) for t in at]
@@ -181,23 +181,23 @@ def test_slips_by_the_dozen_are_counted():
     assert f'{len(at)} such places' in reason.text
 
 
-def test_a_place_in_doubt_already_is_not_called_a_slip():
+def test_place_already_marked_uncertain_is_not_called_a_slip():
     options = TOWN | {'seed': 2}
     lost = spun(options, 120.0, 0.01, 5.0)
     assert len(faults(options, right=lost)[1].t)
     assert faults(options, right=lost, uncertain_t=(120.0,))[0] == ()
 
 
-def test_wheels_of_other_resolution_are_said_with_what_the_mean_then_is():
+def test_different_counter_resolutions_are_reported_with_the_point_of_the_mean():
     (reason,), _ = faults(TOWN, right=lambda s: 2 * s, rough=2 / 3, track_width=1.6)
     assert reason.code is Code.WHEEL_COUNTERS_DIFFER
-    # factors 1.004 apart: the right wheel weighs 0.6657, 0.1657 of 1.6 m off the middle
+    # factors 1.004 apart: the right wheel has weight 0.6657, 0.1657 of 1.6 m off the middle
     assert 'a point 0.27 m right of the axle centre' in reason.text
     assert faults(TOWN, right=lambda s: 1.3 * s)[0] == ()
 
 
-def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
-    """The track goes straight on where the fixes turn: its best scale would be a third off."""
+def test_gyro_without_turns_does_not_determine_the_factors():
+    """The track is straight where the fixes turn: its best scale would be wrong by a third."""
     made = drive(**TOWN, seed=3)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w * [1, 1, 1e-3]))
     result = calibrate(leg, settings(made, method='smoother'))
@@ -215,8 +215,8 @@ def with_gyro_noise(sigma, grade):
     return made, calibrate(leg, settings(made, method='smoother')).methods['smoother']
 
 
-def test_a_gyro_of_noise_ends_in_reasons_or_widens_the_track_width():
-    # heights left out in the last round: what was solved with them has another length
+def test_gyro_with_noise_only_has_reasons_or_widens_the_track_width():
+    # heights excluded in the last pass: values solved with them have another size
     assert with_gyro_noise(0.3, 'industrial')[1].reasons
     (made, noisy), (_, clean) = (with_gyro_noise(sigma, 'consumer') for sigma in (0.1, 0.0))
     assert off(noisy, made, 'track_width') < 4

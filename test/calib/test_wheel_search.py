@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wheels' search: separable wheels, ranges, sigmas, details; its orthogonal parameter_sets."""
+"""The wheel search: separable wheels, ranges, sigmas, details, orthogonal parameter_sets."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -26,7 +26,7 @@ RANGES = ranges_of(WheelsConfig())
 
 
 @pytest.mark.parametrize('name', ['town', 'out and back', 'straight', 'paper'])
-def test_cars_move_left_and_right_together_and_say_why(name):
+def test_left_and_right_scales_of_cars_move_together_with_a_reason(name):
     made, leg = simulated(**DRIVES[name])
     found = search(leg, RANGES)
     assert found.fixed_difference
@@ -37,14 +37,14 @@ def test_cars_move_left_and_right_together_and_say_why(name):
     assert Code.SEARCH_NOT_SETTLED not in codes
     assert found.free.correlation[0, 1] < -0.999
     assert found.free.condition > 1000
-    # the mean is what two wheels count together: their harmonic mean; start and end fixes of
+    # the mean is the harmonic mean of both counters; start and end fixes of
     # 1.5 m (straight: averaged at rest) or 2 cm over 2 to 11 km, gyro drift 1e-4 and less
     mean = found.refined_set[:2].mean()
     assert mean == pytest.approx(made.truth.scale, rel=6e-4)
     assert found.after.rms[0] < 0.1 * found.before.rms[0]
 
 
-def test_a_small_lawn_tells_left_from_right():
+def test_small_lawn_separates_left_and_right():
     leg = on_a_plane()
     found = search(leg, RANGES)
     assert not found.fixed_difference
@@ -55,14 +55,14 @@ def test_a_small_lawn_tells_left_from_right():
     assert len(found.sets) == 49
     assert found.after.rms[0] <= found.scores.rms.min()
     assert_allclose(found.refined_set, found.direct_set, atol=1e-5)
-    # levels are equal steps, with zero among them
+    # levels have equal steps and include zero
     for k, half in enumerate(RANGES.half):
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
         assert_allclose(x, np.linspace(-half, half, 7), atol=1e-11)
     assert set(search(leg, Ranges(RANGES.half, RANGES.why, 1)).sets[:, 0]) == {1.0}
 
 
-def test_the_range_is_widened_where_the_minimum_lies_on_its_edge():
+def test_range_is_widened_if_the_minimum_is_on_its_edge():
     leg = on_a_plane()
     far = replace(leg, scale_left=1.3, scale_right=1.3, left_n=leg.left_n @ turned(-60.0),
                   right_n=leg.right_n @ turned(-60.0))
@@ -80,7 +80,7 @@ def turned(degrees):
 
 
 @pytest.mark.parametrize('heading', [100.0, 179.0, -179.0])
-def test_a_heading_that_nobody_knows_is_found(heading):
+def test_unknown_heading_is_found(heading):
     leg = on_a_plane()
     away = replace(leg, left_n=leg.left_n @ turned(-heading),
                    right_n=leg.right_n @ turned(-heading))
@@ -90,7 +90,7 @@ def test_a_heading_that_nobody_knows_is_found(heading):
     assert abs(found.refined_set[2]) <= np.pi
 
 
-def test_a_search_without_end_ends_and_says_so():
+def test_search_without_convergence_stops_and_is_reported():
     leg = on_a_plane()
     found = search(replace(leg, scale_left=0.4, scale_right=0.4), RANGES)
     texts = {r.code: r.text for r in found.reasons}
@@ -105,7 +105,7 @@ def test_a_search_without_end_ends_and_says_so():
                           fixes_n=leg.fixes_n[:3], sigma=leg.sigma[:3]), RANGES) is None
 
 
-def test_robust_is_not_moved_by_outliers():
+def test_robust_fit_is_not_shifted_by_outliers():
     leg = on_a_plane()
     fixes = leg.fixes_n.copy()
     fixes[::20] += [15.0, 5.0]
@@ -116,7 +116,7 @@ def test_robust_is_not_moved_by_outliers():
 
 
 @pytest.mark.parametrize('levels', [2, 7, 15])
-def test_what_goes_into_json_is_finite_and_short(levels):
+def test_values_for_json_are_finite_and_short(levels):
     _, leg = simulated(**DRIVES['straight'])
     found = search(leg, ranges_of(WheelsConfig(levels=levels)))
     entry = json.loads(json.dumps(found.as_dict(), allow_nan=False))
@@ -138,7 +138,7 @@ def test_ranges_follow_the_settings():
     assert ranges_of(WheelsConfig(levels=2)).levels == 2
 
 
-def test_the_formal_sigma_holds_for_white_fixes():
+def test_formal_sigma_holds_for_white_fixes():
     runs = 300
     z = []
     for seed in range(runs):
@@ -146,24 +146,24 @@ def test_the_formal_sigma_holds_for_white_fixes():
         z.append((1 + found.x[:2] - TRUE[:2]) / found.sigma[:2])
     z = np.array(z)
     assert (np.abs(z.mean(axis=0)) < 4 / runs**0.5).all()
-    # inflation() counts chance likeness of white residuals, so sigmas are wide rather than narrow
+    # inflation() includes chance correlation of white residuals: sigmas are rather too wide
     assert (z.var(axis=0) < 1 + 4 * (2 / runs)**0.5).all()
     assert (z.var(axis=0) > 0.6).all()
 
 
-def test_the_mean_of_both_wheels_is_known_where_their_difference_is_not():
+def test_mean_of_both_wheels_is_observable_without_their_difference():
     _, leg = simulated(**DRIVES['straight'])
     free, held = (least_squares(leg, np.zeros(3), space) for space in (FREE, HELD))
     mean = np.array([0.5, 0.5, 0.0])
     assert held.sigma[0] == held.sigma[1]
     assert held.correlation[0, 1] == pytest.approx(1.0)
-    # the same straight line, fitted with and without a third parameter that it does not see
+    # the same straight line, with and without a third parameter that is not observable
     assert held.sigma[0] < 0.01 * free.sigma[0]
     assert held.sigma[0] <= np.sqrt(mean @ free.covariance @ mean) * 1.01
     assert held.condition < 10 < free.condition
 
 
-def test_residuals_alike_in_a_row_count_as_fewer():
+def test_correlated_residuals_count_as_fewer():
     rng = np.random.default_rng(6)
     white = rng.normal(size=(2, 20000))
     assert inflation(white) == pytest.approx(1.0, abs=0.1)
@@ -179,12 +179,12 @@ PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]
 
 
 def balanced(array):
-    """Return True if each pair of columns of as many rows as pairs holds each pair once."""
+    """Return True if each pair of columns contains each pair of levels once."""
     return all(len({tuple(pair) for pair in array[:, [a, b]].tolist()}) == len(array)
                for a, b in combinations(range(array.shape[1]), 2))
 
 
-def test_prime_powers_are_told_from_other_numbers():
+def test_prime_powers_are_distinguished_from_other_numbers():
     assert [q for q in range(18) if parameter_sets.prime_power(q)] == [*PRIME_POWERS, 17]
     assert parameter_sets.prime_power(49) == (7, 2)
     assert parameter_sets.prime_power(64) == (2, 6)
@@ -194,20 +194,20 @@ def test_prime_powers_are_told_from_other_numbers():
         3, 5, 9, 17, 27, 53]
 
 
-# so the tables are those of a field, and the polynomial is no product
+# therefore the tables are those of a field, and the polynomial is irreducible
 @pytest.mark.core
 @pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 27, 49])
 def test_every_array_is_balanced(q):
     array = parameter_sets.bose(q, q + 1)
     assert array.shape == (q * q, q + 1)
     assert balanced(array)
-    array[3, 1] = (array[3, 1] + 1) % q     # and one wrong cell is seen
+    array[3, 1] = (array[3, 1] + 1) % q     # one wrong cell is found
     assert not balanced(array)
-    # three of each level in each column: L9(3^4) of the patent's figure 2, but for the order
+    # three of each level in each column: L9(3^4) of figure 2 of the patent, in another order
     assert all((np.bincount(column) == q).all() for column in parameter_sets.bose(q, q + 1).T)
 
 
-def test_what_cannot_be_built_is_refused():
+def test_arrays_that_do_not_exist_are_refused():
     with pytest.raises(BadUsage, match='6 levels'):
         parameter_sets.bose(6, 3)
     with pytest.raises(BadUsage, match='5 columns'):
@@ -217,7 +217,7 @@ def test_what_cannot_be_built_is_refused():
 
 
 @pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])
-def test_the_design_follows_the_levels(levels, rows):
+def test_design_follows_the_levels(levels, rows):
     design = parameter_sets.design_for(levels)
     assert design.rows.shape == (rows, 3)
     assert levels != 9 or design.name == 'L81(9^10)'
