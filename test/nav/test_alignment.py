@@ -37,7 +37,7 @@ def rest(C_nb, latitude=LATITUDE, gyro_bias=0.0, accel_bias=0.0, grade=None, rng
     if rng is not None:
         draw = (len(t), 3)
         walk = np.cumsum(rng.normal(size=draw), axis=0) * grade.gyro_bias_walk / np.sqrt(RATE)
-        # the bias wanted is the last one
+        # the reference is the bias of the last row
         w += grade.gyro_noise * np.sqrt(RATE) * rng.normal(size=draw) + walk - walk[-1]
         f += grade.accel_noise * np.sqrt(RATE) * rng.normal(size=draw)
     return t, w, f
@@ -74,7 +74,7 @@ def test_attitude_and_bias_at_rest_are_found_exactly(rpy):
     assert_allclose(a.gyro_bias, bias, atol=1e-16)
 
 
-def test_the_ends_of_a_standstill_are_left_out_unless_there_is_nothing_else():
+def test_ends_of_a_standstill_are_excluded_unless_nothing_else_is_left():
     C_nb = matrix_from_rpy(RPY)
     t, w, f = rest(C_nb)
     f[(t < REST_EDGE) | (t > SECONDS - REST_EDGE)] += [0.5, 0.0, 0.0]
@@ -87,7 +87,7 @@ def test_the_ends_of_a_standstill_are_left_out_unless_there_is_nothing_else():
 
 @pytest.mark.parametrize('up', [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 1e-9, -1e-9],
                                 [1.0, 1e-4, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-def test_level_frame_is_a_rotation_however_the_imu_lies(up):
+def test_level_frame_is_a_rotation_for_any_imu_orientation(up):
     C = level_frame(9.8 * np.array(up))
     assert_allclose(C @ C.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(C) == pytest.approx(1, abs=1e-14)
@@ -95,21 +95,21 @@ def test_level_frame_is_a_rotation_however_the_imu_lies(up):
 
 
 @pytest.mark.parametrize('nose', [1, -1])
-def test_level_frame_goes_on_smoothly_into_the_upright(nose):
+def test_level_frame_is_continuous_near_the_upright_imu(nose):
     for off in (1e-3, 1e-5, 0.0):
         C_Lb = matrix_from_rpy([0.0, -nose * (np.pi / 2 - off), 0.0])
         assert_allclose(level_frame(C_Lb.T @ [0, 0, 9.8]), C_Lb, atol=1e-9)
 
 
 @pytest.mark.parametrize('grade', GRADES)
-def test_level_sigma_holds(grade):
+def test_level_error_agrees_with_its_sigma(grade):
     grade, rng = GRADES[grade], np.random.default_rng(1)
     C_nb, z = matrix_from_rpy(RPY), []
     for _ in range(DRAWS):
-        # what an axis that is askew has of g is a bias
+        # the component of g on a misaligned axis is a bias
         level = levelled(rest(C_nb, accel_bias=rng.normal(0, grade.level_bias, 3), grade=grade,
                               rng=rng, seconds=10.0), grade)
-        up_seen = C_nb @ level.C_Lb[2]              # where L's up lies in the true n
+        up_seen = C_nb @ level.C_Lb[2]              # up of L in the true n
         z.append(up_seen[:2] / level.level_sigma)
     variance_is_one(np.array(z))
 
@@ -126,9 +126,9 @@ def test_gyrocompass_points_north_in_every_quadrant(latitude, yaw):
 
 @pytest.mark.parametrize(('grade', 'latitude'), [
     (GRADES['navigation'], 0.7), (GRADES['navigation'], -1.2),
-    # accelerometers so bad that the tilt counts: tan(1.3) = 3.6
+    # accelerometer errors so large that the tilt matters: tan(1.3) = 3.6
     (replace(GRADES['navigation'], accel_bias=0.01), 1.3)])
-def test_gyrocompass_sigma_holds(grade, latitude):
+def test_gyrocompass_error_agrees_with_its_sigma(grade, latitude):
     rng, C_nb, z = np.random.default_rng(2), matrix_from_rpy(RPY), []
     for _ in range(DRAWS):
         level = levelled(rest(C_nb, latitude, rng.normal(0, grade.gyro_bias, 3),
@@ -138,7 +138,7 @@ def test_gyrocompass_sigma_holds(grade, latitude):
     variance_is_one(np.array(z))
 
 
-def test_gyrocompass_at_the_pole_knows_that_it_knows_nothing():
+def test_gyrocompass_states_an_unknown_heading_at_the_pole():
     _, sigma = gyrocompass(levelled(rest(np.eye(3), np.pi / 2)), np.pi / 2, EXACT)
     assert sigma > 1e6
 
@@ -147,7 +147,7 @@ def test_gyrocompass_at_the_pole_knows_that_it_knows_nothing():
     ('consumer', 10.0, 0.0175), ('consumer', 300.0, 0.0175),   # noise; the walk of the bias
     ('tactical', 60.0, 1e-4), ('tactical', 60.0, 0.04),        # noise; Earth rate on wrong axes
     ('industrial', 300.0, 0.5)])
-def test_gyro_bias_sigma_holds(grade, seconds, yaw_sigma):
+def test_gyro_bias_error_agrees_with_its_sigma(grade, seconds, yaw_sigma):
     grade, rng = GRADES[grade], np.random.default_rng(3)
     C_nb, z = matrix_from_rpy([0.02, -0.03, 0.4]), []
     for _ in range(DRAWS):
@@ -164,7 +164,7 @@ def test_gyro_bias_sigma_holds(grade, seconds, yaw_sigma):
 
 
 @pytest.mark.parametrize(('source', 'yaw_sigma'), [('gyrocompass', 2e-3), ('course', 0.07)])
-def test_a_bias_known_better_by_the_grade_is_taken_from_there(source, yaw_sigma):
+def test_gyro_bias_is_taken_from_the_grade_where_that_is_more_certain(source, yaw_sigma):
     """A gyrocompass has used up the east part; a course leaves 3.9e-6 rad/s on it."""
     grade, rng = GRADES['navigation'], np.random.default_rng(4)
     C_nb, z = np.eye(3), []       # b: x east, y north
@@ -182,7 +182,7 @@ def test_a_bias_known_better_by_the_grade_is_taken_from_there(source, yaw_sigma)
     assert np.sqrt((np.array(z)[:, 1]**2).mean()) < 1.2
 
 
-def test_a_cheap_gyro_far_beyond_its_grade_still_shows_its_bias():
+def test_gyro_bias_far_beyond_the_grade_is_still_estimated():
     bias = np.array([0.1, -0.1, 0.05])
     level = levelled(rest(np.eye(3), gyro_bias=bias), GRADES['consumer'])
     a = finished(level, 0.0, 0.0175, grade=GRADES['consumer'])

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Speeds sent in steps: rounded to a grid, held until changed by a step, zero in a dead band."""
+"""Quantised speeds: rounded to a grid, held until changed by a step, zero in a dead band."""
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -29,19 +29,19 @@ AT = np.arange(0.0, 400.0, 0.05)
 
 
 def sent(step, how, t=T, speed=SPEED):
-    """Return what a bus sends: in steps, truncated or rounded."""
+    """Return (times, speeds) as a bus sends them: in steps, truncated or rounded."""
     return t, np.floor(speed / step + {'floor': 0.0, 'round': 0.5}[how]) * step
 
 
 @pytest.mark.parametrize('how', ['floor', 'round'])
 @pytest.mark.parametrize('step', [KMH, 0.1 * KMH, 0.0075 * KMH])
-def test_the_step_is_found(step, how):
+def test_step_of_a_quantised_speed_is_found(step, how):
     found = find_coarse_speed(*sent(step, how))
     assert found.step == pytest.approx(step, rel=1e-6)
     assert not found.interpolated
 
 
-def test_the_time_in_motion_is_that_of_the_rows_and_not_of_whole_intervals():
+def test_time_in_motion_is_that_of_the_rows_and_not_of_whole_intervals():
     t = np.arange(0.0, 10.001, 0.02)
     moves = (t > 1.395) & (t < 6.205)
     speed = CoarseSpeed(0.1, t, np.where(moves, np.where(t < 3.995, 0.5, -0.5), 0.0))
@@ -51,7 +51,7 @@ def test_the_time_in_motion_is_that_of_the_rows_and_not_of_whole_intervals():
     assert speed.time_in_motion(np.array([0.0, 10.0])) == pytest.approx(2.6 - 2.21, abs=0.011)
 
 
-def test_the_step_is_found_under_noise_and_of_a_slow_drive():
+def test_step_is_found_with_noise_and_in_a_slow_drive():
     t, v = sent(KMH, 'floor')
     noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)
     # the mean of some hundred places of 0.01 m/s, over a lever of tens of cells: below 1e-3
@@ -61,7 +61,7 @@ def test_the_step_is_found_under_noise_and_of_a_slow_drive():
     assert find_coarse_speed(T, slow) is None
 
 
-def test_of_an_interpolation_only_the_knots_are_data():
+def test_only_the_knots_of_an_interpolated_speed_are_used():
     t, v = sent(KMH, 'floor', T[::10], SPEED[::10])
     found = find_coarse_speed(T[:-9], np.interp(T[:-9], t, v))
     assert found.interpolated
@@ -69,7 +69,7 @@ def test_of_an_interpolation_only_the_knots_are_data():
     assert np.isin(found.t[1:-1], t).all()
 
 
-def test_only_speeds_have_a_grid_and_reversed_ones_too():
+def test_speeds_have_a_grid_also_if_reversed_and_counts_have_none():
     t, v = sent(KMH, 'floor')
     found = make_travel(t, v, RATE, reversed_counts=True)[0].coarse
     np.testing.assert_array_equal(found.value, -v)
@@ -78,19 +78,19 @@ def test_only_speeds_have_a_grid_and_reversed_ones_too():
 
 @pytest.mark.parametrize('rate', [1, 10])
 @pytest.mark.parametrize(('how', 'offset'), [('floor', KMH / 2), ('round', 0.0)])
-def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
+def test_speed_at_step_transitions_is_within_its_sigma(how, offset, rate):
     every = slice(None, None, 10 // rate)
     stated = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).instants
     z = (stated.value + offset - np.interp(stated.t, T, SPEED)) / stated.sigma
-    # uniform: sqrt(3) sigma at most, but for what the change in a step is known by
+    # uniform: sqrt(3) sigma at most, except for the uncertainty of the change within a step
     assert np.abs(z).max() < 2.6
-    # uniform: 1, some hundred rows tell it to a tenth; a slow change is stated with the rate of
-    # quicker ones, of which the fit's level takes off up to a half
+    # uniform: 1, to a tenth from some hundred rows; a slow change is stated with the rate of
+    # quicker ones, which the level of the fit reduces by up to a half
     assert 0.5 < np.sqrt((z**2).mean()) < 1.2
     assert np.abs(stated.value).min() > KMH
 
 
-def test_instants_have_their_side_backwards_and_none_beside_zero():
+def test_instants_have_a_side_in_reverse_and_none_is_next_to_zero():
     t, v = sent(KMH, 'floor')
     np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.side, -1.0)
     # a dead band of a cell: from 0 to 2 at once
@@ -110,8 +110,8 @@ def test_a_smooth_start_to_one_cruise_has_no_grid():
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 10.0])
-def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
-    # every stop has its own cruise, the speed's place in its cell is any: in-between, up, down
+def test_speed_at_transitions_is_unbiased_where_cruises_begin_and_end(rate):
+    # cruises differ, so that their speeds are anywhere within a step: in-between, up, down
     rng = np.random.default_rng(5)
     cruise = rng.uniform(1.0, 3.0, 400)
     corners, v = np.cumsum(rng.uniform(5.0, 10.0, 1600)), np.zeros(1600)
@@ -127,8 +127,8 @@ def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 5.0, 10.0])
-def test_small_steps_between_cruises_of_a_motorway_are_within_the_sigma(rate):
-    # each new cruise is reached at 0.3 to 1.2 m/s^2: within a row or two of a slow bus
+def test_small_changes_between_motorway_cruises_are_within_the_sigma(rate):
+    # each cruise is reached at 0.3 to 1.2 m/s^2: within one or two rows of a slow bus
     rng = np.random.default_rng(3)
     cruise = 28 + rng.uniform(-1.5, 1.5, 600)
     rise = np.abs(np.diff(cruise, append=cruise[-1])) / rng.uniform(0.3, 1.2, 600) + 0.1
@@ -139,41 +139,41 @@ def test_small_steps_between_cruises_of_a_motorway_are_within_the_sigma(rate):
     stated = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
     z = (stated.value + KMH / 2 - np.interp(stated.t, corners, cruise.repeat(2))) / stated.sigma
     assert len(z) > 600
-    # uniform: sqrt(3) at most, but for crossings whose rate is known to a whole step
+    # uniform: sqrt(3) at most, except for crossings whose rate is only known to a whole step
     assert np.abs(z).max() < 2.6
     weight = stated.value / stated.sigma
     assert abs(weight @ z) < 3.3 * np.linalg.norm(weight)
 
 
-def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
+def test_rounding_error_persists_in_a_cruise_and_averages_out_in_a_ramp():
     rng, step = np.random.default_rng(4), 0.02
     t = np.arange(0.0, 200.0, 0.05)
     errors, stated = [], None
     for _ in range(200):
-        # two cruises of 60 s, a stop, and a way up that passes a cell in every row
+        # two cruises of 60 s, a stop, and a ramp that passes a step in every row
         speed = np.interp(t, [0, 60, 100, 160, 161], [*[rng.uniform(1, 2)] * 2,
                                                       *[rng.uniform(6, 7)] * 2, 0.0])
         sent = np.rint(speed / step) * step
         found = CoarseSpeed(step, t, sent)
         stated = found.travel_variance(np.arange(0.0, 200.0))
         errors.append(((sent - speed) * 0.05).sum())
-    # nothing while it stands, and of the way up less than of 60 s at a speed
+    # zero at rest, and less in the ramp than in 60 s at constant speed
     assert stated[162:].max() == 0.0
     assert stated[60:100].sum() < 0.02 * stated.sum()
-    # in all, by 200 drives to 1 / sqrt(400): three of those
+    # variance from 200 drives: relative sigma sqrt(2 / 200) = 0.1; three sigmas
     assert np.var(errors) == pytest.approx(stated.sum(), rel=0.15 * 2)
 
 
 def town(t):
-    """Return a speed of stops, ramps and cruises that are not alike, m/s."""
+    """Return a speed of unequal stops, ramps and cruises, m/s."""
     stops = np.clip(20 * np.sin(2 * np.pi * t / 97.0), 0.0, 9.0 + 2 * np.sin(t / 61.0))
     return np.where(stops < 0.05, 0.0, stops)
 
 
 @pytest.mark.parametrize('scale', [1.0, 37.0])
-def test_a_held_speed_is_known_by_its_step(scale):
+def test_a_held_speed_is_recognised_with_its_step(scale):
     found = find_held_speed(AT, scale * with_least_change(town(AT), STEP))
-    # the least change of many is a step and what the speed gains in a row at its slowest
+    # the least of many changes is a step plus the least change within a row
     assert STEP <= found.step / scale < 1.05 * STEP
     assert not found.truncation
 
@@ -182,22 +182,22 @@ def test_a_held_speed_is_known_by_its_step(scale):
     town(AT), town(AT) + 0.01 * np.random.default_rng(1).standard_normal(len(AT)),
     np.repeat(town(AT[::5]), 5), quantized(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
     np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
-def test_other_speeds_are_not_taken_for_held(value):
+def test_other_speeds_are_not_recognised_as_held(value):
     path = make_travel(AT, value, RATE)[0]
     assert path.coarse is None or path.coarse.truncation
 
 
-def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
+def test_a_held_speed_is_exact_at_changes_and_within_half_a_step_elsewhere():
     true = town(AT)
     found = find_held_speed(AT, with_least_change(true, STEP))
     assert_allclose(found.instants.value, np.interp(found.instants.t, AT, true), atol=1e-9)
     off = np.abs(found.value - true)[true > 0]
-    # a row beyond it where the vehicle turns about within a step
+    # one row more where the speed changes direction within a step
     assert np.percentile(off, 90) < 0.55 * STEP
     assert off.max() < 1.6 * STEP
 
 
-def test_the_path_has_no_more_than_the_error_of_its_cruises():
+def test_path_error_of_a_held_speed_is_that_of_its_cruises():
     true = town(AT)
     held = with_least_change(true, STEP)
     middle = make_travel(AT, held, RATE)[0].s[-1]
@@ -207,7 +207,7 @@ def test_the_path_has_no_more_than_the_error_of_its_cruises():
     assert abs(middle - whole) < abs(sent - whole)
 
 
-def test_reversed_counts_are_held_on_the_other_side():
+def test_a_held_speed_with_reversed_counts_has_the_other_side():
     value = with_least_change(town(AT), STEP)
     path, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
                                                               reversed_counts=True)[0]
@@ -216,32 +216,33 @@ def test_reversed_counts_are_held_on_the_other_side():
     assert_allclose(back.coarse.instants.value, path.coarse.instants.value)
 
 
-# to and fro, each stop and start at an acceleration of its own
+# forwards and backwards, with different accelerations at stops and starts
 CORNERS = np.cumsum(np.tile([3.0, 1.5, 6.0, 2.1], 20))
-TO_AND_FRO = np.interp(AT, np.r_[0.0, CORNERS], np.r_[0.0, np.tile([0.0, 1.7, 1.7, 0.0], 20)])
-TO_AND_FRO[CORNERS[39] < AT] *= -1
+BOTH_DIRECTIONS = np.interp(AT, np.r_[0.0, CORNERS],
+                            np.r_[0.0, np.tile([0.0, 1.7, 1.7, 0.0], 20)])
+BOTH_DIRECTIONS[CORNERS[39] < AT] *= -1
 BAND = 0.25
 
 
 @pytest.mark.parametrize('reversed_counts', [False, True])
-def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
-    zeroed = np.where(np.abs(TO_AND_FRO) < BAND, 0.0, TO_AND_FRO)
+def test_travel_lost_in_a_dead_band_is_restored_with_an_uncertainty(reversed_counts):
+    zeroed = np.where(np.abs(BOTH_DIRECTIONS) < BAND, 0.0, BOTH_DIRECTIONS)
     raw, _ = make_travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
     path, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
-    true, _ = make_travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
+    true, _ = make_travel(AT, BOTH_DIRECTIONS, RATE, reversed_counts=reversed_counts)
     lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
     left = np.abs(np.diff(path.s)).sum() - np.abs(np.diff(true.s)).sum()
     assert lost < -0.8          # 40 times v^2 / 2a
     # a band ends within a row: half a row's speed of 1.1 m/s^2, of 0.25 m/s
     assert abs(left) < 0.11 * abs(lost)
-    # each is doubted by half of it, where it is
+    # the sigma of each is half of its travel, and is at its time
     assert sigma.sum() == pytest.approx(abs(lost) / 2, rel=0.11)
-    at = np.interp(t, AT, np.abs(TO_AND_FRO))
+    at = np.interp(t, AT, np.abs(BOTH_DIRECTIONS))
     assert (at < BAND + 0.1).all()
 
 
-def test_a_speed_that_falls_to_zero_stays_as_it_is():
-    exact, _ = make_travel(AT, TO_AND_FRO, RATE)
-    path, t, _ = with_gap_uncertainty(exact, TO_AND_FRO, RATE)
+def test_a_speed_without_a_dead_band_is_unchanged():
+    exact, _ = make_travel(AT, BOTH_DIRECTIONS, RATE)
+    path, t, _ = with_gap_uncertainty(exact, BOTH_DIRECTIONS, RATE)
     np.testing.assert_array_equal(path.s, exact.s)
     assert not len(t)

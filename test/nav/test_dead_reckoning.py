@@ -41,7 +41,7 @@ def quarter_turn(n):
 
 
 @pytest.mark.parametrize('n', [50, 100, 200])
-def test_second_order(n):
+def test_dead_reckoning_error_is_of_second_order(n):
     def miss(n):
         return np.linalg.norm(quarter_turn(n).P[-1] @ X - [RADIUS, RADIUS, 0])
 
@@ -54,7 +54,7 @@ def test_second_order(n):
 ANGLE = st.floats(-3.0, 3.0)
 
 
-def test_eleven_kilometres_on_the_ellipsoid():
+def test_eleven_kilometres_agree_with_the_geodesic():
     geod = pytest.importorskip('pyproj').Geod(ellps='WGS84')
     s = np.linspace(0, 11_200, 1121)
     lon, lat, back = geod.fwd(np.full_like(s, 116.0), np.full_like(s, 40.0),
@@ -69,12 +69,12 @@ def test_eleven_kilometres_on_the_ellipsoid():
     # the road bends by 10 m / R an epoch: (1.6e-6)^2 / 12 of 11 km is 2e-9 m; 1121 roundings of
     # 1e-12 m, and pyproj's own 1e-8 m (its degrees carry 1.4e-14)
     assert_allclose(origin.to_n(end), origin.to_n(np.array([lat[-1], lon[-1], 0.0])), atol=2e-8)
-    # a plane through the start would be off by s^2 / 2 R: nearly 10 m of height
+    # the height error of a plane through the start: s^2 / 2 R, nearly 10 m
     assert (track.P[-1] @ X)[2] == pytest.approx(-11_200**2 / 2 / 6.378e6, rel=0.01)
 
 
 @pytest.mark.parametrize('place', [(0.7, 2.0, 50.0), (-1.2, np.pi, 0.0), (np.pi / 2, 0.3, 10.0)])
-def test_origin_there_and_back(place):
+def test_conversion_to_the_origin_frame_and_back_is_exact(place):
     origin = Origin(*place)
     n = np.random.default_rng(5).normal(0, 5e3, (20, 3))
     # ulp of 6.4e6 m, twice over
@@ -103,11 +103,11 @@ def test_track_of_one_epoch():
 
 
 @given(yaw=st.floats(-3.14, 3.14), pitch=st.floats(-1.5, 1.5), K=st.floats(0.01, 100))
-def test_mounting_angles_and_forward_axis_undo_each_other(yaw, pitch, K):
+def test_mounting_angles_and_forward_axis_are_inverse_functions(yaw, pitch, K):
     d = forward_b(yaw, pitch)
     assert_allclose(d, matrix_from_rpy([0, pitch, yaw])[0], atol=1e-15)   # C_bv e_x
     found = mounting_from_forward(K * d)
-    if abs(abs(yaw) - np.pi / 2) > 1e-6:      # there forward lies along y: no pitch to be seen
+    if abs(abs(yaw) - np.pi / 2) > 1e-6:      # forward is along y there: no pitch
         # 1e-16 over cos yaw > 1e-6 for the pitch
         assert_allclose(found, [yaw, pitch], atol=1e-9)
     assert_allclose(forward_b(*found), d, atol=2e-15)
@@ -121,7 +121,7 @@ def fixes(metres, rng, sigma):
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('metres_per_count', [0.0213, 0.3])
-def test_rough_scale_survives_noise_outliers_standing_and_flicker(seed, metres_per_count):
+def test_rough_scale_is_robust_to_noise_outliers_standstills_and_flicker(seed, metres_per_count):
     rng = np.random.default_rng(seed)
     t = np.arange(0, 900, 0.2)
     metres = 12 * np.clip(t - 60, 0, 90)
@@ -129,26 +129,26 @@ def test_rough_scale_survives_noise_outliers_standing_and_flicker(seed, metres_p
     p[rng.uniform(size=len(t)) < 0.05] += rng.normal(0, 40, 3)
     flicker = rng.integers(0, 2, len(t)) * ((t < 60) | (t > 150))
     odometer = Travel(t, np.floor(metres / metres_per_count) + flicker, 1.0)
-    # a piece of 20 m carries sqrt(2) * 1.5 m of noise: 10 %, the median of 50 pieces 1.8 %;
-    # noise across the way adds (2.1 / 20)^2 / 2 = 0.6 %, outliers in a tenth move the median by
-    # 0.1 of a sigma; flicker of one count while it drives none
+    # a section of 20 m has sqrt(2) * 1.5 m of noise: 10 %, the median of 50 sections 1.8 %;
+    # lateral noise adds (2.1 / 20)^2 / 2 = 0.6 %, outliers in a tenth move the median by
+    # 0.1 of a sigma; flicker of one count has no effect in motion
     assert rough_scale(odometer, t, p, 1.5) == pytest.approx(metres_per_count, rel=0.07)
     backwards = Travel(t, -odometer.s, 1.0)
     assert rough_scale(backwards, t, p, 1.5) == rough_scale(odometer, t, p, 1.5)
 
 
-def test_rough_scale_of_a_loop_and_of_a_single_stretch():
+def test_rough_scale_of_a_loop_and_of_a_single_section():
     t = np.arange(0, 400, 0.2)
     turns = 10 * t / (100 / 2 / np.pi)
     p = 100 / 2 / np.pi * np.stack([np.cos(turns), np.sin(turns), 0 * t], -1)
-    # 20 m of a circle of 100 m: the chord is 6.5 % short, up to the double piece 24 %
+    # 20 m of a circle of 100 m: the chord is 6.5 % short, of twice the length 24 %
     assert rough_scale(Travel(t, 500 * t, 1.0), t, p, 0.0) == pytest.approx(0.02, rel=0.25)
     few = np.array([0.0, 25.0])
     assert rough_scale(Travel(few, 50 * few, 1.0), few, np.outer(few, [1, 0, 0]), 1.5) == 0.02
 
 
 @pytest.mark.parametrize(('noise', 'stated'), [(0.01, 0.01), (0.2, 0.01), (0.01, 2.5)])
-def test_rough_scale_of_lanes_that_fold_back(noise, stated):
+def test_rough_scale_of_parallel_lanes_in_alternating_directions(noise, stated):
     rng, t = np.random.default_rng(3), np.arange(0, 600, 0.2)
     lane = 0.5 * t / 18
     along = 18 * np.abs((lane + 1) % 2 - 1)
@@ -157,7 +157,7 @@ def test_rough_scale_of_lanes_that_fold_back(noise, stated):
     assert rough_scale(Travel(t, 5 * t, 1.0), t, p, stated) == pytest.approx(0.1, rel=0.1)
 
 
-def test_rough_scale_needs_motion_of_both():
+def test_rough_scale_requires_motion_in_fixes_and_odometer():
     rng, t = np.random.default_rng(12), np.arange(0, 60, 0.2)
     still, moving = Travel(t, 0 * t, 1.0), Travel(t, 100 * t, 1.0)
     assert rough_scale(moving, t, fixes(0 * t, rng, 1.5), 1.5) is None

@@ -13,7 +13,7 @@ from odocal_ros.nav.rotations import skew
 
 pytestmark = pytest.mark.core
 
-# Earth-fixed coordinates of 6.4e6 m have an ulp of 9.3e-10 m; three roundings on the way
+# Earth-fixed coordinates of 6.4e6 m have an ulp of 9.3e-10 m; three roundings
 METRES = 3e-9
 LATITUDES_DEG = [-90, -89.9999999, -60, -1e-9, 0, 1e-7, 33, 45, 89, 89.9999999, 90]
 LONGITUDES_DEG = [-180, -179.9999999, -90, 0, 1e-9, 90, 120, 180]
@@ -34,7 +34,7 @@ def test_earth_fixed_coordinates_against_pyproj():
     assert_allclose(geodesy.ecef_from_geodetic(lat, lon, h), theirs, rtol=0, atol=2 * METRES)
 
 
-def test_there_and_back_poles_and_date_line_included():
+def test_geodetic_conversion_is_inverted_also_at_poles_and_date_line():
     lat, lon, h = grid()
     r_e = geodesy.ecef_from_geodetic(lat, lon, h)
     lat2, lon2, h2 = geodesy.geodetic_from_ecef(r_e)
@@ -48,7 +48,7 @@ def test_there_and_back_poles_and_date_line_included():
     assert h == pytest.approx(7.0, abs=METRES)
 
 
-def test_axes_of_enu():
+def test_enu_axes_are_the_derivatives_of_the_position():
     lat, lon, h, d = 0.7, -2.1, 300.0, 1e-6
     C = geodesy.C_en(lat, lon)
     assert_allclose(C @ C.T, np.eye(3), atol=1e-15)
@@ -73,12 +73,12 @@ def test_radii_at_equator_and_pole_and_along_the_meridian_quadrant():
 
 @pytest.mark.parametrize(('latitude_deg', 'gamma'), [
     (0, 9.7803253359), (90, 9.8321849378), (-90, 9.8321849378)])   # NIMA TR8350.2, table 3.4
-def test_normal_gravity_published(latitude_deg, gamma):
+def test_normal_gravity_is_the_published_one(latitude_deg, gamma):
     assert geodesy.gravity(np.deg2rad(latitude_deg), 0.0) == pytest.approx(gamma, abs=1e-10)
 
 
 @pytest.mark.parametrize('latitude', [0.0, 0.6, -1.2, np.pi / 2])
-def test_gravity_gradient_is_that_of_bruns(latitude):
+def test_gravity_gradient_obeys_the_formula_of_bruns(latitude):
     """At the ellipsoid d gamma / dh = -gamma (1/M + 1/N) - 2 Omega^2, an identity."""
     meridian, normal = geodesy.radii(latitude)
     gamma = geodesy.gravity(latitude, 0.0)
@@ -88,7 +88,7 @@ def test_gravity_gradient_is_that_of_bruns(latitude):
                                   rel=4e-5)
 
 
-def test_gravity_far_up_falls_with_the_square():
+def test_gravity_at_altitude_falls_with_the_square_of_the_distance():
     """At 20 km, minus the centrifugal part, as (R / (R + h))^2 to the third order left out."""
     h, omega2, a = 20e3, geodesy.OMEGA**2, geodesy.SEMI_MAJOR_AXIS
     bare = geodesy.gravity(0.0, 0.0) + omega2 * a
@@ -99,13 +99,13 @@ def test_gravity_far_up_falls_with_the_square():
 
 
 @given(lat=st.floats(-1.4, 1.4), lon=st.floats(-3, 3))
-def test_earth_rate_is_the_axis_seen_from_anywhere(lat, lon):
+def test_earth_rate_is_along_the_polar_axis_at_any_place(lat, lon):
     assert_allclose(geodesy.C_en(lat, lon) @ geodesy.earth_rate_n(lat), [0, 0, geodesy.OMEGA],
                     atol=1e-19)
 
 
 @given(lat=st.floats(-1.4, 1.4), ve=st.floats(-60, 60), vn=st.floats(-60, 60))
-def test_transport_rate_is_how_enu_turns_along_the_way(lat, ve, vn):
+def test_transport_rate_is_the_rotation_of_enu_along_a_path(lat, ve, vn):
     h, dt = 200.0, 1e-3
     meridian, normal = geodesy.radii(lat)
     dlat, dlon = vn / (meridian + h) * dt, ve / (normal + h) / np.cos(lat) * dt

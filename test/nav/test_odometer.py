@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer rows to travel: every counter width, both ways over the edge, resets, bursts."""
+"""Odometer rows to travel: counter widths, rollover in both directions, resets, bursts."""
 
 from dataclasses import replace
 
@@ -34,21 +34,21 @@ WIDTHS = [(2**16, -2**15), (2**16, 0), (2**32, -2**31), (2**32, 0), (9000, 0), (
           (65536, 0), (2**62, 0)]
 
 
-@pytest.mark.parametrize('way', [1, -1])
+@pytest.mark.parametrize('sign', [1, -1])
 @pytest.mark.parametrize(('modulus', 'low'), WIDTHS)
-def test_rollover_is_undone_both_ways(modulus, low, way):
-    total = low + modulus - 200 + np.arange(100) * 37 if way > 0 else \
+def test_rollover_is_removed_in_both_directions(modulus, low, sign):
+    total = low + modulus - 200 + np.arange(100) * 37 if sign > 0 else \
         low + 200 - np.arange(100) * 37
     t = np.arange(100) * 0.02
     found, reasons = make_travel(t, sent(total, modulus, low), counter(modulus))
     # exact in whole numbers; 2^62 leaves no digit behind the point
-    assert np.array_equal(found.s, way * np.arange(100) * 37.0)
+    assert np.array_equal(found.s, sign * np.arange(100) * 37.0)
     assert codes(reasons) == [Code.COUNTER_ROLLOVER]
     assert f'modulus {modulus}' in reasons[0].text
     assert found.quantum == 1.0
 
 
-def test_rollover_says_how_often_and_where():
+def test_rollover_is_reported_with_number_and_place():
     total = np.arange(1000) * 37
     _, reasons = make_travel(np.arange(1000) * 0.02, sent(total, 9000, 0), counter(9000))
     # 36963 counts pass 9000 four times, first in step 9000 // 37 = 243
@@ -56,19 +56,19 @@ def test_rollover_says_how_often_and_where():
     assert f't = {244 * 0.02:.2f} s' in reasons[0].text
 
 
-@pytest.mark.parametrize('way', [1, -1])
-def test_64_bits_roll_over_by_themselves(way):
-    edge = np.array([2**63 - 10 * way], dtype=np.uint64)
+@pytest.mark.parametrize('sign', [1, -1])
+def test_64_bit_arithmetic_removes_its_rollover(sign):
+    edge = np.array([2**63 - 10 * sign], dtype=np.uint64)
     steps = np.arange(30, dtype=np.uint64) * 3
-    value = (edge + steps if way > 0 else edge - steps).view(np.int64)
+    value = (edge + steps if sign > 0 else edge - steps).view(np.int64)
     found, reasons = make_travel(np.arange(30.0), value, counter(2**64))
-    assert np.array_equal(found.s, way * np.arange(30) * 3.0)
+    assert np.array_equal(found.s, sign * np.arange(30) * 3.0)
     assert reasons == ()
 
 
 @settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), modulus=st.sampled_from([9000, 9001, 2**16, 2**32, 2**64]))
-def test_any_walk_below_half_a_modulus_a_step_comes_back(seed, modulus):
+def test_any_steps_below_half_a_modulus_are_recovered(seed, modulus):
     rng = np.random.default_rng(seed)
     steps = rng.integers(-4000, 4001, 60)
     total = int(rng.integers(0, 8000)) + np.concatenate([[0], np.cumsum(steps)])
@@ -78,7 +78,7 @@ def test_any_walk_below_half_a_modulus_a_step_comes_back(seed, modulus):
 
 
 def drive(n=400, dt=0.02):
-    """Return times and a whole running total: still, faster and faster, even, still."""
+    """Return times and integer counts: at rest, accelerating, at constant speed, at rest."""
     t = np.arange(n) * dt
     rate = 700 * np.interp(t / t[-1], [0, 0.2, 0.4, 0.8, 0.9, 1], [0, 0, 1, 1, 0, 0])
     return t, np.floor(np.concatenate([[0], np.cumsum(rate[1:] * dt)])).astype(np.int64), rate
@@ -86,7 +86,7 @@ def drive(n=400, dt=0.02):
 
 @pytest.mark.parametrize('modulus', [2**16, 2**32, 2**64])
 @pytest.mark.parametrize('at', [150, 250, 380])
-def test_a_reset_is_bridged_at_the_speed_beside_it(modulus, at):
+def test_a_reset_is_bridged_at_the_adjacent_speed(modulus, at):
     t, total, rate = drive()
     before = total + (30_000 if modulus == 2**16 else 1_500_000_000)     # whole numbers
     value = np.where(np.arange(len(t)) < at, before, total - total[at])
@@ -98,7 +98,7 @@ def test_a_reset_is_bridged_at_the_speed_beside_it(modulus, at):
     assert f't = {t[at]:.2f} s' in reasons[0].text
 
 
-def test_a_false_row_costs_two_steps_not_the_leg():
+def test_a_wrong_row_affects_two_steps_only():
     t, total, _ = drive()
     value = total.copy() + 30_000
     value[200] = 0
@@ -113,18 +113,18 @@ SLOW = np.concatenate([np.full(300, 0.01), np.ones(200), [0.01], np.full(300, 0.
 
 
 @pytest.mark.parametrize(('t', 'value'), [
-    # less than one in a hundred rows moves: they must not be taken for jumps
+    # the count changes in less than 1 % of the rows: changes must not be treated as jumps
     (EVEN, np.concatenate([np.zeros(100_000, dtype=np.int64), drive()[1]])),
     (EVEN[:10_200], np.cumsum(np.concatenate([np.ones(10_000, int), np.full(200, 40)]))),
     # fast zeros at rest, then one count a second, and two at once
     (np.cumsum(SLOW), np.cumsum(np.repeat([0, 1, 2, 0], [300, 200, 1, 300]))),
-    # ten rows at once, or one early: the interval of a row says nothing of the speed
+    # ten rows at once, or one early: the interval of a row does not give the speed
     (np.floor(SHORT / 10) * 0.2 + (SHORT % 10) * 1e-5, drive()[1]),
     (np.where(SHORT % 50 == 1, EVEN[:400] - 0.0199, EVEN[:400]), drive()[1]),
     (EVEN[:500], np.cumsum(np.random.default_rng(1).choice([0, 0, 0, 0, 1, 2], 500))),
     (EVEN[:50], np.full(50, 77))],
     ids=['hour at rest', 'creeping', 'two counts', 'bursts', 'early row', 'seldom', 'standing'])
-def test_uneven_counts_and_stamps_are_no_resets(t, value):
+def test_uneven_counts_and_stamps_are_not_resets(t, value):
     found, reasons = make_travel(t, value, counter(2**32))
     assert reasons == ()
     assert np.array_equal(found.s, (value - value[0]).astype(float))
@@ -175,7 +175,7 @@ def test_reversed_counts(form):
 
 @pytest.mark.parametrize('quantity', ['cumulative', 'increment', 'rate'])
 @pytest.mark.parametrize('dtype', [np.int64, np.float64])
-def test_no_row_and_one_row(quantity, dtype):
+def test_zero_rows_and_one_row_give_no_travel(quantity, dtype):
     form = OdometerForm(quantity, 2**16, 'm/pulse')
     assert make_travel(np.empty(0), np.empty(0, dtype), form)[0].s.shape == (0,)
     found, reasons = make_travel(np.array([3.0]), np.array([7], dtype), form)
@@ -188,7 +188,7 @@ def test_travel_is_linear_between_rows_and_constant_outside():
     assert_allclose(found.at([-9.0, 0.5, 2.0, 9.0]), [0, 1, 0, -2], atol=0)
 
 
-def test_two_wheels_meet_in_the_middle():
+def test_travel_of_two_wheels_is_their_mean():
     left = Travel(np.arange(5.0), np.arange(5.0) * 10, 1.0)
     right = Travel(np.array([0.5, 3.5]), np.array([0.0, 60.0]), 1.0)     # 20 a second
     found = mean_travel((left, right))
@@ -199,26 +199,26 @@ def test_two_wheels_meet_in_the_middle():
         assert mean_travel(pair).s.shape == (0,)
 
 
-def test_the_mean_of_two_rounded_wheels_errs_as_its_quantum_says():
-    """Even errors of width q have q / sqrt(12)."""
+def test_error_of_the_mean_of_two_rounded_wheels_agrees_with_its_quantum():
+    """Uniform errors of width q have a sigma of q / sqrt(12)."""
     rng, n = np.random.default_rng(3), 20_000
     t = np.arange(n) * 0.02
-    way = np.cumsum(rng.uniform(3, 9, n))
-    wheels = [Travel(t, np.floor(way * k + p), 1.0) for k, p in ((1.0, 0.3), (1.003, 0.8))]
+    path = np.cumsum(rng.uniform(3, 9, n))
+    wheels = [Travel(t, np.floor(path * k + p), 1.0) for k, p in ((1.0, 0.3), (1.003, 0.8))]
     found = mean_travel(wheels)
-    error = found.s - way * 1.0015
+    error = found.s - path * 1.0015
     # a variance from 20 000 hardly dependent draws: 1 %, five times over
     assert error.std() == pytest.approx(found.quantum / np.sqrt(12), rel=0.05)
 
 
-def test_steps_too_small_for_a_speed_are_no_resets():
+def test_steps_too_small_for_a_speed_are_not_resets():
     found, reasons = make_travel(np.arange(100) * 1e9, np.arange(100) * 5e-324,
                                  OdometerForm('cumulative', 0, 'm/rad'))
     assert reasons == ()
     assert np.array_equal(found.s, np.arange(100) * 5e-324)
 
 
-def test_rounding_of_a_counter_is_averaged_by_parabolas():
+def test_counter_rounding_is_averaged_by_fitted_parabolas():
     t = np.delete(np.arange(0, 60, 0.02), slice(1500, 1800))      # 30 to 36 s are missing
     true = 5.3 * t + 0.4 * t**2
     raw = Travel(t, np.round(true), 1.0)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a receiver's filter makes of a way, against its answer to a sine."""
+"""Position error by the filter of a receiver, against its response to a sine."""
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -13,7 +13,7 @@ W = np.array([0.5, 0.7])
 
 
 def swaying(t):
-    """Return place and velocity of a way that sways, (n, 2)."""
+    """Return position, m, and velocity, m/s, of a sinusoidal path: (n, 2) each."""
     phase = np.multiply.outer(t, W)
     return [20.0, 3.0] * np.sin(phase), [10.0, 2.1] * np.cos(phase)
 
@@ -22,20 +22,20 @@ def swaying(t):
 @pytest.mark.parametrize(('square', 'error'), [
     (1, lambda s: np.exp(s) / (1 + s) - 1),                     # of first order
     (-2, lambda s: -s**2 / (s**2 + np.sqrt(2) * s + 1))])       # of position and velocity
-def test_a_sine_comes_out_as_the_filter_has_it(square, error, tau):
+def test_smoothing_error_of_a_sine_is_the_filter_response(square, error, tau):
     t, at, square = np.arange(0.0, 60.0, 0.2), np.linspace(35.0, 50.0, 40), square * tau**2
     off, rate = smoothing_error(t, *swaying(t), at, square)
     want = [20.0, 3.0] * (np.exp(1j * np.multiply.outer(at, W)) * error(1j * W * tau)).imag
-    # the bend of a cubic over 0.2 s errs by (0.2 w)^2 / 12; of what the begin left,
+    # a cubic over 0.2 s has a curvature error of (0.2 w)^2 / 12; the initial transient is at
     # exp(-35 / (2.5 sqrt(2)))
     assert_allclose(off, want, rtol=0, atol=3e-3 * np.abs(want).max())
     h = 1e-3 * max(abs(square), LEAST_LAG2)
     above, below = (smoothing_error(t, *swaying(t), at, square + x)[0] for x in (h, -h))
-    # the product's own difference is one-sided, 1e-4 of tau^2 long
+    # the difference in the product is one-sided, over 1e-4 of tau^2
     assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
 
 
-def test_of_an_odometer_in_the_receiver_the_slow_part_is_taken_back():
+def test_error_of_an_odometer_in_the_receiver_is_high_pass_filtered():
     t, at, share, time = np.arange(0.0, 200.0, 0.2), np.linspace(150.0, 190.0, 40), 0.02, 8.0
     error, by_share, by_log_time = own_odometer_error(t, *swaying(t), at, share, np.log(time))
     s = 1j * W * time
@@ -49,10 +49,10 @@ def test_of_an_odometer_in_the_receiver_the_slow_part_is_taken_back():
                     atol=2e-3 * np.abs(by_log_time).max())
 
 
-def test_past_its_ends_a_way_goes_straight_on():
+def test_path_is_extrapolated_straight_beyond_its_ends():
     t = np.arange(0.0, 10.0)
     place = np.stack([3.0 * t, 0 * t], -1)
     late, _ = smoothing_error(t, place, np.tile([3.0, 0.0], (10, 1)), np.array([0.0, 5.0, 9.0]),
                               4.0)
-    # a steady way is late by tau, no more: that is in the delay
+    # at constant velocity the error is a delay of tau only, which is in the delay parameter
     assert_allclose(late, 0.0, atol=1e-12)

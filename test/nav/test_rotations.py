@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Angles and rotations against series, scipy, mpmath and each other, over all seams."""
+"""Angles and rotations against series, scipy, mpmath and each other, across wrap-arounds."""
 
 
 from hypothesis import given, strategies as st
@@ -34,7 +34,7 @@ ANGLES = st.floats(-50.0, 50.0)
 @pytest.mark.parametrize(('angle', 'wrapped'), [
     (0.0, 0.0), (np.pi, np.pi), (-np.pi, np.pi), (3 * np.pi, np.pi), (2 * np.pi, 0.0),
     (1.5 * np.pi, -0.5 * np.pi), (-1.5 * np.pi, 0.5 * np.pi), (1e-300, 1e-300)])
-def test_wrap(angle, wrapped):
+def test_wrap_gives_the_remainder_of_a_turn(angle, wrapped):
     assert wrap(angle) == pytest.approx(wrapped, abs=1e-15)      # an ulp of 3 pi is 1.8e-15
 
 
@@ -50,7 +50,7 @@ def test_wrap_stays_in_its_interval_beside_every_odd_pi(turns, steps):
 
 
 @given(angle=ANGLES)
-def test_wrap_takes_whole_turns_only_and_leaves_the_inside_alone(angle):
+def test_wrap_subtracts_whole_turns_and_keeps_angles_inside(angle):
     turns = (angle - wrap(angle)) / (2 * np.pi)
     # 50 rad carry 7e-15 of round-off, and so does the remainder
     assert turns == pytest.approx(round(turns), abs=1e-14)
@@ -67,7 +67,7 @@ def test_heading_turns_clockwise_from_north(heading_deg, east, north):
 
 
 @given(yaw=ANGLES)
-def test_heading_and_yaw_undo_each_other(yaw):
+def test_heading_and_yaw_are_inverse_functions(yaw):
     heading = heading_from_yaw(yaw)
     assert 0 <= heading < 2 * np.pi
     assert wrap(yaw_from_heading(heading) - yaw) == pytest.approx(0, abs=2e-14)
@@ -76,7 +76,7 @@ def test_heading_and_yaw_undo_each_other(yaw):
 @pytest.mark.parametrize('function', [
     lambda rows: arctan2(*rows.T[:2]),
     lambda rows: rotvec_from_quat(rows / np.linalg.norm(rows, axis=1)[:, None])])
-def test_arc_tangents_and_rotation_vectors_do_not_depend_on_where_the_columns_lie(function):
+def test_angles_and_rotation_vectors_do_not_depend_on_memory_layout(function):
     """With numpy 1.26 a tenth of the copies has other last digits in np.arctan2 itself."""
     rng = np.random.default_rng(0)
     rows, held, seen = rng.normal(size=(7001, 4)), [], set()
@@ -92,7 +92,7 @@ VECTORS = st.tuples(AXIS, AXIS, AXIS).map(np.array)
 
 
 def same_rotation(p, q):
-    """Return the angle between two unit quaternions, rad, blind to their common sign."""
+    """Return the angle between two unit quaternions, rad, for either sign of them."""
     d = quat_multiply(quat_conjugate(p), q)
     return 2 * np.arctan2(np.linalg.norm(d[..., :3], axis=-1), np.abs(d[..., 3]))
 
@@ -142,7 +142,7 @@ ANGLE = st.floats(-3.1, 3.1)
 
 @pytest.mark.parametrize('up', [1, -1])
 @pytest.mark.parametrize('off', [0.0, *np.logspace(-16, -1, 31)])
-def test_matrix_survives_rpy_at_and_beside_gimbal_lock(up, off):
+def test_matrix_is_recovered_from_rpy_at_and_near_gimbal_lock(up, off):
     """Roll and yaw are lost there, but together they must still give the same matrix."""
     R = exp_so3([0.4, -1.3, 2.2])
     C = matrix_from_rpy([0.3, up * (np.pi / 2 - off), -1.1]) @ R @ R.T     # with its round-off
@@ -153,7 +153,7 @@ def test_matrix_survives_rpy_at_and_beside_gimbal_lock(up, off):
         assert_allclose(matrix_from_rpy(rpy_from_matrix(C)), C, atol=ROUND_OFF)
 
 
-def test_against_scipy():
+def test_rotations_agree_with_scipy():
     Rotation = pytest.importorskip('scipy.spatial.transform').Rotation
     rng = np.random.default_rng(3)
     theirs = Rotation.from_rotvec(rng.normal(0, 1.5, (200, 3)))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Standstill: found where it is, not where a vehicle creeps, rocks or turns on the spot."""
+"""Standstills are found, and not in slow motion, rocking or turns on the spot."""
 
 from drives import drive
 import numpy as np
@@ -28,10 +28,10 @@ def gyro(t, noise=0.0, bias=(0.0, 0.0, 0.0), turn=None, seed=1):
     return w
 
 
-def counts(t, way, phase=0.3):
+def counts(t, drive, phase=0.3):
     """Return travel as whole counts of K metres at the odometer's own 50 Hz."""
     own = t[::2]
-    s = np.floor(np.interp(own, *way) / K + phase)
+    s = np.floor(np.interp(own, *drive) / K + phase)
     return Travel(own, s - s[0], 1.0)
 
 
@@ -60,10 +60,10 @@ def test_both_ends_of_a_drive_are_found_inside_the_truth(grade, bias):
 
 
 @pytest.mark.parametrize('slope', [0.02, 0.1, 0.5, 3.0])
-def test_a_slow_start_is_cut_off_before_it_has_moved_far(slope):
-    way = ramp(20.0, 90.0, slope=slope)
-    b = standstills(T, gyro(T), counts(T, way), K, 2.0)[0, 1]
-    assert np.interp(b, *way) <= REST_TRAVEL
+def test_a_standstill_ends_early_in_a_slow_start(slope):
+    drive = ramp(20.0, 90.0, slope=slope)
+    b = standstills(T, gyro(T), counts(T, drive), K, 2.0)[0, 1]
+    assert np.interp(b, *drive) <= REST_TRAVEL
     if slope >= 0.5:                        # 0.5 m/s^2 makes 3 cm within 0.35 s < the window
         assert b <= 20.0
 
@@ -75,14 +75,14 @@ def swinging(hertz):
     return w
 
 
-@pytest.mark.parametrize(('w', 'way'), [
+@pytest.mark.parametrize(('w', 'travel'), [
     *((gyro(T), size * np.sin(2 * np.pi * T / period))
       for size in (0.05, 0.2) for period in (0.5, 1.0, 3.0)),
     *((gyro(T), speed * T) for speed in (0.025, 0.05, 0.1)),
     (gyro(T, bias=(0.0, 0.0, 0.3)), 0 * T), (swinging(0.5), 0 * T), (swinging(3.0), 0 * T)],
     ids=[*['rocking'] * 6, *['creeping'] * 3, 'turning all the time', *['swinging'] * 2])
-def test_what_moves_is_no_standstill(w, way):
-    assert len(standstills(T, w, Travel(T, way, 0.0), 1.0, 2.0)) == 0
+def test_motion_is_not_a_standstill(w, travel):
+    assert len(standstills(T, w, Travel(T, travel, 0.0), 1.0, 2.0)) == 0
 
 
 @pytest.mark.parametrize('metres', [0.001, 0.02, 0.3])
@@ -94,7 +94,7 @@ def test_a_count_that_flickers_at_rest_is_a_standstill(metres):
 
 @pytest.mark.parametrize('bias', [0.0, 0.1, -0.1])
 @pytest.mark.parametrize('spin', [0.3, -0.5, 1.0])
-def test_turning_on_the_spot_is_no_standstill(bias, spin):
+def test_turning_on_the_spot_is_not_a_standstill(bias, spin):
     turn = [0, 10, 10.3, 40, 40.3, 100], [0, 0, spin, spin, 0, 0]
     found = standstills(T, gyro(T, 1e-4, (0.02, 0.0, bias), turn), Travel(T, 0 * T, 0.5), K, 2.0)
     assert len(found) == 2
@@ -105,7 +105,7 @@ def test_turning_on_the_spot_is_no_standstill(bias, spin):
     assert found[1, 1] == T[-1]
 
 
-def test_one_rest_among_many_equal_turns_is_the_rest():
+def test_a_standstill_among_many_equal_turns_is_found():
     turn = ([0, 10, 10.2, 30, 30.2, 35, 35.2, 60, 60.2, 65, 65.2, 100],
             [0.2, 0.2, 0.5, 0.5, 0.2, 0.2, 0.0, 0.0, 0.2, 0.2, 0.5, 0.5])
     w = gyro(T, bias=(0.0, 0.0, -0.01), turn=turn)
@@ -115,14 +115,14 @@ def test_one_rest_among_many_equal_turns_is_the_rest():
     assert 59.0 < found[0, 1] <= 60.2
 
 
-def test_the_engine_shakes_and_a_reversed_odometer_counts_backwards():
+def test_standstill_is_found_with_engine_vibration_and_reversed_counts():
     w = gyro(T, GRADES['consumer'].gyro_noise)
     w += 0.05 * np.sin(2 * np.pi * np.outer(T, [27.0, 31.0, 23.0]))
     assert len(standstills(T, w, counts(T, DRIVE), K, 2.0)) == 2
     assert len(standstills(T, gyro(T), counts(T, (DRIVE[0], -DRIVE[1])), K, 2.0)) == 2
 
 
-def test_a_gap_of_the_imu_is_no_standstill():
+def test_an_imu_gap_is_not_a_standstill():
     for gap, count in ((5.0, 2), (0.3, 1)):
         keep = (T < 50) | (50 + gap < T)
         found = standstills(T[keep], gyro(T)[keep], Travel(T, 0 * T, 1.0), K, 2.0)
@@ -134,7 +134,7 @@ def test_a_gap_of_the_imu_is_no_standstill():
             assert found[1, 0] >= 55.0
 
 
-def test_an_odometer_silent_at_rest_still_stands():
+def test_a_standstill_is_found_without_odometer_messages_at_rest():
     rows = counts(T, DRIVE)
     own = (rows.t == 0) | ((rows.t > 20) & (rows.t < 70)) | (rows.t == rows.t[-1])
     found = standstills(T, gyro(T), Travel(rows.t[own], rows.s[own], 1.0), K, 2.0)
@@ -144,15 +144,15 @@ def test_an_odometer_silent_at_rest_still_stands():
 
 
 @pytest.mark.parametrize(('shortest', 'count'), [(1.0, 3), (4.0, 2), (25.0, 1), (40.0, 0)])
-def test_only_as_short_as_asked(shortest, count):
-    way = ramp(20.0, 40.0)
+def test_standstills_shorter_than_the_minimum_are_not_found(shortest, count):
+    drive = ramp(20.0, 40.0)
     again = ramp(43.0, 70.0)
-    both = way[0], way[1] + again[1]
+    both = drive[0], drive[1] + again[1]
     assert len(standstills(T, gyro(T), counts(T, both), K, shortest)) == count
 
 
 @pytest.mark.parametrize('n', [0, 1, 2, 3])
-def test_too_little_data(n):
+def test_too_little_data_has_no_standstill(n):
     few = np.arange(n) * 0.01
     many = Travel(T, 0 * T, 1.0)
     assert standstills(few, np.zeros((n, 3)), many, K, 2.0).shape == (0, 2)
@@ -161,7 +161,7 @@ def test_too_little_data(n):
 
 
 @pytest.mark.parametrize('scale', [0.35, 1.0, 1.7])
-def test_one_pulse_a_turn_of_the_wheel_still_shows_a_stop(scale):
+def test_a_stop_is_found_with_one_pulse_per_wheel_turn(scale):
     made = drive(scenario='straight', duration=200.0, scale=scale, nominal_scale=scale)
     inputs, _ = screen(made.leg(), Config())
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, 2.0)
@@ -170,12 +170,12 @@ def test_one_pulse_a_turn_of_the_wheel_still_shows_a_stop(scale):
     assert 0 <= spans[0, 1] < np.sqrt(4 * scale / 0.48)
 
 
-def test_the_medians_are_those_of_the_distributions():
+def test_median_factors_are_those_of_the_distributions():
     assert pytest.approx(norm.ppf(0.75), abs=1e-4) == NORMAL_MEDIAN
     assert pytest.approx(rayleigh.median(), abs=1e-4) == RAYLEIGH_MEDIAN
 
 
-def test_a_tenth_of_wild_values_changes_little():
+def test_ten_per_cent_outliers_change_the_level_little():
     x = np.random.default_rng(1).normal(0.0, 0.3, 30_000)
     # of 30,000 values a median is known to 0.8 %: three sigmas
     assert robust_sigma(x) == pytest.approx(0.3, rel=0.024)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Strapdown attitude: against loops and closed forms, its orders, its seams."""
+"""Strapdown attitude: against loops and closed forms, orders of the error, chunk edges."""
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -36,14 +36,14 @@ def stamps(n, rng, jitter=0.3):
 
 
 @pytest.mark.parametrize('n', [0, 1, 2, 3, 4, 5, 63, 64, 65, 129, 4097, 20_000])
-def test_prefix_product_is_that_of_a_loop(n):
+def test_prefix_product_equals_that_of_a_loop(n):
     q = quat_from_rotvec(np.random.default_rng(n).normal(0, 0.3, (n, 3)))
     before, expected, total = q.copy(), np.empty((n, 4)), ONE
     for k in range(n):
         expected[k] = total = quat_multiply(total, q[k])
     # a product rounds by some 2e-16; as a random walk over 20 000: 3e-14
     assert_allclose(prefix_product(q), expected, rtol=0, atol=1e-13)
-    assert np.array_equal(q, before)        # its input is left alone
+    assert np.array_equal(q, before)        # the input is unchanged
 
 
 @pytest.mark.parametrize('n', [2, 3, 4, 5, 6, 7, 100])
@@ -54,7 +54,7 @@ def test_constant_rate_on_uneven_stamps_is_exact(n):
     assert_allclose(q, quat_from_rotvec((t - t[0])[:, None] * w), atol=1e-14)
 
 
-def test_one_sample_is_the_start_and_none_is_nothing():
+def test_one_sample_gives_the_start_attitude_and_none_gives_none():
     q0 = quat_from_rotvec([0.1, 0.2, 0.3])
     t, q = attitude([5.0], np.ones((1, 3)), q0, np.ones(3), every=4)
     assert_allclose(t, [5.0])
@@ -66,12 +66,12 @@ def test_one_sample_is_the_start_and_none_is_nothing():
 
 @pytest.mark.parametrize('latitude', [0.7, -0.7, 0.0, 1.5])
 @pytest.mark.parametrize('every', [1, 50])
-def test_gyro_at_rest_stays_level_and_pointing_for_hours(latitude, every):
+def test_attitude_at_rest_is_constant_for_hours(latitude, every):
     C_nb, hours = matrix_from_rpy([0.1, -0.2, 2.5]), 3
     t = np.arange(0.0, hours * 3600, 0.5)
     w_b = np.tile(C_nb.T @ earth_rate_n(latitude), (len(t), 1))
     _, q = attitude(t, w_b, quat_from_matrix(C_nb), earth_rate_n(latitude), every)
-    # 21600 products of 2e-16 each, at worst all one way
+    # 21600 products of 2e-16 each, at worst of one sign
     assert angle(q, quat_from_matrix(C_nb)).max() < 5e-12
     # the Earth turns by 0.8 rad meanwhile: left out, the attitude is off by that
     _, q = attitude(t, w_b, quat_from_matrix(C_nb), STILL, every)
@@ -89,7 +89,7 @@ CONE, RATE = 0.05, 2 * np.pi * 3.0      # rad, half-angle; rad/s: 3 Hz
 
 
 def coning(t):
-    """Return attitude and turn rate, b, of a body whose z axis goes round a cone."""
+    """Return attitude and turn rate, b, of a body in coning motion of its z axis."""
     axis = np.stack([np.cos(RATE * t), np.sin(RATE * t), np.zeros_like(t)], -1)
     w = np.stack([-np.sin(CONE) * np.sin(RATE * t), np.sin(CONE) * np.cos(RATE * t),
                   np.full_like(t, -2 * np.sin(CONE / 2)**2)], -1) * RATE
@@ -115,7 +115,7 @@ def limping(n):
 
 @pytest.mark.parametrize('n', [200, 400])
 @pytest.mark.parametrize(('stamped', 'ratio'), [(even, 16), (limping, 4)])
-def test_coning_error_is_of_fourth_order_and_of_second_by_two_samples(stamped, ratio, n):
+def test_coning_error_is_of_fourth_order_and_with_two_samples_of_second(stamped, ratio, n):
     # next order: (RATE / n)^2 = 0.9 % at 200
     assert coning_error(stamped(n)) / coning_error(stamped(2 * n)) == pytest.approx(
         ratio, rel=0.05)
@@ -167,7 +167,7 @@ def test_cubic_rate_about_one_axis_is_integrated_exactly(seed):
 
 
 @given(seed=st.integers(0, 10_000))
-def test_turning_the_body_axes_turns_the_answer(seed):
+def test_rotated_body_axes_give_the_rotated_attitude(seed):
     rng = np.random.default_rng(seed)
     t, w = stamps(30, rng, 0.8), rng.normal(0, 2, (30, 3))
     C = matrix_from_quat(quat_from_rotvec(rng.normal(0, 1, 3)))
@@ -175,7 +175,7 @@ def test_turning_the_body_axes_turns_the_answer(seed):
 
 
 @pytest.mark.parametrize('n', [2, 3])
-def test_short_arrays_are_two_sample(n):
+def test_short_arrays_use_the_two_sample_form(n):
     t = np.array([0.0, 0.1, 0.25])[:n]
     w = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 2.0], [1.0, 0.0, 0.0]])[:n]
     h = np.diff(t)[:, None]
@@ -183,7 +183,7 @@ def test_short_arrays_are_two_sample(n):
     assert_allclose(rotation_increments(t, w).T, straight, atol=1e-17)
 
 
-def test_around_a_gap_lines_are_straight_and_elsewhere_nothing_changes():
+def test_rates_are_linear_around_a_gap_and_unchanged_elsewhere():
     rng = np.random.default_rng(6)
     w = rng.normal(0, 1, (40, 3))
     t = np.arange(40) * 0.01
@@ -198,7 +198,7 @@ def test_around_a_gap_lines_are_straight_and_elsewhere_nothing_changes():
                     atol=1e-15)
 
 
-def test_equal_stamps_turn_nothing_and_spoil_nothing():
+def test_equal_stamps_have_no_effect_on_the_attitude():
     w = np.random.default_rng(7).normal(0, 1, (6, 3))
     phi = rotation_increments(np.array([0.0, 1.0, 2.0, 2.0, 3.0, 4.0]), w)
     assert np.isfinite(phi).all()
@@ -207,7 +207,7 @@ def test_equal_stamps_turn_nothing_and_spoil_nothing():
 
 @pytest.mark.parametrize('n', [1, 2, 3, 4, 5, 8, 9, 1000, 1001])
 @pytest.mark.parametrize('every', [1, 2, 3, 4, 7, 5000])
-def test_every_keeps_epochs_of_the_full_answer(n, every):
+def test_decimation_keeps_epochs_of_the_full_result(n, every):
     rng = np.random.default_rng(n)
     t, w, earth = stamps(n, rng), rng.normal(0, 2, (n, 3)), rng.normal(0, 0.1, 3)
     t_all, q_all = attitude(t, w, ONE, earth)
@@ -220,7 +220,7 @@ def test_every_keeps_epochs_of_the_full_answer(n, every):
 
 @pytest.mark.parametrize('every', [1, 3, 4])
 @pytest.mark.parametrize('chunk', [1, 2, 5, 16])
-def test_chunks_leave_no_trace(monkeypatch, every, chunk):
+def test_result_does_not_depend_on_chunk_size(monkeypatch, every, chunk):
     rng = np.random.default_rng(8)
     t, w = stamps(203, rng, 0.9), rng.normal(0, 2, (203, 3))
     whole = attitude(t, w, ONE, STILL, every)[1], rotation_increments(t, w)

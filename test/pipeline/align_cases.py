@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drives made ready for ``align``, and their true attitude."""
+"""Inputs of ``align`` from simulated drives, and the true attitude."""
 
 from copy import copy
 from dataclasses import replace
@@ -33,7 +33,7 @@ def settings(**changes):
 
 
 class Case:
-    """A drive made ready for ``align``, its start mark ``later`` seconds on if asked."""
+    """Inputs of ``align`` from a drive, with the start mark ``later`` by so many seconds."""
 
     def __init__(self, options, config=None, later=0.0, forget=False):
         self.drive = simulate(options)
@@ -56,7 +56,7 @@ class Case:
                      self.origin, self.config)
 
     def truth(self, t):
-        """Return the true C_nb at t, n being that of the origin."""
+        """Return the true C_nb at t, with n of the origin."""
         state = self.drive.motion.at(np.array([self.mark + t]))
         o = self.drive.options
         C_vb = matrix_from_rpy([o.roll, o.pitch, o.yaw])
@@ -65,7 +65,7 @@ class Case:
         return C_np @ attitude(state)[0] @ C_vb
 
     def miss(self, alignment):
-        """Return how the alignment turns n against the truth, as a rotation vector, rad."""
+        """Return the attitude error of the alignment, a rotation vector in n, rad."""
         return rpy_from_matrix(alignment.C_nb @ self.truth(alignment.t).T)
 
     def heading(self):

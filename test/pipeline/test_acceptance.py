@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pass or fail: the rule against the normal law, its limits, and what bars a pass."""
+"""Pass or fail: the rule against the normal law, its limits, and what prevents a pass."""
 
 from math import erf, pi, sqrt
 
@@ -28,7 +28,7 @@ def decided(value, sigma, reasons=(), name='scale_ratio', unit='1', **settings):
 
 
 @pytest.mark.parametrize('place', [-4, -2, 0, 1, 4])
-def test_the_shares_that_pass_and_fail_are_those_of_the_normal_law(place):
+def test_shares_of_pass_and_fail_agree_with_the_normal_law(place):
     """A result with a sigma of 500 ppm, its true value so many sigma above the upper limit."""
     draws, sigma = 20_000, 500e-6
     z = ndtri((np.arange(draws) + 0.5) / draws)        # the law itself: no noise of drawing
@@ -40,7 +40,7 @@ def test_the_shares_that_pass_and_fail_are_those_of_the_normal_law(place):
     assert found.count(Decision.FAIL) / draws == pytest.approx(above, abs=1e-4)
 
 
-def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
+def test_an_uncertain_value_is_undecided_and_states_the_sigma_required():
     assert decided(1.004, 0.0004).decision is Decision.PASS
     found = decided(1.004, 0.0006)
     assert found.decision is Decision.UNDECIDED
@@ -52,7 +52,7 @@ def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
     assert decided(1.0055, 0.0002).decision is Decision.FAIL
 
 
-def test_no_limit_asks_nothing_and_one_side_may_be_open():
+def test_limits_are_optional_on_each_side():
     estimates = {'scale_ratio': Estimate(1.0, 0.1, '1')}
     assert accept(Calibration((), estimates, {}, ()), Config()) is None
     one = {'accept.scale_ratio_max': 1.005}
@@ -62,7 +62,7 @@ def test_no_limit_asks_nothing_and_one_side_may_be_open():
         with_settings(Config(), one | {'accept.scale_ratio_min': 1.005})
 
 
-def test_an_angle_of_an_imu_that_faces_backwards_is_held_across_the_half_turn():
+def test_limits_of_an_angle_near_180_deg_hold_across_the_wrap_around():
     limits = {'accept.yaw_mounting_angle_min': pi - 0.02, 'accept.yaw_mounting_angle_max':
               pi + 0.02}
     for value in (pi - 0.01, -pi + 0.01):
@@ -77,7 +77,7 @@ def test_an_angle_of_an_imu_that_faces_backwards_is_held_across_the_half_turn():
         found.why)
 
 
-def test_nothing_is_decided_by_a_rejected_result_and_strict_lets_no_caution_pass():
+def test_a_rejected_result_decides_nothing_and_strict_passes_no_caution():
     rejected = decided(1.0, 1e-4, [Reason(Code.ODOMETER_STILL, 'no counts')])
     assert rejected.decision is Decision.UNDECIDED
     assert 'ODOMETER_STILL: no counts' in rejected.why
@@ -88,7 +88,7 @@ def test_nothing_is_decided_by_a_rejected_result_and_strict_lets_no_caution_pass
     assert decided(2.0, 1e-4, [CAUTION], **strict).decision is Decision.FAIL
 
 
-def test_a_value_that_is_not_determined_says_what_to_drive():
+def test_a_value_that_is_not_determined_gives_driving_instructions():
     why = Reason(Code.YAW_NOT_DETERMINED, 'too little')
     found = decided(None, None, [why], name='yaw_mounting_angle', unit='rad',
                     **{'accept.yaw_mounting_angle_max': 0.01})
@@ -96,7 +96,7 @@ def test_a_value_that_is_not_determined_says_what_to_drive():
     assert 'nominal_scale' in decided(None, None).remedy
 
 
-def test_limits_on_the_command_line_take_degrees():
+def test_limits_of_angles_on_the_command_line_are_in_degrees():
     assert parse_accept('scale_ratio=0.995:1.005') == LIMITS
     assert parse_accept('yaw_mounting_angle_deg=-0.5:') == {
         'accept.yaw_mounting_angle_min': pytest.approx(-0.5 * pi / 180, rel=1e-15)}

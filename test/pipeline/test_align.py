@@ -19,7 +19,7 @@ from odocal_ros.settings.nominal import GRADES
 @pytest.mark.parametrize(('spans', 'chosen'), [
     ([], None), ([[5.0, 9.0]], None), ([[-9.0, 3.0]], 0), ([[-9.0, -5.0], [-3.0, -1.0]], 1),
     ([[-9.0, -5.0], [0.4, 3.0]], 1), ([[-9.0, -5.0], [0.6, 3.0]], 0)])
-def test_the_standstill_that_holds_or_last_ended_before_the_mark(spans, chosen):
+def test_alignment_uses_the_standstill_at_the_mark_or_the_last_before(spans, chosen):
     found = choose_standstill(np.array(spans).reshape(-1, 2))
     assert found is None if chosen is None else found.tolist() == spans[chosen]
 
@@ -31,13 +31,13 @@ def far():
 
 
 @pytest.mark.parametrize('source', ['heading_topic', 'gyrocompass', 'fixed'])
-def test_a_standstill_far_from_the_mark_is_level_and_north_where_it_was(far, source):
+def test_a_standstill_far_from_the_mark_uses_level_and_north_of_its_place(far, source):
     a, _ = far.with_settings_of(alignment__heading_source=source,
                                 alignment__heading=far.heading()).align()
     assert a.t < -250
     assert a.heading_source == source
-    # fixes to a millimetre; a heading carried back is that of an axis pitched by 0.01 rad, and the
-    # level it is seen on has leant by 0.4 mrad meanwhile
+    # fixes of 1 mm; the heading carried back is of an axis pitched by 0.01 rad, and the local
+    # level has turned by 0.4 mrad meanwhile
     assert_allclose(far.miss(a), 0, atol=5e-6 if source == 'fixed' else 2e-7)
 
 
@@ -57,7 +57,7 @@ def test_level_in_motion_is_within_its_sigma(seed, grade):
 
 
 @pytest.mark.parametrize('slope', [0.0, 2e-7])
-def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
+def test_bias_walk_of_a_warming_gyro_is_taken_from_its_standstills(slope):
     case = Case(TURNING)
     alignment, _ = case.align()
     late = np.clip(case.inputs.t_imu - alignment.t, 0.0, None)
@@ -76,7 +76,7 @@ def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
     assert unknown.gyro_bias_walk == alignment.gyro_bias_walk
 
 
-def test_an_imu_taken_for_better_than_it_is_has_the_errors_of_its_noise():
+def test_an_imu_configured_with_a_better_grade_has_sigmas_of_its_noise():
     noisy = replace(PLAIN, imu_grade='consumer')
     alignment, _ = Case(noisy, settings(imu__grade='tactical')).align()
     own, _ = Case(noisy, settings(imu__grade='consumer')).align()
@@ -90,7 +90,7 @@ def test_an_imu_taken_for_better_than_it_is_has_the_errors_of_its_noise():
 
 
 @pytest.mark.parametrize('rows', [2, 3])
-def test_an_imu_that_falls_silent_at_the_mark_is_still_aligned(rows):
+def test_an_imu_without_rows_after_the_mark_is_still_aligned(rows):
     plain = Case(PLAIN)
     keep = plain.inputs.t_imu < 0
     keep[:np.flatnonzero(keep)[-rows]] = False

@@ -22,7 +22,7 @@ from odocal_ros.nav.rotations import (
 from odocal_ros.reasons import Code
 from odocal_ros.screening.inputs import UsableRows
 
-PLACE = 1e-6     # rad: fixes of 1.5 m say where north and level of a standstill are, 2.4e-7
+PLACE = 1e-6     # rad: north and level at a standstill by fixes of 1.5 m, 2.4e-7
 
 
 @pytest.fixture(scope='module')
@@ -44,13 +44,13 @@ def test_a_fixed_heading_is_a_compass_quantity(heading_deg):
 def test_a_fixed_heading_at_a_moving_mark_is_carried_back_to_the_standstill(later):
     case = Case(replace(TURNING, fix_sigma=0.0), later=later)
     a, _ = case.with_settings_of(alignment__heading=case.heading()).align()
-    # a perfect gyro at 50 Hz; Earth rate left on axes that the body has turned from: 7e-5 rad/s
-    # times what it is tilted by, 0.01 rad, for a minute: 4e-5 at the very most
+    # a perfect gyro at 50 Hz; Earth rate on axes from before the body turned: 7e-5 rad/s times
+    # the tilt, 0.01 rad, for a minute: 4e-5 at most
     assert_allclose(case.miss(a), 0, atol=5e-6)
 
 
 def orientations(case, yaw, variance):
-    """Return inputs for an IMU that sends one orientation, of its own frame i, all the time."""
+    """Return inputs for an IMU that always sends the same orientation, of its own frame i."""
     n = len(case.inputs.t_imu)
     q = quat_from_matrix(matrix_from_rpy([0.0, 0.0, yaw]) @ case.inputs.C_bi)
     return {'q_ni': np.tile(q, (n, 1)), 'yaw_variance': np.full(n, variance)}
@@ -68,7 +68,7 @@ def yaw_of(alignment):
 
 
 @pytest.mark.parametrize(('variance', 'sigma'), [(1e-4, 0.01), (0.0, 0.0175)])
-def test_orientation_of_the_imu_with_its_sigma_or_the_setting(plain, variance, sigma):
+def test_orientation_of_the_imu_has_its_own_sigma_or_that_of_the_setting(plain, variance, sigma):
     case = plain.with_settings_of(alignment__heading_source='imu_orientation')
     a, reasons = case.align(**orientations(plain, 2.9, variance))
     assert yaw_of(a) == pytest.approx(2.9, abs=PLACE)
@@ -86,7 +86,7 @@ def test_orientation_is_of_the_imu_frame_not_of_the_body():
     assert_allclose(case.miss(a), 0, atol=1e-6)
 
 
-def test_means_of_headings_go_over_the_seam_and_have_their_offset(plain):
+def test_mean_heading_is_right_across_the_wrap_around_and_has_its_offset(plain):
     case = plain.with_settings_of(alignment__heading_source='heading_topic')
     t = np.linspace(-30, -10, 200)
     a, _ = case.align(**heading_rows(np.pi + 0.01 * (-1.0)**np.arange(200), 1e-4, t))
@@ -99,7 +99,7 @@ def test_means_of_headings_go_over_the_seam_and_have_their_offset(plain):
     assert a.heading_sigma == pytest.approx(2e-3)
 
 
-def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
+def test_in_motion_the_nearest_heading_is_used_and_no_old_one(plain):
     case = plain.with_settings_of(alignment__heading_source='heading_topic')
     rows = heading_rows(np.array([9.0, 1.0, 2.0, 9.0]), np.array([np.nan, 1e-4, 1e-4, 1e-4]),
                         np.array([0.0, 0.1, 0.3, 0.6]))
@@ -114,7 +114,7 @@ def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
 @pytest.mark.parametrize(('variance', 'words'), [
     (np.nan, 'covariance[0] = -1'), (10.0, 'sigma is 181 deg; the limit is')])
-def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, words):
+def test_a_missing_or_invalid_orientation_is_refused(plain, source, variance, words):
     case = plain.with_settings_of(alignment__heading_source=source)
     rows = orientations(plain, 1.0, variance) if source == 'imu_orientation' else \
         heading_rows(1.0, variance, np.linspace(-50, 50, 1001))
@@ -141,9 +141,9 @@ TOO_POOR = 'causes a heading uncertainty of'
 
 @pytest.mark.parametrize(('changes', 'bias_deg_h', 'text'), [
     *(({'imu__grade': grade}, 0.0, TOO_POOR) for grade in ('consumer', 'industrial', 'tactical')),
-    # a tactical gyro set as navigation grade: its compass would be 20 deg off, at 0.1 stated
+    # tactical gyro configured as navigation: its gyrocompass errs by 20 deg and states 0.1
     ({}, [5.0, 0.0, 0.0], 'the Earth rate'), ({}, [0.0, 0.0, -2.0], 'the Earth rate')])
-def test_a_gyro_that_does_not_show_the_turn_of_the_earth_is_no_compass(
+def test_a_gyro_that_does_not_show_the_earth_rate_gives_no_heading(
         plain, changes, bias_deg_h, text):
     case = plain.with_settings_of(alignment__heading_source='gyrocompass', **changes)
     case.inputs = replace(case.inputs, w_b=case.inputs.w_b + np.deg2rad(bias_deg_h) / 3600)
@@ -160,13 +160,13 @@ def test_a_gyrocompass_needs_a_standstill(plain):
 
 
 @pytest.mark.parametrize('heading_deg', [0.0, 45.0, 180.0, 269.0])
-def test_course_of_the_first_thirty_metres_holds_the_mounting_angle(heading_deg):
+def test_course_of_the_first_thirty_metres_contains_the_mounting_angle(heading_deg):
     case = Case(replace(PLAIN, heading=np.deg2rad(heading_deg), fix_sigma=0.0))
     a, reasons = case.with_settings_of(alignment__heading_source='course').align()
     assert reasons == ()
     assert not a.heading_separable
     assert a.heading_shared
-    # b's x axis is taken for forward: off by the mounting angle; 1 mm fixes over 30 m, 2 cm pulses
+    # x of b is used as forward: wrong by the mounting angle; 1 mm fixes over 30 m, 2 cm pulses
     assert wrap(yaw_of(a) - yaw_from_heading(np.deg2rad(heading_deg))) == pytest.approx(
         0, abs=2e-4)
     assert wrap(yaw_of(a) - np.arctan2(*case.truth(a.t)[[1, 0], 0])) == pytest.approx(
@@ -174,7 +174,7 @@ def test_course_of_the_first_thirty_metres_holds_the_mounting_angle(heading_deg)
     assert np.abs(case.miss(a)[:2]).max() < 1e-5
 
 
-def test_course_sigma_holds():
+def test_course_error_agrees_with_its_sigma():
     z = []
     for seed in range(30):
         case = Case(replace(PLAIN, imu_rate=20.0, odometer_rate=20.0, seed=seed, duration=190.0))
@@ -203,7 +203,7 @@ def test_without_motion_or_fixes_after_the_mark_there_is_no_course(plain):
     assert a.heading_sigma == np.pi
 
 
-def test_auto_takes_the_first_that_answers(plain):
+def test_auto_uses_the_first_source_that_is_available(plain):
     t = np.linspace(-50, 50, 1001)
     case = plain.with_settings_of()
     everything = heading_rows(1.0, 1e-4, t) | orientations(plain, 2.0, 1e-4)
@@ -214,13 +214,13 @@ def test_auto_takes_the_first_that_answers(plain):
     assert_allclose(a.gyro_bias, 0, atol=1e-10)        # 1e-6 rad of level times the Earth rate
     a, reasons = plain.with_settings_of(imu__grade='industrial').align()
     assert a.heading_source == 'course'
-    assert reasons == ()        # nobody asked for the others
+    assert reasons == ()        # no reasons of sources that are not needed
     given = plain.with_settings_of(alignment__heading=1.0)
     assert given.align(**everything)[0].heading_source == 'fixed'
 
 
 @pytest.mark.parametrize('source', ['heading_topic', 'imu_orientation', 'gyrocompass', 'course'])
-def test_an_asked_source_is_taken_though_others_come_first(plain, source):
+def test_a_configured_source_is_used_although_others_come_first(plain, source):
     rows = heading_rows(1.0, 1e-4, np.linspace(-50, 50, 1001)) | orientations(plain, 2.0, 1e-4)
     case = plain.with_settings_of(alignment__heading_source=source)
     assert case.align(**rows)[0].heading_source == source

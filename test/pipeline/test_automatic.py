@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs that begin and end by themselves: where, and the same however the rows come."""
+"""Automatic legs: where they begin and end, the same for any order and size of blocks."""
 
 from types import SimpleNamespace
 
@@ -21,7 +21,7 @@ CONFIG = with_settings(Config(), {'leg.automatic': True, 'leg.automatic_minutes'
 
 
 def rows(stamp_ns, value=None):
-    """Return rows of an odometer; without values of a sensor of which only stamps are read."""
+    """Return rows of an odometer; without values: of a sensor, with stamps only."""
     if value is None:
         return SimpleNamespace(stamp_ns=np.asarray(stamp_ns), value=None)
     return OdometerSamples(stamp_ns, stamp_ns, value)
@@ -31,7 +31,7 @@ def sent(drive, form=COUNTER, imu_gap=(0, 0), only_counts=False):
     """
     Return slot -> rows of a drive: a list of (seconds, m/s), 50 counts a metre.
 
-    imu_gap : s in which the IMU is silent.   only_counts : a row only where there is a new count.
+    imu_gap : s without IMU rows.   only_counts : a row only where there is a new count.
     """
     ends = np.cumsum([length for length, _ in drive])
     t = np.arange(0.01, ends[-1], 0.05)
@@ -60,25 +60,25 @@ def in_seconds(search):
             for leg in search.spans]
 
 
-# at 60 s off, a red light at 120, a stop at 260 that is long enough, then ten minutes on end
+# starts at 60 s, a red light at 120, a stop at 260 that is long enough, then ten minutes
 TOWN = [(60, 0), (60, 10), (20, 0), (120, 10), (30, 0), (600, 10), (30, 0)]
 BEFORE, REST, PARKED = (x / SECOND for x in (START_REST_NS, LEG_END_REST_NS, PARKED_NS))
 
 
 @pytest.mark.parametrize(('form', 'only_counts'), [(COUNTER, False), (SPEED, False),
                                                    (COUNTER, True)])
-def test_legs_end_at_standstills_else_by_time(form, only_counts):
+def test_legs_end_at_standstills_or_after_the_longest_time(form, only_counts):
     found = legs(sent(TOWN, form, only_counts=only_counts), form)
-    first = 60 if only_counts else 60 - BEFORE      # no odometer is heard before its first count
+    first = 60 if only_counts else 60 - BEFORE      # no odometer row before the first count
     expected = [(first, 260 + REST), (290 - BEFORE, 590 - BEFORE),
                 (590 - BEFORE, 890 - BEFORE), (890 - BEFORE, 0)]
-    # one begins where the other ended in motion
+    # in motion, one begins where the other ends
     assert [b for _, b in found[1:3]] == [a for a, _ in found[2:]]
-    # what is less than 0.02 m or two counts, and a row's way, tells nothing: a tenth of a second
+    # motion below 0.02 m, two counts and the travel of a row is not detected: 0.1 s
     assert np.array(found) == pytest.approx(np.array(expected), abs=0.15)
 
 
-def test_a_long_stop_ends_a_leg_and_a_stop_too_short_to_rest_where_it_drives_off():
+def test_a_long_stop_ends_a_leg_and_a_shorter_one_when_the_vehicle_starts():
     parked = [(30, 0), (60, 10), (PARKED + 5, 0), (400, 10)]
     assert legs(sent(parked))[0] == pytest.approx((30 - BEFORE, 90 + REST), abs=0.15)
     light = [(30, 0), (60, 10), (PARKED - 5, 0), (400, 10)]
@@ -88,14 +88,14 @@ def test_a_long_stop_ends_a_leg_and_a_stop_too_short_to_rest_where_it_drives_off
                      pytest.approx((236 - BEFORE, 0), abs=0.15)]
 
 
-def test_a_gap_of_the_imu_lies_between_two_legs():
+def test_an_imu_gap_is_between_two_legs():
     found = legs(sent([(30, 0), (200, 10)], imu_gap=(100.0, 103.0)))
     assert found == [pytest.approx((30 - BEFORE, 100.0), abs=0.15),
                      pytest.approx((103.0, 0), abs=0.15)]
     assert len(legs(sent([(30, 0), (200, 10)], imu_gap=(100.0, 100.4)))) == 1     # leg.max_gap
 
 
-def test_nothing_begins_before_all_topics_are_there():
+def test_no_leg_begins_before_all_topics_are_received():
     topics = sent([(30, 0), (200, 10)])
     topics['fix'] = rows(topics['fix'].stamp_ns[100:])        # the first at 100.5 s
     assert legs(topics) == [pytest.approx((100.5, 0), abs=0.15)]
@@ -107,7 +107,7 @@ def test_nothing_begins_before_all_topics_are_there():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_how_the_rows_were_chopped_leaves_no_trace(seed):
+def test_legs_do_not_depend_on_block_sizes(seed):
     rng = np.random.default_rng(seed)
     topics = sent(TOWN, imu_gap=(700.0, 702.0))
     pieces = []
@@ -123,7 +123,7 @@ def test_how_the_rows_were_chopped_leaves_no_trace(seed):
     assert in_seconds(search) == legs(topics)
 
 
-def test_after_a_leg_of_the_operators_it_goes_on():
+def test_automatic_legs_continue_after_a_leg_of_the_operator():
     topics = sent(TOWN)
     for at_rest, expected in ((False, 200.0), (True, 290 - BEFORE)):
         search, cut = LegSearch(CONFIG), START + 200 * SECOND

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delays, slip of a coarse speed and lasting slip of one wheel: reported, and in the sigmas."""
+"""Delays, slip of a coarse speed, slow slip of one wheel: reported, and in the sigmas."""
 
 import re
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(± ([\d.]+) s\) (late|early).*
 
 
 def delay_texts(made, method, **changes):
-    """Return what is said of a delay: (sensor, seconds late, sigma, setting, its value)."""
+    """Return a reported delay: (sensor, seconds late, sigma, setting, its value)."""
     result = calibrate(made.leg(), settings(made, method=method, heading_sigma=None, **changes))
     text = everything_said(result).get(Code.DELAY_SEEN)
     if text is None:
@@ -40,18 +40,18 @@ def delay_texts(made, method, **changes):
     (0.12, 'fix', 'gnss', 0.05, {'fix_delay': 0.12}),
     (-0.12, 'fix', 'gnss', 0.05, {'fix_delay': -0.12}),
     (0.04, 'odometer', 'odometer', 0.01, {'odometer_delay': 0.04, 'fix_noise': 'rtk'})])
-def test_late_and_early_sensors_are_said(late, sensor, setting, prior, options):
+def test_late_and_early_sensors_are_reported(late, sensor, setting, prior, options):
     made = drive(**ROUTE, **options)
     what, size, sigma, name, offset = delay_texts(made, 'smoother')
     assert (what, name) == (sensor, setting)
-    # the prior of its delay, time_sigma, pulls it towards none by (sigma / prior)^2 of itself
+    # the prior of the delay, time_sigma, reduces it by (sigma / prior)^2 of itself
     pull = abs(late) * (sigma / prior)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001
     assert offset == pytest.approx(-size, abs=0.001)
     assert delay_texts(made, 'smoother', **{f'{name}__time_offset': offset}) is None
 
 
-def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is():
+def test_a_value_far_from_its_setting_is_determined_despite_a_tight_prior():
     made = drive(**ROUTE | {'duration': 300.0}, antenna_lever_arm=(0.0, 2.0, 0.0), fix_sigma=0.5)
     method = calibrate(made.leg(), settings(
         made, method='smoother', heading_sigma=None, gnss__lever_arm=(0.0, 0.0, 0.0),
@@ -61,24 +61,24 @@ def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is(
     assert found.sigma > 0.05 / 2
 
 
-def test_of_no_delay_nothing_is_said():
+def test_a_delay_of_zero_is_not_reported():
     assert delay_texts(drive(**ROUTE), 'smoother') is None
 
 
 @pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [
     (0.02, 0.005, 0.02, True),       # 0.2 m at 10 m/s, 4 sigmas
     (0.02, 0.008, 0.02, False),      # 2.5 sigmas
-    (-0.009, 0.001, 0.02, False),    # 9 cm: a lever arm need not be known better
-    (0.02, 0.005, 1.5, False),       # fixes of 1.5 m do not show 0.2 m
+    (-0.009, 0.001, 0.02, False),    # 9 cm: as a lever arm error
+    (0.02, 0.005, 1.5, False),       # not observable by 1.5 m fixes
     (-0.04, 0.005, 1.5, True)])
-def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
+def test_a_delay_is_reported_if_significant_and_with_an_effect(late, sigma, fix_sigma, is_said):
     t = np.arange(0.0, 60.0, 0.1)
     run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
         travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, aligned={}))       # 10 m/s
     assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
 
 
-def test_what_is_set_already_is_counted_in_and_one_method_says_it_once():
+def test_a_configured_delay_is_included_and_one_method_reports_the_delay():
     made = drive(**ROUTE, fix_delay=0.12)
     *_, offset = delay_texts(made, 'smoother', gnss__time_offset=0.05)
     assert delay_texts(made, 'smoother', gnss__time_offset=offset) is None
@@ -98,12 +98,12 @@ def run(name, odometer, reasons=()):
 
 
 @pytest.mark.parametrize(('smoother', 'delay_texts'), [
-    ([run('smoother', ())], []),                        # it fitted the leg and saw none
+    ([run('smoother', ())], []),                        # it fitted the leg without slip
     ([run('smoother', (SLID,))], [SLID]),
-    ([run('smoother', None)], [SPUN]),                  # it did not look
+    ([run('smoother', None)], [SPUN]),                  # it does not estimate slip
     ([run('smoother', (), REJECTED)], [SPUN]),
     ([], [SPUN])])
-def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, delay_texts):
+def test_slip_is_from_the_smoother_where_the_smoother_gives_the_value(smoother, delay_texts):
     runs = (*smoother, run('two_point', (SPUN,), REJECTED))
     assert reasons_on_data({one.result.name: one for one in runs}, None) == delay_texts
 
@@ -117,7 +117,7 @@ def whole_kmh(leg, spun=0.0):
 
 
 @pytest.mark.parametrize('spun', [0.0, 4.0])
-def test_slip_of_a_coarse_speed_is_seen_by_the_smoothers_own_track(spun):
+def test_slip_of_a_coarse_speed_is_found_by_the_track_of_the_smoother(spun):
     made = drive(**SPEED)
     leg, at = whole_kmh(made.leg(), spun)
     result = calibrate(leg, settings(made, None, method='auto'))
@@ -135,23 +135,23 @@ WHEELS = ('scale_factor_left', 'scale_factor_right')
 
 
 def with_slip(made, extra_m):
-    """Return the leg, extra_m(t, way) more metres counted by the right wheel; way from 0 to 1."""
+    """Return the leg with extra_m(t, share of the path) more metres on the right wheel."""
     leg, count = made.leg(), made.odometer_right.value
-    direction = (count - count[0]) / (count[-1] - count[0])
-    more = extra_m(seconds(leg, leg.odometer_right), direction) / made.truth.wheel_scales[1]
+    share = (count - count[0]) / (count[-1] - count[0])
+    more = extra_m(seconds(leg, leg.odometer_right), share) / made.truth.wheel_scales[1]
     return spoilt(leg, 'odometer_right', value=lambda n: n + np.round(more).astype(np.int64))
 
 
 def slow(made):
-    """One per cent from half of the way on."""
+    """Return the leg with a slip of one per cent in the second half of the path."""
     return with_slip(made, lambda t,
-                     direction: 0.01 * made.truth.distance * np.clip(direction - 0.5, 0, None))
+                     share: 0.01 * made.truth.distance * np.clip(share - 0.5, 0, None))
 
 
 def drawn_out(made):
-    """Twenty metres within forty seconds about the middle."""
-    return with_slip(made, lambda t, direction: SLIP_M * np.clip(
-        (t - np.interp(0.5, direction, t)) / 40.0 + 0.5, 0.0, 1.0))
+    """Return the leg with a slip of twenty metres within forty seconds about the middle."""
+    return with_slip(made, lambda t, share: SLIP_M * np.clip(
+        (t - np.interp(0.5, share, t)) / 40.0 + 0.5, 0.0, 1.0))
 
 
 @pytest.fixture(scope='module', params=[slow, drawn_out], ids=['slow', 'drawn out'])
@@ -161,14 +161,14 @@ def slipped(request):
 
 
 @pytest.mark.parametrize('method', ['two_point', 'smoother'])
-def test_the_sigma_of_each_method_holds_it(slipped, method):
+def test_slow_slip_is_within_the_sigma_of_each_method(slipped, method):
     made, _, result = slipped
     estimates = result.methods[method].estimates
     truth = dict(zip(('scale_factor', *WHEELS), (made.truth.scale, *made.truth.wheel_scales),
                      strict=True))
     for name in truth.keys() & estimates.keys():
         e = estimates[name]
-        # without any slip the error would be 0.1 sigma: it is all of this slip, whole or less
+        # without slip the error is 0.1 sigma: all of it is this slip or a share of it
         assert abs(e.value - truth[name]) < 1.5 * e.sigma, name
         assert e.sigma < 0.01 * e.value
     ratio = estimates['scale_ratio']
@@ -176,7 +176,7 @@ def test_the_sigma_of_each_method_holds_it(slipped, method):
         estimates['scale_factor'].sigma / estimates['scale_factor'].value, rel=1e-6)
 
 
-def test_the_sigma_is_that_of_the_sources_and_in_the_budget(slipped):
+def test_the_sigma_of_slip_is_in_the_budget(slipped):
     _, _, result = slipped
     for name, method in result.methods.items():
         e = method.estimates['scale_factor']
@@ -188,7 +188,7 @@ def test_the_sigma_is_that_of_the_sources_and_in_the_budget(slipped):
         assert budget == pytest.approx(e.sigma, rel=1e-6), name
 
 
-def test_it_is_said_with_its_size(slipped):
+def test_slow_slip_is_reported_with_its_size(slipped):
     _, how, result = slipped
     text = next(r.text for r in result.reasons if r.code is Code.WHEEL_SLIP)
     if how is slow:
@@ -197,11 +197,11 @@ def test_it_is_said_with_its_size(slipped):
                 'wheel') in text
     else:
         assert 1800 < float(text.split(' by ')[1].split(' cm')[0]) < 2200
-    # 0.25 % is more than the 0.1 % asked for: settings of these tests ask for 10 %
+    # 0.25 % exceeds the required accuracy of 0.1 %; settings of these tests require 10 %
     assert Code.SCALE_SIGMA_TOO_LARGE not in everything_said(result)
 
 
-def test_a_widened_sigma_is_judged_again():
+def test_an_increased_sigma_is_compared_with_its_limit():
     made = drive(**STRAIGHT)
     result = calibrate(slow(made), settings(made, method='smoother',
                                             verdict__max_scale_sigma=1e-3))
@@ -210,7 +210,7 @@ def test_a_widened_sigma_is_judged_again():
     assert float(text.split()[3]) > 2400           # ppm
 
 
-def test_without_slip_nothing_is_widened():
+def test_without_slip_no_sigma_is_increased():
     made = drive(**STRAIGHT)
     result = calibrate(made.leg(), settings(made, method='all'))
     assert not any(s.name == 'slow_wheel_slip' for m in result.methods.values() for s in m.sources)

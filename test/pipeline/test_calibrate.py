@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pipeline as a whole: pure, honest over many drives, and never fooled for long."""
+"""The whole pipeline: pure, with correct sigmas over many drives, robust to faulty data."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def test_the_same_leg_gives_the_same_result_to_the_last_bit(made):
     np.testing.assert_array_equal(first.track_n, second.track_n)
 
 
-def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
+def test_a_recorded_leg_gives_the_result_of_the_whole_drive(made):
     recorder = LegRecorder()
     for slot in ('fix', 'odometer', 'imu'):
         block = made.leg().rows(slot)
@@ -51,8 +51,8 @@ def test_the_counts_of_a_result_are_those_of_the_leg(made):
     assert result.rejected_fixes == 0
 
 
-def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
-    # of fixes that state 15 m the rough scale is by chords of 120 m, through the corners of a town
+def test_printed_speeds_use_the_calibrated_scale(town):
+    # with a stated 15 m the rough scale is from chords of 120 m, across corners of a town
     leg = replace(town.leg(), fix=drives.changed(
         town.fix, covariance_n=lambda c: np.tile(225 * np.eye(3), (len(c), 1, 1))))
     result = calibrate(leg, drives.settings(town, heading_sigma=None, method='smoother',
@@ -66,14 +66,14 @@ def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
     assert highest_speed == pytest.approx(fastest, rel=2e-3)
 
 
-def test_notes_of_the_door_are_kept_and_weigh(made):
+def test_notes_of_the_reader_are_kept_and_change_the_verdict(made):
     note = Reason(Code.BAG_TRUNCATED, '3 s are missing at the end')
     result = calibrate(made.leg(), drives.settings(made), notes=(note,))
     assert note in result.reasons
     assert result.verdict.value == 'caution'
 
 
-def test_a_holdout_checks_what_the_fit_has_not_seen(made):
+def test_a_holdout_checks_data_outside_the_fit(made):
     result = calibrate(made.leg(), drives.settings(made), holdout=True)
     # the last fifth by the nominal scale is 6.1 % short; fixes of 1.5 m, each axis, on top
     short = 0.061 * 0.2 * made.truth.distance
@@ -83,7 +83,7 @@ def test_a_holdout_checks_what_the_fit_has_not_seen(made):
     assert all(abs(z) < 5 for z in drives.errors_in_sigmas(result, made.truth).values())
 
 
-def test_the_check_shows_the_correction(made):
+def test_residuals_of_the_track_show_the_correction(made):
     result = calibrate(made.leg(), drives.settings(made))
     assert result.before.max > 0.05 * made.truth.distance
     assert result.after.rms == pytest.approx(1.5 * np.sqrt(2), rel=0.15)
@@ -94,7 +94,7 @@ def test_the_check_shows_the_correction(made):
     ('outliers', 0.05), ('outages', ((70.0, 90.0), (100.0, 104.0))), ('slip_walk', 0.01),
     ('two_wheels', True), ('odometer', 'speed'), ('odometer', 'angle'), ('roll', 0.05),
     ('heading_sigma', 0.002), ('orientation_sigma', 0.002), ('imu_lever_arm', (1.0, 0.4, 0.5))])
-def test_what_drives_are_like(option, value):
+def test_values_are_within_sigmas_for_each_kind_of_drive(option, value):
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
                         **{option: value})
     own = option in ('heading_sigma', 'orientation_sigma')
@@ -115,12 +115,12 @@ def test_moving_the_marks_within_the_standstills_changes_little(made):
 
 
 @pytest.mark.parametrize(('grade', 'noise'), [('tactical', 'white'), ('industrial', 'correlated')])
-def test_sigmas_are_honest_over_many_drives(grade, noise):
+def test_sigmas_agree_with_errors_over_many_drives(grade, noise):
     """
-    60 drives: errors over sigmas have unit spread, and 95 % lie within 1.96.
+    60 drives: errors over sigmas have unit variance, and 95 % are within 1.96.
 
-    A mean square of 60 strays by sqrt(2 / 60) = 0.18, a share of 95 % by 2.8 %; four of those
-    each way, and for correlated errors, whose sigma is itself judged from the leg, 1.3 times.
+    A mean square of 60 has a sigma of sqrt(2 / 60) = 0.18, a share of 95 % one of 2.8 %: four of
+    them on either side; for correlated errors, whose sigma is estimated from the leg, 1.3 times.
     The large run is benchmarks/two_point_monte_carlo.py.
     """
     runs, z, slack = 60, [], 1.0 if noise == 'white' else 1.3
@@ -135,11 +135,11 @@ def test_sigmas_are_honest_over_many_drives(grade, noise):
         z.append(list(drives.errors_in_sigmas(calibrate(made.leg(), config), made.truth).values()))
     z = np.array(z)
     assert z.shape == (runs, 3)
-    rms, stray = np.sqrt((z**2).mean(axis=0)), 4 * np.sqrt(2 / runs)
-    assert (rms < slack * np.sqrt(1 + stray)).all(), rms
-    assert (rms > np.sqrt(1 - stray) / slack).all(), rms
+    rms, deviation = np.sqrt((z**2).mean(axis=0)), 4 * np.sqrt(2 / runs)
+    assert (rms < slack * np.sqrt(1 + deviation)).all(), rms
+    assert (rms > np.sqrt(1 - deviation) / slack).all(), rms
     assert ((np.abs(z) < 1.96 * slack).mean(axis=0) >= 0.95 - 4 * 0.028).all()
-    assert (np.abs(z.mean(axis=0)) < 4 / np.sqrt(runs) * slack).all()      # nor is there a bias
+    assert (np.abs(z.mean(axis=0)) < 4 / np.sqrt(runs) * slack).all()      # and no bias
 
 
 COLUMNS = {'imu': ('w_i', 'f_i'), 'odometer': ('value',),
@@ -154,7 +154,7 @@ KINDS = [*ORDERS, 'nan', 'huge', 'hang', 'no stamp', 'set clock', 'false stamp']
 
 
 def corrupted(rng, slot, samples):
-    """Return samples with a fault that real recordings have, and what it is."""
+    """Return samples with a fault of real recordings, and the name of the fault."""
     n, kind = len(samples.stamp_ns), str(rng.choice(KINDS))
     first, length = int(rng.integers(n)), int(rng.choice([1, 2, 20, 200]))
     rows = slice(first, min(first + length, n))
@@ -182,8 +182,8 @@ def corrupted(rng, slot, samples):
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize(('which', 'runs'), [('straight', 50), ('town', 30)])
-def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
-    """80 corrupted legs: an accepted one is within six sigmas, a rejected one says why."""
+def test_faults_raise_nothing_and_no_wrong_value_is_accepted(made, town, which, runs):
+    """80 corrupted legs: an accepted one is within six sigmas, a rejected one has a reason."""
     it = made if which == 'straight' else town
     config, verdicts = drives.settings(it), []
     for seed in range(runs):
@@ -200,7 +200,7 @@ def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
         if verdicts[-1] == 'accepted':
             z = drives.errors_in_sigmas(result, it.truth)
             assert all(abs(x) < 6 for x in z.values()), (seed, what, z)
-    # the faults are such that most legs can still be used
+    # most legs with these faults are usable
     assert verdicts.count('accepted') > runs / 2, verdicts
-    # clocks that are set, five of the 30 in town, do not reject
+    # clock steps, in five of the 30 town drives, do not reject
     assert verdicts.count('rejected') >= 3

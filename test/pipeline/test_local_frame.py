@@ -35,7 +35,7 @@ from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
-# method smoother, a heading that is not given
+# method smoother, without a heading
 SMOOTHER = {'heading_sigma': None, 'method': 'smoother'}
 CAR = {'scenario': 'town', 'duration': 240.0, 'imu_grade': 'consumer', 'fix_noise': 'rtk',
        'seed': 5}
@@ -47,14 +47,14 @@ def made():
 
 
 def posed(made, latitude_deg=math.nan, position=None):
-    """Return the leg of a drive with poses in the place of its fixes, or other ones, m."""
+    """Return the leg of a drive with poses instead of its fixes, or with other positions, m."""
     position = made.positions() if position is None else position
     return replace(made.leg(), fix=local_fixes(latitude_deg)(
         made.fix.stamp_ns, made.fix.received_ns, position))
 
 
 def without_covariance(made):
-    """Return the leg of a drive whose fixes say as little of their errors as poses do."""
+    """Return the leg of a drive whose fixes have no covariance, like poses."""
     return spoilt(made.leg(), 'fix', covariance_type=np.zeros_like)
 
 
@@ -69,10 +69,10 @@ def test_poses_give_the_values_of_fixes(options, monkeypatch):
     # poses may be better than GNSS: here not
     monkeypatch.setattr(prepare, 'MIN_NOISE', replace(MIN_NOISE, pose=MIN_NOISE.fix))
     made = drive(**options)
-    # the same first sigma: a fit that begins elsewhere ends within 0.03 sigma of it
+    # the same first sigma: a fit from another start ends within 0.03 sigma of it
     config = settings(made, **SMOOTHER, leg__min_distance=20.0, reference__default_sigma=2.5)
     by_fix, by_pose = (estimates(leg, config) for leg in (without_covariance(made), posed(made)))
-    tenth = 0.1     # sigma; the pitch has the Earth rate in it, which poses do not tell
+    tenth = 0.1     # sigma; the pitch depends on the Earth rate, unknown from poses
     for name, limit in zip(NAMES, (tenth, tenth, 0.4), strict=True):
         a, b = by_fix[name], by_pose[name]
         # estimates of nested data differ by a variance that is the difference of theirs
@@ -82,7 +82,7 @@ def test_poses_give_the_values_of_fixes(options, monkeypatch):
     assert off(by_pose, made, *NAMES) < 3
 
 
-def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
+def test_poses_give_the_values_of_fixes_with_the_earth_rate_of_the_frame(monkeypatch):
     made = drive(**CAR | {'fix_noise': 'white'})
     latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
@@ -96,7 +96,7 @@ def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
         assert abs(by_pose[name].value - by_fix[name].value) < 0.1 * by_fix[name].sigma
 
 
-def test_what_is_unknown_of_the_earth_rate_is_in_the_sigma():
+def test_sigma_contains_the_unknown_part_of_the_earth_rate():
     made = drive(**CAR | {'imu_grade': 'tactical'})
     config = settings(made, **SMOOTHER)
     by_fix, by_pose = (estimates(leg, config) for leg in (without_covariance(made), posed(made)))
@@ -129,7 +129,7 @@ def test_the_leg_is_placed_in_the_frame_as_sent(made, latitude_deg):
     np.testing.assert_allclose(distances, as_sent, atol=1e-4)
 
 
-def test_what_refers_to_north_is_not_used_and_said():
+def test_data_relative_to_north_is_not_used_and_this_is_reported():
     made = drive(**CAR, heading_sigma=0.001, velocity_sigma=0.05)
     leg, config = posed(made), settings(made, **SMOOTHER)
     inputs, found = screen(leg, config)
@@ -141,7 +141,7 @@ def test_what_refers_to_north_is_not_used_and_said():
         'positions are in a local frame, so north is unknown: up to 15.0 deg/h of the Earth rate '
         'are estimated as gyro bias; GNSS velocities and external headings are not used')
     assert Code.LOCAL_FRAME not in {r.code for r in screen(made.leg(), config)[1]}
-    # who asks for a heading topic has one in the frame of the positions
+    # a configured heading topic is relative to the frame of the positions
     heading_config = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
     assert len(screen(leg, heading_config)[0].external['heading'].t)
     text = {r.text for r in screen(leg, settings(made, reference__latitude_deg=40.0))[1]
@@ -149,7 +149,7 @@ def test_what_refers_to_north_is_not_used_and_said():
     assert f'up to {15.041 * math.cos(math.radians(40.0)):.1f} deg/h' in text.pop()
 
 
-def test_a_gyro_is_no_compass_in_a_local_frame():
+def test_a_local_frame_has_no_gyrocompass():
     made = drive(scenario='straight', duration=200.0, imu_grade='navigation', fix_noise='rtk',
                  seed=5)
     config = settings(made, heading_sigma=None)
@@ -163,7 +163,7 @@ def test_a_gyro_is_no_compass_in_a_local_frame():
         Code.GYROCOMPASS_REFUSED]
 
 
-def test_an_orientation_is_a_heading_in_the_frame_only_if_asked_for():
+def test_an_orientation_is_a_heading_in_the_frame_only_if_configured():
     made = drive(**CAR, orientation_sigma=0.001)
     for source in ('auto', 'imu_orientation'):
         config = settings(made, heading_sigma=None, alignment__heading_source=source)
@@ -171,7 +171,7 @@ def test_an_orientation_is_a_heading_in_the_frame_only_if_asked_for():
         assert (Code.YAW_NOT_SEPARABLE in texts) == (source == 'auto')
 
 
-def test_surveyed_points_are_not_in_the_frame(made):
+def test_surveyed_points_are_not_used_in_a_local_frame(made):
     plain, surveyed = (calibrate(posed(made), settings(made, **more)).methods['two_point']
                        for more in ({}, {'reference__start': [40.0, 116.0, 50.0, 0.01]}))
     assert plain.estimates['scale_factor'] == surveyed.estimates['scale_factor']
@@ -217,14 +217,14 @@ def test_a_pose_that_contains_the_wheels_is_reported():
     assert Code.FIXES_FOLLOW_ODOMETER not in everything_said(plain)
 
 
-def test_a_local_frame_has_no_place_on_a_map(made):
+def test_a_result_in_a_local_frame_has_no_map(made):
     assert calibrate(made.leg(), settings(made)).origin is not None
     result = calibrate(posed(made), settings(made))
     assert result.origin is None
     assert result.track_n is not None
 
 
-def test_map_coordinates_are_refused_with_what_to_do(made):
+def test_map_coordinates_are_refused_with_a_remedy(made):
     far = posed(made, position=made.positions() + [691_000.0, 5_334_000.0, 0.0])
     assert (far.fix.status == LOCAL).all()
     _, found = screen(far, settings(made))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg cut where the IMU was silent: its parts tell what a leg without the gap would."""
+"""A leg that is cut at gaps of the IMU: its parts give the values of a leg without gaps."""
 
 from dataclasses import replace
 
@@ -46,10 +46,10 @@ def of(leg, *gaps):
             for p in parts_of(silent(leg, *gaps))]
 
 
-def test_gaps_are_steps_beyond_a_limit_or_the_rhythm():
+def test_gaps_are_intervals_beyond_a_limit_or_the_usual_interval():
     t = np.array([0.0, 1.0, 2.0, 5.0, 6.0])
     np.testing.assert_array_equal(gaps_longer(t, 1.5), [(2.0, 5.0)])
-    assert len(gaps_in_rhythm(t)) == 0                  # too few to have one
+    assert len(gaps_in_rhythm(t)) == 0                  # too few rows for a usual interval
     t = np.r_[np.arange(20.0), 25.5]
     np.testing.assert_array_equal(gaps_in_rhythm(t), [(19.0, 25.5)])
 
@@ -64,9 +64,9 @@ def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
         (0.0, pytest.approx(50.0, abs=row)), (pytest.approx(53.0, abs=row),
                                               pytest.approx(120.0, abs=row)),
         (pytest.approx(121.0, abs=row), stop)]
-    # silent until the stop mark: what came before is left
+    # no rows until the stop mark: the part before remains
     assert of(leg, (stop - 5.0, stop + 100.0)) == [(0.0, pytest.approx(stop - 5.0, abs=row))]
-    # silent before the start mark: the leg itself, but nothing from before the gap
+    # no rows before the start mark: the leg itself, without rows from before the gap
     (one,) = parts_of(silent(leg, (-8.0, -3.0)))
     assert (one.start_ns, one.stop_ns) == (leg.start_ns, leg.stop_ns)
     assert seconds(leg, one.imu).min() == pytest.approx(-3.0, abs=row)
@@ -74,7 +74,7 @@ def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
 
 def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     leg = made.leg()
-    # tyres that walk by a tenth in a day do not between two parts of one leg
+    # a random walk of 10 % a day of the tyres does not apply between two parts of one leg
     config = settings(made, heading_sigma=None, method='smoother', verdict__max_yaw_sigma=0.0087,
                       verdict__max_scale_sigma=0.001, verdict__scale_drift_per_day=0.1)
     cut = silent(leg, GAP)
@@ -90,27 +90,27 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
         'leg 1: no IMU data for more than 0.5 s; this section covers 0.0 to 200.0 s')
     assert off(whole, made, SCALE, YAW, PITCH) < 4
     for name in (SCALE, YAW, PITCH):
-        # each part has sizes of imperfections of its own; the joint ones lie between them, so that
-        # an angle that they dominate may be a hundredth less certain than by the lucky part
+        # each part has its own sizes of imperfections; the joint ones are between them, so that
+        # an angle that they dominate may be 1 % less certain than in the better part
         assert whole.estimates[name].sigma < 1.02 * min(
             one.methods['smoother'].estimates[name].sigma for one in results), name
 
 
-def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):
+def test_a_leg_whose_parts_are_all_too_short_is_rejected_as_a_whole(made):
     config = settings(made, heading_sigma=None, method='smoother')
     stop = (made.leg().stop_ns - made.leg().start_ns) * 1e-9
     dead = silent(made.leg(), (3.0, stop - 3.0))
     (only,) = calibrate_parts(dead, config)
     assert Code.IMU_GAP in {r.code for r in only.reasons}
     full = silent(made.leg(), *((t, t + 2.0) for t in np.arange(5.0, stop, 8.0)))
-    assert parts_of(full) == [full]        # one that stutters is not cut to pieces
+    assert parts_of(full) == [full]        # a leg with periodic gaps is not cut
     (only,) = calibrate_parts(full, config)
     assert only.verdict is Verdict.REJECTED
     assert Code.IMU_GAP in {r.code for r in only.reasons}
 
 
 def ferried(leg, at_s, wait_s, metres):
-    """Return a leg that stands at a time for so long, on a ship that goes north."""
+    """Return a leg with a standstill of given time and length on a ship that sails north."""
     wait_ns, window = round(wait_s * 1e9), 2.0      # s of rows that are repeated while it stands
 
     def later(samples):
@@ -132,7 +132,7 @@ def ferried(leg, at_s, wait_s, metres):
 
 
 @pytest.mark.parametrize('metres', [2000.0, 60.0])      # at sea, and across a canal
-def test_a_leg_is_cut_where_a_ferry_carried_the_vehicle(metres):
+def test_a_leg_is_cut_where_a_ferry_carries_the_vehicle(metres):
     made = drive(scenario='town', duration=600.0, imu_grade='industrial', seed=8)
     leg, config = made.leg(), settings(made, heading_sigma=None, method='smoother')
     t = seconds(leg, leg.odometer)
@@ -143,7 +143,7 @@ def test_a_leg_is_cut_where_a_ferry_carried_the_vehicle(metres):
     assert Code.ODOMETER_STILL in {r.code for r in calibrate(leg, config).reasons}
     results = calibrate_parts(leg, config)
     assert len(results) == 2
-    # cut where the ship moves, to the time that a fix takes to show 10 sigmas, or a quarter, of it
+    # cut where the ship moves, within the time until a fix shows 10 sigmas, or a quarter of it
     shown = 5.0 + min(15.0 / metres, 0.25) * (wait - 40.0)
     (_, end), (begin, _) = (((r.start_ns - leg.start_ns) * 1e-9, (r.stop_ns - leg.start_ns) * 1e-9)
                             for r in results)
@@ -157,7 +157,7 @@ def test_a_leg_is_cut_where_a_ferry_carried_the_vehicle(metres):
     assert off(found, made) < 3.3
 
 
-def test_a_counter_that_never_counts_again_rejects_the_leg(made):
+def test_a_counter_that_stops_for_ever_rejects_the_leg(made):
     leg = made.leg()
     value = np.minimum(leg.odometer.value, np.interp(150.0, seconds(leg, leg.odometer),
                                                      leg.odometer.value).astype(np.int64))

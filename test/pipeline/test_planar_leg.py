@@ -95,7 +95,7 @@ def test_a_run_without_turns_has_a_scale_and_no_width():
     assert 'turns on the spot' in why.remedy
 
 
-def test_one_wheel_without_an_imu_is_refused_as_before():
+def test_one_wheel_without_an_imu_is_refused():
     made, config = driven()
     leg = made.leg()
     found = calibrate(replace(leg, odometer_right=type(leg.odometer)(
@@ -105,7 +105,7 @@ def test_one_wheel_without_an_imu_is_refused_as_before():
     assert Code.NO_IMU in {r.code for r in found.reasons}
 
 
-def test_mecanum_with_two_wheels_says_what_is_required():
+def test_mecanum_with_two_wheels_states_what_is_required():
     made, config = driven()
     found = calibrate(made.leg(), with_settings(config, {'odometer.drive': 'mecanum'}))
     assert found.verdict is Verdict.REJECTED
@@ -123,7 +123,7 @@ def test_wheels_of_another_run_are_rejected():
     assert Code.METHOD_FAILED not in codes
 
 
-def test_controllers_of_each_drive():
+def test_controller_parameters_of_each_drive_are_exported():
     made, config = driven('mecanum')
     text = _controllers(_calibrated(made, config), config)
     assert 'mecanum_drive_controller:' in text
@@ -177,7 +177,7 @@ def heights(height, sigma=0.02, noise=0.0):
 
 
 def test_slopes_shorten_the_path_by_half_their_square():
-    """Up and down by 5 %; 300 m of hills of 3 % by sine; noise alone; no heights."""
+    """Up and down by 5 %; 300 m of sinusoidal hills of 3 %; noise alone; no heights."""
     shortened = shortened_by_slopes
     of_noise = (0.02 / 5)**2        # of two heights, 5 m apart
     assert shortened(heights(lambda x: 0.05 * np.abs(x - 1000.0))) == pytest.approx(
@@ -202,7 +202,7 @@ def test_slopes_are_in_the_sigma_of_the_scale(monkeypatch):
 
 
 def test_a_result_is_the_same_for_any_number_of_threads():
-    """Threads of BLAS must not show in the last bit: node and replay may have others."""
+    """Not even the last bit depends on BLAS threads: node and replay may have other numbers."""
     program = ('import sys; sys.path[:0] = ["test/pipeline"]; import test_planar_leg as t\n'
                'made, config = t.driven("skid", imu=True, imu_grade="industrial", duration=80.0)\n'
                'found = t.calibrate(made.leg(), config).methods["planar"].estimates\n'

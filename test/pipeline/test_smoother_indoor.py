@@ -22,7 +22,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 pytestmark = pytest.mark.slow
 
 
-# SLAM: its z of 0 as a height made noise of the IMU look like a delay that grows. Motion capture:
+# SLAM: with its z of 0 as a height, IMU noise looked like a growing delay. Motion capture:
 # derivatives of its positions by accelerometer errors contained noise
 @pytest.mark.parametrize('options', [{'seed': 2, 'fix_noise': 'rtk'},
                                      {'seed': 4, 'reference': 'mocap'}], ids=['slam', 'mocap'])
@@ -46,7 +46,7 @@ def test_positions_of_motion_capture_are_thinned_to_20_per_second(rate, used):
     ('mocap', 1e-3, 1e-3), ('total_station', 1e-3, 2e-3), ('slam', 5e-3, None),
     ('amcl', 1e-2, None)])
 def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
-    """An IMU mounted nose down: with it a wrong derivative made the yaw 5 sigma off."""
+    """An IMU mounted nose down, with which a wrong derivative gave a yaw error of 5 sigma."""
     made = simulate(SimOptions(scenario='indoor', duration=120.0, seed=3, imu_rate=50.0,
                                reference=reference, pitch=-0.04, roll=0.01))
     config = with_settings(drives.configured(made), {'odometer.track_width': 0.0,
@@ -65,7 +65,7 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
                'scale_factor_left', 'scale_factor_right') < 3
 
 
-def test_limits_are_those_of_the_frame_the_smaller_of_both():
+def test_limits_are_the_smaller_of_the_setting_and_that_of_the_frame():
     config = with_settings(Config(), {'leg.min_distance': 50.0, 'reference.min_speed': 5.0})
     local = config.in_local_frame()
     assert (local.leg.min_distance, local.leg.min_speed) == (2.0, 2.78)
@@ -88,7 +88,7 @@ def room(rng):
     return t, fixes, np.cumsum(0.04 * moves), faces
 
 
-def test_the_rough_scale_of_a_room_is_that_of_its_straights():
+def test_rough_scale_in_a_room_is_that_of_its_straight_sections():
     t, fixes, route, _ = room(np.random.default_rng(1))
     travel = Travel(t, route / 1e-4, 1.0)
     assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
@@ -98,7 +98,7 @@ def test_the_rough_scale_of_a_room_is_that_of_its_straights():
     assert not motion_reasons(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
 
 
-def test_turns_on_the_spot_are_no_turns_of_the_course():
+def test_turns_on_the_spot_do_not_count_as_changes_of_course():
     t, fixes, _, faces = room(np.random.default_rng(2))
     rate = np.gradient(faces, t)
     for unit in (1.0, 57.3):

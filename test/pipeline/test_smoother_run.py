@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother as a member of the pipeline."""
+"""The smoother as a method of the pipeline."""
 
 import drives
 from drives import ANGLES, drive, everything_said, off, settings, spoilt, TOWN
@@ -20,7 +20,7 @@ from odocal_ros.reasons import Code, Verdict
 
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
-ASKED = {'method': 'smoother', 'heading_sigma': None}      # no heading from outside
+ASKED = {'method': 'smoother', 'heading_sigma': None}      # no external heading
 
 
 @pytest.fixture(scope='module')
@@ -33,7 +33,7 @@ def held(made):
     return calibrate(made.leg(), settings(made, **ASKED), holdout=True)
 
 
-def test_the_result_is_its_own_without_a_heading_and_a_standstill(made, held):
+def test_smoother_gives_the_result_without_a_heading_and_a_standstill(made, held):
     assert off(held.methods['smoother'], made, 'scale_factor', *ANGLES) < SIGMAS
     assert held.after.rms < held.before.rms / 4
     assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
@@ -52,7 +52,7 @@ def with_height(made, height):
     return spoilt(made.leg(), 'fix', height=(slice(None), height))
 
 
-def test_fixes_without_altitude_give_all_three(made):
+def test_fixes_without_altitude_give_all_three_values(made):
     found = smoothed(with_height(made, np.nan), made).estimates
     assert off(found, made, 'scale_factor', *ANGLES) < SIGMAS
     assert found['scale_factor'].sigma < 1e-3 * made.truth.scale
@@ -60,7 +60,7 @@ def test_fixes_without_altitude_give_all_three(made):
 
 
 @pytest.mark.parametrize('height', [np.nan, 0.0])
-def test_unknown_heights_leave_the_size_of_the_earth_below_uncertain(height):
+def test_unknown_heights_increase_the_sigma_by_the_radius_of_the_earth(height):
     made = drive(**TOWN, height=1600.0)
     result = smoothed(with_height(made, height), made)
     # on the ellipsoid below a road of 1600 m, distances are 1600 m / 6378 km shorter
@@ -111,7 +111,7 @@ def test_a_late_odometer_loses_no_travel_at_a_mark_in_motion():
     assert off(result.methods['smoother'], made, 'scale_factor', *ANGLES) < SIGMAS
 
 
-def test_a_start_within_a_gap_of_the_odometer_is_no_slip(made):
+def test_a_start_within_an_odometer_gap_is_not_slip(made):
     leg = made.leg()
     moves = drives.seconds(leg, leg.odometer)[1:][np.diff(leg.odometer.value) > 0]
     start = moves[1:][(np.diff(moves) > 2.0) & (moves[1:] > 30.0)][0]     # after a stop
@@ -128,15 +128,15 @@ def test_a_start_within_a_gap_of_the_odometer_is_no_slip(made):
     (Stage('two_point', 0.0), 'two_point'),
     (Stage('smoother', 0.1, 1, 51234.5), 'smoother, 1 pass done, remaining change 51234 sigma'),
     (Stage('smoother', 0.1, 7, 0.4249), 'smoother, 7 passes done, remaining change 0.42 sigma')])
-def test_a_stage_says_passes_and_change_and_no_share(stage, words):
+def test_progress_states_passes_and_change_and_no_percentage(stage, words):
     assert stage.words() == words
 
 
-def test_auto_takes_it_and_computes_two_point_beside_it(made):
+def test_auto_uses_the_smoother_and_computes_two_point_too(made):
     stages = []
     leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None),
                     progress=stages.append)
-    # how far it is, pass by pass, and never all before the end
+    # the progress after each pass, below 1 until the end
     shares = [stage.done for stage in stages]
     assert shares == sorted(shares)
     assert shares[0] == 0
@@ -145,21 +145,21 @@ def test_auto_takes_it_and_computes_two_point_beside_it(made):
     passes = [stage for stage in stages if stage.passes]
     assert [stage.passes for stage in passes] == list(range(1, len(passes) + 1))
     assert {(stage.name, stage.done) for stage in passes} == {('smoother', shares[1])}
-    # the change that is left falls from a first guess some sigmas off to what may be left
+    # the change falls from some sigmas at the first guess to the limit of convergence
     assert passes[0].change > CONVERGENCE.fitted_below
     assert passes[-1].change < CONVERGENCE.max_step
     assert set(leg.methods) == {'smoother', 'two_point'}
     assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
 
 
-def test_all_says_of_each_method_why_it_gives_nothing(made):
+def test_all_states_for_each_method_why_it_gives_no_value(made):
     leg = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
     assert Code.YAW_NOT_SEPARABLE in {r.code for r in leg.methods['two_point'].reasons}
     assert leg.verdict is Verdict.ACCEPTED
 
 
-def test_before_and_after_differ_in_what_is_calibrated_and_not_in_the_gyros_drift():
-    """One is the other turned by the yaw and stretched by the ratio, but for level and lever."""
+def test_tracks_before_and_after_differ_by_the_calibrated_values_only():
+    """One is the other rotated by the yaw and scaled by the ratio, except for level and lever."""
     made = drive(scenario='town', duration=240.0, imu_grade='consumer', seed=13)
     leg = calibrate(made.leg(), settings(made, **ASKED))
     found = leg_estimates(leg)
@@ -169,13 +169,13 @@ def test_before_and_after_differ_in_what_is_calibrated_and_not_in_the_gyros_drif
     assert abs(c) == pytest.approx(1 / found['scale_ratio'].value, rel=1e-3)
     assert np.angle(c) == pytest.approx(found['yaw_mounting_angle'].value, abs=2e-3)
     assert np.abs(before - c * after).max() < 1e-3 * np.abs(after).max()
-    # a piece as configured ends |c - 1| of its chord away, and no chord is longer than its piece
+    # a section as configured ends |c - 1| of its chord away; a chord is at most its path length
     (first, *_) = leg.per_distance
     assert first.after < first.before < np.hypot(abs(c - 1) * first.length, 2 * first.after)
 
 
-def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
-    """A late fix lies behind by delay times speed: at rest nowhere, at 15 m/s by 4.5 m."""
+def test_calibrated_dead_reckoning_accounts_for_a_delay_of_the_fixes():
+    """A late fix is behind by delay times speed: 0 at rest, 4.5 m at 15 m/s."""
     late = drive(scenario='town', duration=240.0, imu_grade='tactical', fix_noise='rtk',
                  fix_delay=0.3, seed=12)
     leg = calibrate(late.leg(), settings(late, **ASKED))
@@ -187,7 +187,7 @@ def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
     assert np.nanmax(np.abs(evidence.sections.ratio - 1)) < 0.003
 
 
-def test_the_path_runs_on_for_the_delay_beyond_the_data():
+def test_the_path_continues_beyond_the_data_for_the_delay():
     t = np.linspace(0.0, 10.0, 101)
     track = dead_reckon(t, np.tile([0.0, 0.0, 0.0, 1.0], (101, 1)), Travel(t, 5.0 * t, 0.0))
     path = _delayed_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)

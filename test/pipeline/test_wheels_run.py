@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two wheels in the pipeline: what comes out of a leg with two counters."""
+"""Two wheels in the pipeline: results of a leg with two counters."""
 
 import drives
 from drives import drive
@@ -43,7 +43,7 @@ def test_the_mean_of_both_wheels_is_the_scale_factor(result):
     assert of_scale <= min(of_wheels) <= max(of_wheels) < 1.1 * of_scale
 
 
-def test_the_result_is_that_of_the_smoother_and_brings_the_track_to_the_fixes(made, result):
+def test_result_is_from_the_smoother_and_its_track_agrees_with_the_fixes(made, result):
     whole = combine([result], settings(made))
     assert {whole.estimates[name].method for name in WHEELS} == {'smoother'}
     assert set(whole.methods) == {'two_point', 'smoother'}
@@ -52,21 +52,21 @@ def test_the_result_is_that_of_the_smoother_and_brings_the_track_to_the_fixes(ma
     assert result.after.mean < result.after.rms < result.after.max
 
 
-def test_wheels_is_another_word_for_the_smoother(made, result):
+def test_method_wheels_is_an_alias_of_the_smoother(made, result):
     again = calibrate(made.leg(), settings(made, method='wheels'))
     assert again.methods['smoother'].estimates == result.methods['smoother'].estimates
     whole = combine([again], settings(made, method='wheels'))
     assert whole.estimates['scale_factor_left'].method == 'smoother'
 
 
-def test_two_point_may_be_asked_for_and_is_then_the_only_one(made):
+def test_two_point_is_the_only_method_if_configured(made):
     config = settings(made, method='two_point')
     leg = calibrate(made.leg(), config)
     assert set(leg.methods) == {'two_point'}
     assert combine([leg], config).estimates['scale_factor'].method == 'two_point'
 
 
-def test_of_one_counter_nothing_is_said_of_two_wheels():
+def test_one_counter_gives_no_values_of_two_wheels():
     one = drive(**ROUTE | {'two_wheels': False}, seed=7)
     leg = calibrate(one.leg(), settings(one))
     assert leg.methods['smoother'].estimates['scale_factor'].value is not None
@@ -74,28 +74,28 @@ def test_of_one_counter_nothing_is_said_of_two_wheels():
     assert 'wheels' not in leg.methods['smoother'].details
 
 
-def test_a_leg_that_is_refused_lists_both_wheels_as_unknown(made):
+def test_a_rejected_leg_lists_both_wheels_as_unknown(made):
     leg = made.leg()
     inside = np.flatnonzero(leg.fix.stamp_ns > leg.start_ns)
-    few = drives.kept(leg, 'fix', inside[::200])        # one in 40 s: 7 of 10 wanted
+    few = drives.kept(leg, 'fix', inside[::200])        # one in 40 s: 7 of the required 10
     found = calibrate(few, settings(made)).methods['smoother'].estimates
     assert all(found[name].value is None for name in (*WHEELS, 'track_width'))
 
 
-def test_a_gyro_that_turns_too_far_bends_no_corrected_track():
+def test_a_gyro_scale_error_does_not_bend_the_corrected_track():
     # 1 % of 360 deg is 3.6 deg: tens of metres
     made = drive(**ROUTE | {'imu_grade': 'consumer'}, seed=7, gyro_scale_error=0.01)
     result = calibrate(made.leg(), settings(made))
     assert result.after.rms < 2 * np.sqrt(2) * made.options.fix_sigma
 
 
-def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made, result):
+def test_the_holdout_is_not_in_the_fit_and_agrees_with_the_track(made, result):
     held = calibrate(made.leg(), settings(made), holdout=True)
     a, b = (r.methods['smoother'].estimates['scale_factor_left'] for r in (held, result))
     assert a.value != b.value
     assert a.sigma > b.sigma
     assert held.after.rms < held.before.rms / 5
-    # nothing after the fifth's begin reaches the fit
+    # nothing after the begin of the holdout is in the fit
     late = made.fix.stamp_ns > made.truth.start_ns + 0.9 * (
         made.truth.stop_ns - made.truth.start_ns)
     moved = drives.spoilt(made.leg(), 'fix', latitude=lambda x: x + late * 2e-5)      # 127 m north
@@ -105,11 +105,11 @@ def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made, result):
         a.value, rel=1e-12)
 
 
-def test_what_the_search_found_is_in_the_details_where_it_is_asked_for(made, result):
+def test_details_contain_the_result_of_the_search_if_configured(made, result):
     assert 'search' not in result.methods['smoother'].details
     patent_result = calibrate(made.leg(), settings(made, method='patent'))
     assert set(patent_result.methods) == {'two_point', 'smoother'}
-    # it stands beside the values and moves none of them
+    # it changes no value
     assert patent_result.methods['smoother'].estimates == result.methods['smoother'].estimates
     search = patent_result.methods['smoother'].details['search']
     assert search['array']['name'].startswith('L49')
@@ -134,7 +134,7 @@ def test_the_order_of_the_methods_does_not_matter(made):
     assert reasons_on_data(onward, prepared) == reasons_on_data(backward, prepared)
 
 
-def test_a_slip_of_one_wheel_is_named_once_and_moves_neither_ratio_nor_mean(made, result):
+def test_slip_of_one_wheel_is_reported_once_and_changes_no_ratio_or_mean(made, result):
     leg = made.leg()
     t = drives.seconds(leg, leg.odometer)
     spun = np.rint(np.clip((t - 100.0) / 2.0, 0.0, 1.0) * 0.5 / made.options.scale)
@@ -144,8 +144,8 @@ def test_a_slip_of_one_wheel_is_named_once_and_moves_neither_ratio_nor_mean(made
     source = next(s for s in result.methods['two_point'].sources if s.name == 'wheel_slip')
     assert source.effects[0] @ source.effects[0] > 0
     before, after = (x.methods['smoother'] for x in (clean, result))
-    # of 1300 m half a metre is 380 ppm of the left wheel, 190 of the mean: the sigma is 170 ppm
-    # of fixes, and of the ratio some ppm
+    # half a metre of 1300 m is 380 ppm of the left wheel, 190 ppm of the mean: the sigma is
+    # 170 ppm from the fixes, and some ppm for the ratio
     scale = after.estimates['scale_factor']
     assert abs(scale.value - before.estimates['scale_factor'].value) < 0.5 * scale.sigma
     ratio, was = (x.details['wheels']['left']['ratio'] for x in (after, before))

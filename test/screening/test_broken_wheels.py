@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels that do not count, or count in one direction only, are named with the time."""
+"""Wheels that do not count, or count in one direction only, are reported with the time."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
 
 
 def texts_of(made, **wheels):
-    """Return what screening says of a leg whose counters are changed."""
+    """Return the reasons that screening reports for a leg with changed counters."""
     leg = made.leg()
     leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
                            for slot, change in wheels.items()})
@@ -27,36 +27,36 @@ def texts_of(made, **wheels):
 
 
 @pytest.mark.parametrize('side', ['left', 'right'])
-def test_a_wheel_that_never_counts_or_counts_down_is_named(side):
+def test_a_wheel_that_never_counts_or_counts_down_is_reported(side):
     slot = 'odometer' if side == 'left' else 'odometer_right'
     text = texts_of(drive(**TOWN), **{slot: lambda a: a * 0})[Code.WHEEL_DEAD]
     assert text.startswith(f'the {side} wheel does not count: its travel is 0 % of that of the ')
     assert '(limit 2 %)' in text
     text = texts_of(drive(**TOWN), **{slot: lambda a: -a})[Code.WHEEL_REVERSED]
     assert text.startswith(f'the {side} wheel counts down')
-    # two reversed wheels are not for this check
+    # two reversed wheels are outside this check
     both = texts_of(drive(**TOWN), odometer=lambda a: -a, odometer_right=lambda a: -a)
     assert not {Code.WHEEL_REVERSED, Code.WHEEL_DEAD} & set(both)
 
 
-def test_a_wheel_that_dies_on_the_way_is_named_with_its_time():
+def test_a_wheel_that_stops_counting_is_reported_with_the_time():
     made = drive(**TOWN)
     t = seconds(made.leg(), made.odometer)
     k = np.searchsorted(t, 100.0)
 
     def dies(a):
         a[k:] = a[k]
-    moves = np.flatnonzero(np.diff(made.odometer.value[k:]) > 0)[0]     # stands at a light?
+    moves = np.flatnonzero(np.diff(made.odometer.value[k:]) > 0)[0]     # a red light?
     text = texts_of(made, odometer=dies)[Code.WHEEL_DEAD]
     at = float(text.removeprefix('the left wheel does not count from t = ').split()[0])
-    # rows of 0.05 s, cells of 0.5 s, and the cell in which it dies holds counts still
+    # rows of 0.05 s, cells of 0.5 s; the last cell with counts contains the time of the fault
     assert abs(at - t[k + moves]) < 1.1
     right = np.abs(np.diff(made.odometer_right.value))
     share = float(text.split(' s on, in ')[1].split(' % of the travel of the right')[0])
     assert share == pytest.approx(100 * right[k:].sum() / right.sum(), abs=1.5)
 
 
-def test_a_wheel_that_hangs_for_seconds_is_named_with_time_and_length():
+def test_a_wheel_that_stops_for_seconds_is_reported_with_time_and_length():
     made = drive(**TOWN)
     t = seconds(made.leg(), made.odometer)
     rate = np.diff(made.odometer.value) > 5
@@ -73,7 +73,7 @@ def test_a_wheel_that_hangs_for_seconds_is_named_with_time_and_length():
 
 
 def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
-    """Return wheels and IMU of a robot whose wheels drive so, one speed a segment of 10 s."""
+    """Return wheels and IMU of a robot; each wheel has one speed per segment of 10 s."""
     t = np.arange(0.0, seconds_, 0.02)
     k = (t // 10).astype(int)
     left, right = (np.cumsum(np.asarray(v)[k % len(v)]) * 0.02 for v in (left_speed, right_speed))
@@ -86,13 +86,13 @@ def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
 def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
     wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
     assert broken_wheel_reasons(wheels, imu, (0.0, 200.0)) == ()
-    # the same wheels with a gyro that does not turn: dead for a while, and against each other
+    # the same wheels with zero turn rate: one dead for a while, and opposite directions
     still = (imu[0], imu[1] * 0, imu[2])
     codes = {r.code for r in broken_wheel_reasons(wheels, still, (0.0, 200.0))}
     assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
-def test_a_wheel_without_direction_is_named_in_reverse_gear():
+def test_a_wheel_without_direction_is_reported_in_reverse_gear():
     wheels, imu = robot(right_speed=[0.5, 0.6, -0.3, 0.7, 0.3],
                         left_speed=[0.5, 0.5, -0.3, 0.7, 0.4])
     up = replace(wheels[1], s=np.append(0.0, np.cumsum(np.abs(np.diff(wheels[1].s)))))
@@ -102,7 +102,7 @@ def test_a_wheel_without_direction_is_named_in_reverse_gear():
     assert 'first at t = 20.' in reason.text
 
 
-def test_one_counter_sent_twice_is_no_second_wheel():
+def test_one_counter_sent_twice_is_not_a_second_wheel():
     left = drive(**TOWN).odometer.value
     text = texts_of(drive(**TOWN), odometer_right=lambda _: left)[Code.WHEEL_DEAD]
     assert 'one counter is sent twice' in text

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Clocks that are seconds apart: found from the motion, corrected, and the values do not move."""
+"""Clock offsets of seconds: found from the motion and corrected; the values do not change."""
 
 from dataclasses import replace
 
@@ -50,12 +50,12 @@ def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, offset_s, 
     assert Code.CLOCKS_DIFFER not in everything_said(result)
     for name in ('scale_factor', 'yaw_mounting_angle'):
         one, other = (x.methods['smoother'].estimates[name] for x in (result, alone))
-        # the marks cut the topics at other samples, and a part of a cell is left as a delay
+        # the marks cut the topics at other samples, and a part of a cell remains as a delay
         assert abs(one.value - other.value) < 0.5 * other.sigma
         assert one.sigma == pytest.approx(other.sigma, rel=0.1)
 
 
-def test_clocks_that_agree_stay_as_they_are(made, alone):
+def test_clocks_that_agree_are_unchanged(made, alone):
     assert Code.DELAY_SEEN not in everything_said(alone)
 
 
@@ -68,7 +68,7 @@ def test_a_leg_shorter_than_a_change_of_speed_is_not_aligned(made, seconds):
 
 
 def test_nothing_is_aligned_without_accelerations():
-    """At a constant speed no offset is better than another; 0.3 m/s of noise is no motion."""
+    """At constant speed all offsets fit equally well; 0.3 m/s of noise is not motion."""
     rng = np.random.default_rng(1)
     assert clocks._delay(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) == 0.0
     steady = np.zeros((1200, 1))
@@ -77,7 +77,7 @@ def test_nothing_is_aligned_without_accelerations():
 
 @pytest.mark.parametrize('offset_s', [-7.3, 0.0, 3.37, 60.0])
 def test_an_offset_is_found_to_a_fraction_of_a_cell(offset_s):
-    """Of a signal that a straight line between cells holds; noise of its size is independent."""
+    """For a signal that is linear between cells, with independent noise of the same size."""
     rng = np.random.default_rng(2)
     t = OFFSET_CELL * np.arange(1600)
     bumps = rng.uniform(t[0], t[-1], 60)
@@ -90,7 +90,7 @@ def test_an_offset_is_found_to_a_fraction_of_a_cell(offset_s):
     assert clocks._delay(y, x) == pytest.approx(offset_s, abs=OFFSET_CELL / 4)
 
 
-def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
+def test_an_offset_hardly_better_than_a_small_one_is_not_used():
     """Speeds of a motorway change over half a minute: errors of the fixes move the best offset."""
     rng = np.random.default_rng(3)
     t = OFFSET_CELL * np.arange(1200)

@@ -27,14 +27,14 @@ def turned(t):
 
 
 def driven(stop=(0, 0)):
-    """Return the positions of a vehicle at 15 m/s that stands from and to a time, m: (n,)."""
+    """Return positions of a vehicle at 15 m/s with a standstill between two times, m: (n,)."""
     fine = np.arange(0.0, 400.0, 0.01)
     speed = np.where((fine >= stop[0]) & (fine < stop[1]), 0.0, 15.0)
     return np.interp(at_s, fine, np.cumsum(speed * 0.01 * np.exp(1j * turned(fine))))
 
 
 def received(sigma, tunnel, scale=0.02, stop=(0, 0)):
-    """Return what a receiver sends there: (n, 3) m; in the tunnel by its own odometer."""
+    """Return positions from a receiver, in the tunnel by its own odometer, m: (n, 3)."""
     true = driven(stop)
     noise = sigma * make_rng(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
     inside = (at_s >= tunnel[0]) & (at_s < tunnel[1])
@@ -52,7 +52,7 @@ def stated(sigma):
 @pytest.mark.parametrize(('length', 'stop'), [
     (20, (0, 0)), (60, (0, 0)), (120, (0, 0)), (80, (220, 240))], ids=str)
 @pytest.mark.parametrize('sigma', [0.05, 0.5])
-def test_a_tunnel_is_found_with_its_ends_at_a_standstill_too(sigma, length, stop):
+def test_a_tunnel_is_found_with_its_ends_also_at_a_standstill(sigma, length, stop):
     begin, end = 150, 150 + length
     found, why = dead_reckoned_fixes(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
                                      1j * driven(stop))
@@ -64,7 +64,7 @@ def test_a_tunnel_is_found_with_its_ends_at_a_standstill_too(sigma, length, stop
     assert found[begin:end].mean() > 0.8
 
 
-def test_fixes_of_one_moment_are_too_few():
+def test_fixes_of_one_moment_are_too_few_for_a_tunnel():
     t = at_s * 1e-6       # stamps whose nanoseconds the driver divides by 1000
     with np.errstate(all='raise'):
         found, why = dead_reckoned_fixes(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
@@ -73,7 +73,7 @@ def test_fixes_of_one_moment_are_too_few():
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.05, 0.5])
-def test_noise_and_a_wrong_fix_are_none(sigma):
+def test_noise_and_a_wrong_fix_are_not_a_tunnel(sigma):
     fixes = received(sigma, (0, 0))
     fixes[200:230, 0] += 20.0          # a false fix, and back
     found, why = dead_reckoned_fixes(at_s, fixes, stated(sigma), 1j * driven())
@@ -82,7 +82,7 @@ def test_noise_and_a_wrong_fix_are_none(sigma):
 
 
 @pytest.mark.parametrize('change', [0.7, 3.0])
-def test_satellites_that_change_are_no_tunnel(change):
+def test_a_change_of_satellites_is_not_a_tunnel(change):
     """Carrier-smoothed fixes move by less than a metre of a stated error of 1.4 m."""
     fixes = received(0.1, (0, 0))
     fixes[150:200] = received(0.0, (0, 0))[150:200] + fixes[149] - received(0.0, (0, 0))[149]
@@ -94,7 +94,7 @@ def test_satellites_that_change_are_no_tunnel(change):
 
 @pytest.mark.parametrize('lag', ['delay', 'filter'])
 @pytest.mark.parametrize('tunnel', [False, True])
-def test_an_odometer_that_is_late_at_each_braking_is_no_tunnel(lag, tunnel):
+def test_an_odometer_that_is_late_when_braking_is_not_a_tunnel(lag, tunnel):
     fine = np.arange(0.0, 400.0, 0.01)
     phase = fine % 60.0
     speed = np.interp(phase, [0, 48, 50, 54, 60], [15, 15, 7, 15, 15]) + np.where(
@@ -115,7 +115,7 @@ def test_an_odometer_that_is_late_at_each_braking_is_no_tunnel(lag, tunnel):
 
 
 @pytest.mark.parametrize(('scenario', 'noise'), [('motorway', 'white'), ('town', 'rtk')])
-def test_fixes_of_a_tunnel_are_not_used_and_said(scenario, noise):
+def test_fixes_in_a_tunnel_are_not_used_and_this_is_reported(scenario, noise):
     real = Real(tunnels=((110.0, 70.0),), tunnel_odometer=0.02)
     made = simulate(SimOptions(scenario=scenario, duration=300.0, imu_grade='industrial',
                                imu_rate=50.0, fix_noise=noise, antenna_lever_arm=(1.0, 0.0, 1.5),
@@ -143,7 +143,7 @@ def screened(drive, change, **options):
 
 
 @pytest.mark.parametrize('factor', [1.0, 1.05, 0.95])
-def test_that_of_the_fixes_is_used(drive, factor):
+def test_a_velocity_that_agrees_with_the_fixes_is_used(drive, factor):
     assert not screened(drive, lambda v: np.multiply(v, factor, out=v))
 
 
@@ -151,7 +151,7 @@ def test_gaps_of_the_velocity_are_not_compared(drive):
     leg = drive.leg()
     v = leg.rows('fix_velocity')
     t = seconds(leg, v)
-    fast = np.linalg.norm(v.velocity_n, axis=1) > 8.0      # a line between them is no stop
+    fast = np.linalg.norm(v.velocity_n, axis=1) > 8.0      # no stop by interpolation
     some = (t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0)
     inputs, found = screen(kept(leg, 'fix_velocity', some), settings(drive, None))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
@@ -171,13 +171,13 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
         assert re.search(r'contradicts the fixes .* a difference of \d+ % \(limit 1\d %\)', text)
 
 
-def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
+def test_a_velocity_that_is_not_configured_is_not_reported(drive):
     leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=lambda v: v.fill(9.0))
     _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
 
 
-def test_a_vehicle_that_stands_says_nothing(drive):
+def test_a_standstill_gives_no_reason_about_the_velocity(drive):
     keep = drive.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
     inputs, _ = screen(kept(drive.leg(), 'fix', keep), settings(drive, None))
     assert len(inputs.external['fix_velocity'].t)

@@ -17,7 +17,7 @@ STAND, ROWS = 40, 200
 
 
 def published(rows_per_update, counts):
-    """Return a counter that stands, moves from row STAND on faster and faster, and stands."""
+    """Return a counter at rest, accelerating from row STAND on, and at rest."""
     read = np.floor(np.arange(ROWS) / rows_per_update) * rows_per_update
     moved = np.clip((read - STAND) / (ROWS - 2 * STAND), 0, 1)
     return np.floor(counts * ROWS * moved**2).astype(np.int64)
@@ -31,7 +31,7 @@ def test_repeated_counts_in_motion_are_dropped(rows):
     inside = np.arange(moves[0], moves[-1])
     np.testing.assert_array_equal(~held[inside], np.isin(inside, moves))
     kept = np.flatnonzero(~held)
-    # a standstill has the rhythm of the updates
+    # at a standstill the interval of the updates
     assert np.diff(kept).max() <= np.ceil(rows)
     assert np.median(np.diff(kept)) >= np.floor(rows)
 
@@ -39,11 +39,11 @@ def test_repeated_counts_in_motion_are_dropped(rows):
 @pytest.mark.parametrize('value', [
     published(1.0, 4), published(1.0, 0.3), published(2.0, 0.5), np.zeros(ROWS, np.int64)],
     ids=['each row new', 'coarse', 'coarse and read slowly', 'standing'])
-def test_other_counters_are_kept(value):
+def test_rows_of_other_counters_are_kept(value):
     assert not held_counts(value, 2**64).any()
 
 
-def test_a_counter_read_at_5_hz_and_published_at_50_hz_is_no_slip():
+def test_a_counter_read_at_5_hz_and_published_at_50_hz_gives_no_slip():
     made = drive(scenario='town', duration=300.0, imu_grade='industrial', odometer_rate=50.0,
                  fix_noise='rtk', seed=8)
     leg = made.leg()

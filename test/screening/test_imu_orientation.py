@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the IMU faces, an IMU that is moved in the vehicle, and reversing however short."""
+"""IMU orientation in the vehicle, an IMU that is moved during a leg, and short reversing."""
 
 from dataclasses import replace
 import re
@@ -51,28 +51,28 @@ def seen(made, leg=None, **scale):
 
 @pytest.mark.parametrize('yaw', [1.0, 40.0, 90.0, -170.0])
 @pytest.mark.parametrize('options', [{}, {'slope': 0.08}, {'scenario': 'straight'}])
-def test_it_is_seen_in_town_on_hills_and_on_a_straight_road(yaw, options):
+def test_imu_orientation_is_found_in_town_on_hills_and_on_a_straight_road(yaw, options):
     found = seen(town(yaw, **options))
     assert abs(wrap(found.yaw - yaw * DEG)) < 3 * found.sigma
     assert found.sigma < 3 * DEG
 
 
-def test_a_gyro_of_the_wrong_sign_does_not_turn_it():
+def test_a_gyro_with_the_wrong_sign_does_not_change_the_orientation():
     made = town(1.0)
     found = seen(made, gyro=-1.0)
     assert abs(wrap(found.yaw - 1.0 * DEG)) < 3 * found.sigma
     assert found.sigma < 3 * DEG
 
 
-def test_nothing_is_seen_where_nothing_pushes():
+def test_imu_orientation_is_not_found_without_accelerations():
     made = town(1.0)
     rng = np.random.default_rng(1)
-    for noise in (0.0, 3.0):        # m/s^2: none at all, and far above what driving does
+    for noise in (0.0, 3.0):        # m/s^2: zero, and far above accelerations of driving
         still = [0.0, 0.0, 9.81] + noise * rng.standard_normal(made.imu.f_i.shape)
         assert seen(made, spoilt(made.leg(), 'imu', f_i=(slice(None), still))) is None
 
 
-def test_what_is_far_off_is_said_by_its_side_and_size():
+def test_a_large_orientation_error_is_reported_with_side_and_size():
     assert orientation_reasons(None, np.nan) == ()
     for yaw in (0.0, 60.0, -60.0, 75.0):
         assert orientation_reasons(ImuOrientation(yaw * DEG, 1 * DEG), np.nan) == ()
@@ -85,7 +85,7 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
     assert back.code is Code.ODOMETER_REVERSED
     # as configured
     assert orientation_reasons(ImuOrientation(-179 * DEG, 1 * DEG), np.pi) == ()
-    # said as it is seen, whatever the nominal
+    # reported as observed, for any nominal value
     ahead, = orientation_reasons(ImuOrientation(0.0, 1 * DEG), np.pi)
     assert ahead.code is Code.ODOMETER_REVERSED
     assert 'forwards in the IMU frame (yaw mounting +0 deg, ± 1, nominal +180)' in ahead.text
@@ -94,20 +94,20 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
     assert 'accelerations point forwards' in ahead.text
 
 
-def test_only_a_far_forward_axis_is_turned():
+def test_only_a_large_error_of_the_forward_axis_is_corrected():
     f = 0.02 * forward_b(0.02, 0.01)
     assert corrected_forward_axis(None, f) is f
     assert corrected_forward_axis(ImuOrientation(5 * DEG, 1 * DEG), f) is f
     yaw, pitch = mounting_from_forward(
         corrected_forward_axis(ImuOrientation(40 * DEG, 1 * DEG), f))
-    # the vertical share stays, and is divided by another cosine
+    # the vertical component remains, and is divided by another cosine
     assert [yaw, np.sin(pitch) * np.cos(yaw)] == pytest.approx(
         [40 * DEG, f[2] / 0.02 * np.cos(40 * DEG) / np.cos(0.02)], rel=1e-9)
 
 
 @pytest.mark.parametrize(('yaw', 'code'), [(90.0, Code.IMU_AXES), (-90.0, Code.IMU_AXES),
                                            (180.0, Code.ODOMETER_REVERSED)])
-def test_a_leg_says_so_and_knows_of_no_slip(yaw, code):
+def test_a_leg_reports_the_orientation_and_no_slip(yaw, code):
     made = town(yaw)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto'))
     assert code in {r.code for r in result.reasons}
@@ -115,14 +115,14 @@ def test_a_leg_says_so_and_knows_of_no_slip(yaw, code):
     assert Code.WHEEL_SLIP not in everything_said(result)
 
 
-def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
+def test_an_imu_with_a_configured_rotation_is_calibrated_without_slip():
     made = town(40.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto'))
     texts = everything_said(result)
     assert Code.WHEEL_SLIP not in texts
     assert Code.YAW_FAR_FROM_NOMINAL in texts
     assert off(result.methods['smoother'], made, 'yaw_mounting_angle') < 4
-    # an IMU that faces backwards, and is said to
+    # an IMU that points backwards and is configured so
     made = town(180.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto',
                                             imu__nominal_yaw=np.pi))
@@ -131,7 +131,7 @@ def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
     assert abs(wrap(yaw.value - np.pi)) < 4 * yaw.sigma
 
 
-def test_driven_backwards_all_along_by_a_counter_that_counts_down():
+def test_a_whole_leg_driven_backwards_is_not_a_reversed_odometer():
     made = town(180.0)
     backwards = spoilt(made.leg(), 'odometer', value=lambda n: 20_000 - n)
     result = calibrate(backwards, settings(made, heading_sigma=None, method='auto'))
@@ -139,7 +139,7 @@ def test_driven_backwards_all_along_by_a_counter_that_counts_down():
 
 
 def moved(made, rpy_deg, share=0.5):
-    """Return the leg with the IMU turned from a share of its rows on."""
+    """Return the leg with the IMU rotated after a share of its rows."""
     C = matrix_from_rpy(np.multiply(rpy_deg, DEG))
     begin = int(share * len(made.imu.stamp_ns))
 
@@ -171,14 +171,14 @@ def test_a_moved_imu_rejects_the_leg_with_the_time(rpy_deg, text, share):
 @pytest.mark.parametrize('options', [
     {}, {'slope': 0.08}, {'scenario': 'yard', 'seed': 4}, {'scenario': 'straight'},
     {'yaw': 170.0 * DEG}])
-def test_slopes_and_turns_move_no_imu(options):
+def test_slopes_and_turns_are_not_a_moved_imu(options):
     made = drive(**TOWN | options)
     inputs, _ = screen(made.leg(), settings(made))
     assert gravity_turn_reasons(inputs) == ()
     assert forward_turn_reasons(accelerations(inputs, made.options.nominal_scale)) == ()
 
 
-def test_a_bend_of_one_g_moves_no_imu():
+def test_a_curve_of_one_g_is_not_a_moved_imu():
     made = drive(**TOWN)
     inputs, _ = screen(made.leg(), settings(made))
     force = inputs.f_b.copy()
@@ -195,24 +195,24 @@ def reasons_of(leg, config):
     {}, {'two_wheels': True}, {'odometer': 'speed', 'speed_noise': 0.05},
     {'slope': 0.05, 'imu_grade': 'consumer'}, {'yaw': np.pi, 'imu_grade': 'consumer'}],
     ids=['counts', 'two wheels', 'speed', 'hills', 'IMU facing back'])
-def test_a_counter_that_counts_up_in_reverse_is_seen_off_the_stop(route, kind):
+def test_a_counter_that_counts_up_in_reverse_is_found_at_the_stop(route, kind):
     drive_ = made(ROUTES[route], **kind)
     leg = drive_.leg()
     assert Code.REVERSING_UNSIGNED not in reasons_of(leg, settings(drive_))
     text = reasons_of(without_direction(leg), settings(drive_))[Code.REVERSING_UNSIGNED]
     times = '2 times' if route == 'three point turn' else '1 time'
     assert text.startswith(f'{times} the acceleration has the opposite sign')
-    # how far: to a tenth, by a rough scale and the blur of its ends
+    # distance: to 10 %, by the rough scale and the uncertainty of the ends
     metres = sum(float(m) for m in re.findall(r', ([\d.]+) m', text))
     assert metres == pytest.approx(METRES[route], rel=0.1, abs=0.5)
-    # where: the stop before the stretch ends where the route says, to the stop's blur
+    # time: the stop before the section ends as in the route, within the detection of the stop
     at = float(text.split('t = ')[1].split(' s')[0])
     start = (drive_.truth.start_ns - drive_.options.start_ns) * 1e-9
     assert at + start == pytest.approx(BACK_AT[route], abs=2.0)
 
 
 @pytest.mark.parametrize('route', ['10 m', 'three point turn'])
-def test_what_is_mirrored_gives_the_truth_and_no_slip(route):
+def test_corrected_reversing_gives_the_true_values_and_no_slip(route):
     drive_ = made(ROUTES[route], two_wheels=True)
     for config in (settings(drive_), settings(drive_, method='smoother', heading_sigma=None)):
         result = calibrate(without_direction(drive_.leg()), config)
@@ -223,8 +223,8 @@ def test_what_is_mirrored_gives_the_truth_and_no_slip(route):
         assert max(map(abs, errors.values())) < 3.5
 
 
-def test_a_stretch_that_slips_by_twice_its_way_was_reversed():
-    """Of stretches of 10 s and 8 m/s at the top, 40 m each, the second slips by 76 m."""
+def test_a_section_with_slip_of_twice_its_path_length_was_reversed():
+    """The second of three sections of 10 s, up to 8 m/s and 40 m, has a slip of 76 m."""
     travel, *_ = starts([8.0, 8.0, 8.0])
     def slip(metres):
         return [{'t': 19.0, 'duration': 8.0, 'metres': metres}]
@@ -240,18 +240,18 @@ def test_a_stretch_that_slips_by_twice_its_way_was_reversed():
 
 
 @pytest.mark.parametrize('route', ROUTES)
-def test_signed_counters_give_the_truth_over_it(route):
+def test_signed_counters_give_the_true_values_with_reversing(route):
     drive_ = made(ROUTES[route])
     result = calibrate(drive_.leg(), settings(drive_))
     assert result.verdict is Verdict.ACCEPTED
     errors = drives.errors_in_sigmas(result, drive_.truth)
     assert len(errors) == 3
-    assert max(map(abs, errors.values())) < 3.5      # 12 draws: p = 0.006 for an honest sigma
+    assert max(map(abs, errors.values())) < 3.5      # 12 draws: p = 0.006 with a correct sigma
 
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('scenario', ['town', 'out_and_back'])
-def test_no_drive_forward_is_taken_for_it(scenario, seed):
+def test_forward_driving_is_not_detected_as_reversing(scenario, seed):
     clean = drive(scenario=scenario, seed=seed, slope=0.08, imu_grade='consumer', sway=0.05)
     assert Code.REVERSING_UNSIGNED not in reasons_of(clean.leg(), settings(clean))
 
@@ -260,7 +260,7 @@ def starts(speeds, nose=None, noise=0.0):
     """
     Return travel, IMU times, turn rates and forces of runs of 10 s with stops of 4 s between.
 
-    speeds : m/s at the top of each.   nose : gravity along x by the nose's rise, in parts of the
+    speeds : peak of each, m/s.   nose : gravity along x by pitch of the body, as a share of the
     acceleration.
     """
     t = np.arange(0.0, 14.0 * len(speeds) + 4.0, 0.02)
@@ -277,18 +277,18 @@ def starts(speeds, nose=None, noise=0.0):
         np.stack([f, zero, 9.81 * np.cos(theta)], -1)
 
 
-def test_a_nose_that_dips_and_starts_too_gentle_are_no_reversing():
-    # gravity by the dip takes away twice what the speed adds to the specific force
+def test_pitch_of_the_body_and_gentle_starts_are_not_reversing():
+    # gravity by the pitch subtracts twice the acceleration from the specific force
     made_ = starts([8.0, 1.0, 8.0], [0.0, -2.0, 0.0])
     assert not len(reversed_starts(*made_, (0.0, 50.0)))
     travel, t, w_b, f_b = made_
-    assert len(reversed_starts(travel, t, 0 * w_b, f_b, (0.0, 50.0)))    # but for the gyro
-    # 0.06 m/s^2 in 2 m/s^2 of white noise at 50 Hz: half of 60 would go the wrong way by chance
+    assert len(reversed_starts(travel, t, 0 * w_b, f_b, (0.0, 50.0)))    # without the gyro
+    # 0.06 m/s^2 in 2 m/s^2 of white noise at 50 Hz: by chance half of 60 have the wrong sign
     made_ = starts([12.0] + [0.2] * 60, noise=2.0)
     assert not len(reversed_starts(*made_, (0.0, 1000.0)))
 
 
-def test_what_was_reversed_before_the_leg_does_not_matter():
+def test_reversing_before_the_leg_has_no_effect():
     drive_ = made(ROUTES['10 m'])
     leg = without_direction(drive_.leg())
     late = shifted(leg, start=75.0)

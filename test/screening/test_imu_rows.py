@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""IMU rows: their rhythm, an axis at the limit of its range, two IMUs that alternate."""
+"""IMU rows: regular intervals, an axis at the limit of its range, two alternating IMUs."""
 
 from drives import drive, seconds, spoilt
 import numpy as np
@@ -25,7 +25,7 @@ BIAS = np.array([3e-3, -2e-3, 1e-3])     # rad/s: 0.17 deg/s, a consumer gyro ha
 
 
 def signals(t, rng, vibration=1.0, noise=0.01):
-    """Return rates and forces of an IMU that shakes at 12 Hz, taken at times: (n, 3) each."""
+    """Return rates and forces at times of an IMU that vibrates at 12 Hz: (n, 3) each."""
     phases = rng.uniform(0, 2 * np.pi, 6)
     x = vibration * np.sin(2 * np.pi * 12.0 * t[:, None] + phases)
     x = x + noise * rng.standard_normal(x.shape)
@@ -33,7 +33,7 @@ def signals(t, rng, vibration=1.0, noise=0.01):
 
 
 def late(t, rng, jitter=JITTER):
-    """Return stamps of rows that arrive late by 4 ms and a jitter, in order."""
+    """Return stamps of rows that are late by 4 ms and a jitter, in order."""
     return np.maximum.accumulate(t + 4e-3 + jitter * rng.standard_normal(len(t))
                                  - 1e-9 * np.arange(len(t))) + 1e-9 * np.arange(len(t))
 
@@ -43,23 +43,23 @@ def rng():
     return np.random.default_rng(5)
 
 
-def test_stamps_that_jitter_are_put_on_the_rhythm(rng):
+def test_stamps_with_jitter_are_corrected_to_the_regular_interval(rng):
     true = np.arange(SECONDS * RATE) / RATE
     found = even_imu_times(late(true, rng), *signals(true, rng))
-    # means over 20 s: of 2000 rows each, between them a line
+    # means over 20 s, of 2000 rows each, with linear interpolation
     assert np.abs(found - true - 4e-3).max() < 5 * JITTER / np.sqrt(2000)
     assert (np.diff(found) > 0).all()
 
 
-def test_rows_stamped_in_pairs_are_put_on_the_rhythm(rng):
+def test_rows_stamped_in_pairs_are_corrected_to_the_regular_interval(rng):
     true = np.arange(SECONDS * RATE) / RATE
     pairs = np.repeat(true[1::2], 2) + np.tile([0.0, 1e-6], len(true) // 2)
     found = even_imu_times(pairs, *signals(true, rng))
-    # the first of two is stamped an interval later than it was taken, the second as it was
+    # the first of two has a stamp one interval after its sampling time, the second a right one
     np.testing.assert_allclose(found - true, 0.5 / RATE, atol=2e-6)
 
 
-def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
+def test_an_imu_that_is_sampled_at_irregular_times_keeps_its_stamps(rng):
     stamps = np.sort(np.arange(SECONDS * RATE) / RATE + JITTER * rng.standard_normal(12000))
     assert even_imu_times(stamps, *signals(stamps, rng)) is stamps
 
@@ -68,19 +68,19 @@ def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
     np.arange(SECONDS * RATE) / RATE, np.arange(50) / RATE, np.zeros(500), np.empty(0),
     np.cumsum(np.random.default_rng(3).exponential(0.01, 12000))],
     ids=['even', 'few', 'at once', 'none', 'at random'])
-def test_what_shows_no_rhythm_stays(rng, t):
+def test_stamps_without_a_regular_interval_are_unchanged(rng, t):
     np.testing.assert_array_equal(even_imu_times(t, *signals(t, rng)), t)
 
 
 @pytest.mark.parametrize('noise', [0.01, 0.0])
-def test_noise_alone_tells_no_rhythm(rng, noise):
+def test_noise_alone_determines_no_regular_interval(rng, noise):
     true = np.arange(SECONDS * RATE) / RATE
     stamps = late(true, rng)
     w, f = signals(true, rng, vibration=0.0, noise=noise)
     assert even_imu_times(stamps, w, f + 9.81) is stamps
 
 
-def test_lost_rows_move_no_others(rng):
+def test_lost_rows_do_not_change_the_times_of_others(rng):
     true = np.arange(4 * SECONDS * RATE) / RATE
     kept = np.ones(len(true), bool)
     kept[rng.integers(500, len(true) - 500, 16)] = False
@@ -88,14 +88,14 @@ def test_lost_rows_move_no_others(rng):
     stamps = late(true, rng)
     found = even_imu_times(stamps, *signals(true, rng))
     left = np.abs(found - true - 4e-3)
-    # a row lost in the first or last quarter of a block moves its mean by less than is seen
+    # a row lost in the first or last quarter of a block changes its mean by less than the limit
     assert np.median(left) < 0.1 * JITTER
     assert left.max() < np.abs(stamps - true - 4e-3).max() + 0.25 / RATE
     assert (np.diff(found) > 0).all()
     assert np.std(found - true) < 0.6 * np.std(stamps - true)
 
 
-def shaken(size, step=0.0):
+def vibrating(size, step=0.0):
     """Return forces about gravity: (N, 3) m/s^2, in steps."""
     f = np.random.default_rng(1).normal(0.0, size, (N, 3)) + [0.0, 0.0, G]
     return np.round(f / step) * step if step else f
@@ -108,8 +108,8 @@ def words(*signals, imu=None):
 
 
 @pytest.mark.parametrize('step', [0.0, 0.125])
-def test_force_cut_at_a_limit_is_named(step):
-    f = np.clip(shaken(5.0, step), -2 * G, 19.5)
+def test_a_force_clipped_at_a_limit_is_reported(step):
+    f = np.clip(vibrating(5.0, step), -2 * G, 19.5)
     count = int((f[:, 2] == 19.5).sum())
     first = T[np.argmax(f[:, 2] == 19.5)]
     assert words(NONE, f) == [
@@ -118,9 +118,9 @@ def test_force_cut_at_a_limit_is_named(step):
 
 
 def test_limits_are_of_the_scaled_unit_and_both_ends_are_counted():
-    f = np.clip(shaken(5.0), -2 * G, 2 * G) / G
+    f = np.clip(vibrating(5.0), -2 * G, 2 * G) / G
     assert 'saturates at +19.61 m/s^2' in words(NONE, f, imu=ImuConfig(accel_scale=G))[0]
-    assert not words(NONE, f)       # 2 m/s^2 is no range
+    assert not words(NONE, f)       # 2 m/s^2 is not a range of a sensor
     w = np.zeros((N, 3))
     w[:, 1] = np.clip(3.0 * np.sin(T), -2.18, 2.18)
     text, = words(w, NONE)
@@ -129,11 +129,11 @@ def test_limits_are_of_the_scaled_unit_and_both_ends_are_counted():
 
 
 @pytest.mark.parametrize('signal', [
-    shaken(5.0), shaken(5.0, 0.125), shaken(5.0, 1.0),         # not cut
-    shaken(5.0)[np.arange(N) // 4],                            # each value sent four times
-    np.round(shaken(0.01) / 0.1) * 0.1,                        # at rest, in coarse steps
+    vibrating(5.0), vibrating(5.0, 0.125), vibrating(5.0, 1.0),         # not clipped
+    vibrating(5.0)[np.arange(N) // 4],                            # each value sent four times
+    np.round(vibrating(0.01) / 0.1) * 0.1,                        # at rest, in coarse steps
 ], ids=['fine', 'steps', 'coarse', 'repeated', 'rest'])
-def test_no_limit_is_found_where_none_is(signal):
+def test_signals_without_clipping_have_no_limit(signal):
     assert not words(NONE, signal)
     assert not words(signal * [1.0, 1.0, 0.0] / 5.0, NONE)
 
@@ -159,7 +159,7 @@ def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
 @pytest.mark.parametrize('grade', ['consumer', 'perfect'])
 @pytest.mark.parametrize('rate', [10.0, 25.0, 100.0])
 @pytest.mark.parametrize('repeat', [1, 2])
-def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repeat):
+def test_one_imu_is_not_two_at_any_rate_or_with_repeated_rows(grade, rate, repeat):
     imu = drive(scenario='yard', duration=250.0, imu_grade=grade, imu_rate=rate, seed=9).leg().imu
     assert not alternating_imu_reasons(
         *(np.repeat(x[::repeat], repeat, axis=0) for x in (imu.w_i, imu.f_i)))
@@ -167,22 +167,22 @@ def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repea
 
 @pytest.mark.parametrize(('off_hz', 'on_s'), [(0.002, 60.0), (0.0, 40.0), (0.001, 40.0)])
 @pytest.mark.parametrize('size', [0.1, 1.0])
-def test_a_vibration_at_half_the_rate_is_no_second_imu(leg, off_hz, on_s, size):
+def test_a_vibration_at_half_the_rate_is_not_a_second_imu(leg, off_hz, on_s, size):
     t = seconds(leg, leg.imu)
-    shaken = size * np.cos(2 * np.pi * (25.0 - off_hz) * t + 1.0) * (t % 60.0 < on_s)
-    assert not alternating_imu_reasons(leg.imu.w_i, leg.imu.f_i + shaken[:, None])
-    assert not alternating_imu_reasons(leg.imu.w_i + 0.01 * shaken[:, None], leg.imu.f_i)
+    vibration = size * np.cos(2 * np.pi * (25.0 - off_hz) * t + 1.0) * (t % 60.0 < on_s)
+    assert not alternating_imu_reasons(leg.imu.w_i, leg.imu.f_i + vibration[:, None])
+    assert not alternating_imu_reasons(leg.imu.w_i + 0.01 * vibration[:, None], leg.imu.f_i)
 
 
 @pytest.mark.parametrize('drift', [0.0, 0.1])
-def test_biases_that_drift_are_of_two_imus(leg, drift):
+def test_two_imus_with_drifting_biases_are_found(leg, drift):
     t = seconds(leg, leg.imu)[:, None]
     assert alternating_imu_reasons(
         second(leg.imu.w_i, lambda w: w + BIAS * (1 + drift * t / t[-1])), leg.imu.f_i)
 
 
 @pytest.mark.parametrize('seed', [8, 9, 11, 12, 14])
-def test_a_section_that_tilts_and_vibrates_more_is_no_second_imu(seed):
+def test_a_section_with_more_tilt_and_vibration_is_not_a_second_imu(seed):
     rng = np.random.default_rng(seed)
     lifted = (np.arange(N) > 0.9 * N)[:, None]
     f = np.array([0.0, 0.0, G]) + rng.standard_normal((N, 3)) * np.where(lifted, 0.072, 0.006)
@@ -190,7 +190,7 @@ def test_a_section_that_tilts_and_vibrates_more_is_no_second_imu(seed):
     assert not alternating_imu_reasons(NONE, f)
 
 
-def test_a_spike_is_no_second_imu(leg):
+def test_a_spike_is_not_a_second_imu(leg):
     w = leg.imu.w_i.copy()
     w[len(w) // 2] += 50.0
     assert not alternating_imu_reasons(w, leg.imu.f_i)

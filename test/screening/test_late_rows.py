@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer messages that came late in bursts: put back, said, and not taken for slip."""
+"""Odometer messages that arrive late in bursts: corrected, reported and not treated as slip."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def made():
 
 
 def spun(made, samples):
-    """Return rows of a wheel that turns half a metre more within half a second."""
+    """Return rows of a wheel that slips by half a metre within half a second."""
     t = drives.seconds(made.leg(), samples)
     more = SLIP_M / made.truth.scale * np.clip((t - SLIP_S) / 0.5, 0.0, 1.0)
     return replace(samples, value=samples.value + np.round(more).astype(np.int64))
@@ -45,7 +45,7 @@ def since_first(samples):
 
 @pytest.fixture(scope='module')
 def true(made):
-    """Return the inputs of the drive with each row in its place."""
+    """Return the inputs of the drive with each row at its sampling time."""
     return screened(made, made.odometer)[0]
 
 
@@ -62,13 +62,13 @@ def of_smoother(made, samples):
 
 @pytest.fixture(scope='module')
 def straight(made):
-    """Return the scale factor by rows in their places."""
+    """Return the scale factor from rows at their sampling times."""
     return of_smoother(made, made.odometer)[0].estimates['scale_factor']
 
 
 @pytest.mark.parametrize(('how_long_s', 'drain_s'), [(0.12, 1e-4), (0.12, 0.01), (1.5, 0.012)],
                          ids=['at once', 'slow line', 'starved'])
-def test_late_rows_are_put_where_they_were_taken(made, true, how_long_s, drain_s):
+def test_late_rows_are_moved_to_their_sampling_times(made, true, how_long_s, drain_s):
     late, held = held_up(made.odometer, how_long_s=how_long_s, drain_s=drain_s)
     inputs, found = screened(made, late)
     assert len(inputs.travel.t) == len(true.travel.t)
@@ -81,7 +81,7 @@ def test_late_rows_are_put_where_they_were_taken(made, true, how_long_s, drain_s
     assert how_long_s - 0.03 < worst <= how_long_s
 
 
-def test_late_rows_are_no_slip(made, straight):
+def test_late_rows_are_not_slip(made, straight):
     late, _ = held_up(made.odometer)
     method, texts = of_smoother(made, late)
     assert Code.ODOMETER_LATE in texts
@@ -101,7 +101,7 @@ def arrivals(samples, seconds, lost=0.0, seed=3):
 
 
 @pytest.mark.parametrize(('seconds', 'off_s'), [(0.005, 0.0005), (0.02, 0.002), (0.05, 0.01)])
-def test_rows_that_all_arrive_late_by_chance_are_put_on_their_rhythm(made, true, seconds, off_s):
+def test_rows_with_random_delays_are_corrected_to_the_regular_interval(made, true, seconds, off_s):
     """Up to several intervals late, some together: 1000 rows have a mean to 50 ms / sqrt(100)."""
     late = arrivals(made.odometer, seconds)
     inputs, found = screened(made, late)
@@ -127,8 +127,8 @@ def test_rows_of_one_stamp_have_an_arrival_jitter():
     assert 0.0 < late_rows.arrival_jitter(t) < 30.0
 
 
-def test_arrival_jitter_is_no_slip(made, straight):
-    """A jitter of 20 ms at 12 m/s is 0.24 m; the rest is as without it, a slip of 0.5 m too."""
+def test_arrival_jitter_is_not_slip(made, straight):
+    """A jitter of 20 ms at 12 m/s is 0.24 m; a slip of 0.5 m is found as without jitter."""
     method, texts = of_smoother(made, arrivals(made.odometer, 0.02))
     assert Code.WHEEL_SLIP not in texts
     sigma = method.estimates['scale_factor'].sigma
@@ -138,12 +138,12 @@ def test_arrival_jitter_is_no_slip(made, straight):
     assert method.details['slips'][0]['metres'] == pytest.approx(SLIP_M, rel=0.25)
 
 
-def test_lost_rows_keep_their_place_among_late_ones(made, true):
+def test_lost_rows_among_late_ones_keep_their_interval(made, true):
     """The rows after a lost one are an interval later: 0.02 s, at 12 m/s 0.24 m."""
     late = arrivals(made.odometer, 0.002, lost=0.002)
     inputs, _ = screened(made, late)
     moving = np.gradient(inputs.travel.s, inputs.travel.t) * made.truth.scale > 2.0
-    # the time at which the vehicle was where a row says
+    # the time at which the vehicle was at the position of a row
     at = np.interp(inputs.travel.s, true.travel.s, true.travel.t)
     later = (inputs.travel.t - at)[moving]
     assert np.percentile(np.abs(later - np.median(later)), 95) < 0.006
@@ -163,7 +163,7 @@ def test_rows_lost_by_chance_do_not_make_the_others_late(made, true, share, seco
 
 
 @pytest.mark.parametrize('share', [0.0, 0.05, 0.25])
-def test_the_interval_is_that_of_the_sender_if_rows_are_lost(made, share):
+def test_the_interval_is_that_of_the_sender_with_lost_rows(made, share):
     """Stamps uniform over 6 ms: of 80 times 5 s the interval has a sigma of 0.05 ms."""
     rng = np.random.default_rng(3)
     t = since_first(made.odometer)
@@ -186,14 +186,14 @@ def test_equal_increments_that_arrive_together_are_both_counted(made):
     assert inputs.travel.s[-1] == steps.value[1:].sum()
 
 
-def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
+def test_rows_with_repeated_header_stamps_are_reported(made):
     k = int(np.flatnonzero(np.diff(made.odometer.value))[1000])
     twice = changed(made.odometer, stamp_ns=(k + 1, made.odometer.stamp_ns[k]))
     _, found = screened(made, twice)
     assert Code.STAMPS_NOT_RISING in found
 
 
-def test_a_sender_that_changes_its_rate_stays_where_it_is(made):
+def test_rows_of_a_sender_that_changes_its_rate_keep_their_stamps(made):
     n = len(made.odometer.stamp_ns)
     rows = take(made.odometer, (np.arange(n) > n // 2) | (np.arange(n) % 2 == 0))
     inputs, found = screened(made, rows)
@@ -201,8 +201,8 @@ def test_a_sender_that_changes_its_rate_stays_where_it_is(made):
     assert not found
 
 
-def test_rows_that_are_early_or_late_are_put_in_their_middle():
-    """What comes soonest is no rhythm then: of 250 rows it is 2.8 sigma early, by chance 3.2."""
+def test_rows_that_are_early_or_late_are_moved_to_the_mean():
+    """The earliest of 250 rows is not regular then: 2.8 sigma early, by chance up to 3.2."""
     fine = drive(scenario='town', duration=400.0, odometer_rate=50.0, seed=8, scale=1e-3,
                  nominal_scale=1e-3)
     even_ns, sigma_s = fine.odometer.stamp_ns, 0.003
@@ -217,8 +217,8 @@ def test_rows_that_are_early_or_late_are_put_in_their_middle():
     assert np.abs(late_ns).max() > 1e7
 
 
-def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
-    """Stamps and counts agree: at no time does a row come out where its rhythm would have it."""
+def test_rows_sampled_at_irregular_times_keep_their_stamps(made):
+    """Stamps and counts agree: no row is moved to a regular interval."""
     even, counts = made.odometer.stamp_ns, made.odometer.value
     uneven = even + np.round(np.random.default_rng(4).uniform(0.0, 0.0039, len(even)) * 1e9
                              ).astype(np.int64)
@@ -230,7 +230,7 @@ def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
 
 
 @pytest.mark.filterwarnings('error')
-def test_rows_that_come_at_once_are_spread(made):
+def test_rows_that_arrive_together_are_distributed(made):
     t = since_first(made.odometer)
     held = t % 15.0 < 0.4
     wait_s = np.where(held, 0.4 - t % 15.0, 0.0)
@@ -239,7 +239,7 @@ def test_rows_that_come_at_once_are_spread(made):
     usual = late_rows.intervals(since_first(late))[0]
     assert usual == pytest.approx(0.02, rel=1e-6)
     true = late_rows.sampling_times(late, since_first(late), made.leg().form, [])
-    # where it stands nothing tells, and nothing matters
+    # at rest times are not observable and have no effect
     speed = np.abs(np.gradient(made.odometer.value.astype(float), t)) * made.truth.scale
     off = true - t + (stamps[0] - made.odometer.stamp_ns[0]) * 1e-9
     assert np.abs(off)[held & (speed > 2.0)].max() < 0.003

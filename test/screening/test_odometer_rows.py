@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Counters that roll over, jump, hang or lose increments: the travel stays that of a true one."""
+"""Counters that roll over, jump, hang or lose increments: the travel remains correct."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.core
 
 @pytest.fixture
 def true(leg):
-    """Return the travel of the counter as it is."""
+    """Return the travel of the counter without faults."""
     return screen_with(leg)[0].travel.s
 
 
@@ -38,8 +38,8 @@ def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span, scale):
     np.testing.assert_array_equal(inputs.travel.s, alone.travel.s)
 
 
-def test_jumps_between_values_farther_apart_than_a_span_are_no_rollover():
-    """Each count is sent again 0.4 s later: it jumps back and on by much the same amount."""
+def test_jumps_larger_than_a_span_are_not_a_rollover():
+    """Each count is sent again 0.4 s later: it jumps back and forward by nearly the same."""
     leg = drive(**STRAIGHT, odometer='counts', scale=0.001).leg()
     again = replace(leg.odometer, stamp_ns=leg.odometer.stamp_ns + 400_000_001)
     both = join([leg.odometer, again])
@@ -49,7 +49,7 @@ def test_jumps_between_values_farther_apart_than_a_span_are_no_rollover():
 
 @pytest.mark.parametrize('value', [0, -50_000, 2**62, 10**9])
 @pytest.mark.parametrize('length', [1, 20, 300])
-def test_a_counter_that_jumps_away_and_back_is_mended(leg, true, value, length):
+def test_a_counter_that_jumps_away_and_back_is_corrected(leg, true, value, length):
     inputs, codes = screen_with(spoilt(leg, 'odometer', value=(slice(2000, 2000 + length), value)))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
@@ -58,37 +58,37 @@ def test_a_counter_that_jumps_away_and_back_is_mended(leg, true, value, length):
 
 
 @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s
-def test_a_counter_that_hangs_and_catches_up_is_mended(leg, true, first):
+def test_a_counter_that_hangs_and_catches_up_is_corrected(leg, true, first):
     hung = (slice(first, first + 150), leg.odometer.value[first])
     inputs, codes = screen_with(spoilt(leg, 'odometer', value=hung))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
 
 
-def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(made, leg, true):
+def test_a_reset_is_bridged_within_the_stated_uncertainty(made, leg, true):
     after = slice(2000, None)     # 12 m/s
     count = leg.odometer.value[after]
     inputs, codes = screen_with(spoilt(leg, 'odometer', value=(after, count - count[0])))
     assert 'a reset, not motion' in codes[Code.COUNTER_RESET]
-    # one interval at the speed beside it, uniform between none and two of it
+    # one interval at the adjacent speed, uniform between zero and two of it
     speed = 12.0 / made.options.scale
     np.testing.assert_allclose(inputs.uncertain_sigma, speed * 0.05 / np.sqrt(3), rtol=0.05)
     assert abs(inputs.travel.s[-1] - true[-1]) < 3 * inputs.uncertain_sigma[0]
 
 
-def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
+def test_lost_increments_are_bridged_at_the_adjacent_speed(leg, true):
     whole = with_increments(leg)
     step = whole.odometer.value
     inputs, _ = screen_with(kept(whole, 'odometer', np.r_[:2000, 2040:len(step)]))
     lost, end = step[2000:2040].sum(), screen_with(whole)[0].travel.s[-1]
-    # the speed is even there: but for rounding of counts at each side, nothing is lost
+    # the speed is constant there: the only error is rounding of counts on each side
     error = abs(inputs.travel.s[-1] - end)
     assert error < 0.01 * lost
     assert error < 3 * inputs.uncertain_sigma[0] < 0.2 * lost
     np.testing.assert_allclose(end, true[-1])
 
 
-def test_a_speed_that_jumps_is_left_out():
+def test_a_speed_that_jumps_is_excluded():
     made = drive(**STRAIGHT, odometer='speed')
     leg = made.leg()
     inputs, codes = screen_with(spoilt(leg, 'odometer', value=([2500, 2900], [90.0, -40.0])))

@@ -28,7 +28,7 @@ def float32(degrees):
 
 
 def nmea(degrees):
-    """Return angles that were degrees and minutes with four decimals."""
+    """Return angles rounded as degrees and minutes with four decimals."""
     whole = np.trunc(degrees)
     return whole + np.round((degrees - whole) * 60, 4) / 60
 
@@ -65,13 +65,13 @@ def errors(kind, geodetic):
 @pytest.mark.parametrize(('kind', 'steps_deg'), [
     (float32, (2**-20, 2**-18)), (nmea, (1e-4 / 60, 1e-4 / 60)), (decimals(5), (1e-5, 1e-5)),
     (decimals(6), (1e-6, 1e-6))])
-def test_equal_coordinates_have_one_error_that_is_uniform_in_the_step(kind, steps_deg):
+def test_equal_coordinates_share_one_error_that_is_uniform_in_the_step(kind, steps_deg):
     made, error = errors(kind, fixes())
     variance, why = rounding_variance(made, stated(made))
     step = np.deg2rad(steps_deg) * RADII
     # closed form: the mean of the standstill has the variance of one rounding
     np.testing.assert_allclose(variance[-STOP:, :2].mean(axis=0) / STOP, step**2 / 12, rtol=0.1)
-    # in motion by another coordinate in each fix
+    # in motion each fix has another coordinate
     np.testing.assert_allclose(variance[:, :2].min(axis=0), step**2 / 12, rtol=1e-4)
     assert not variance[:, 2].any()
     assert (np.abs(error) <= 0.501 * step).all()
@@ -109,7 +109,7 @@ def test_ordinary_doubles_are_not_rounded(geodetic):
     assert not why
 
 
-def test_a_step_far_below_the_stated_sigma_is_no_reason():
+def test_a_step_far_below_the_stated_sigma_is_not_reported():
     for kind, sigma in ((decimals(8), 0.01), (decimals(7), 0.01), (decimals(6), 0.7)):
         made, _ = errors(kind, fixes())
         variance, why = rounding_variance(made, stated(made, sigma))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Screening: what is dropped, what is said of it, and that the rest is used."""
+"""Screening: which rows are dropped, what is reported, and that the others are used."""
 
 from drives import drive, seconds, settings, spoilt, without
 import numpy as np
@@ -45,18 +45,18 @@ def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, lab
     assert np.isfinite(inputs.f_b).all()
 
 
-def test_an_empty_leg_screens_to_nothing_without_a_fault():
+def test_an_empty_leg_gives_no_rows_and_no_error():
     inputs, codes = screen_with(Leg(start_ns=10**18, stop_ns=10**18 + 10**9))
     assert {Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX} <= set(codes)
     assert len(inputs.t_imu) == len(inputs.travel.t) == len(inputs.t_fix) == 0
 
 
 @pytest.mark.filterwarnings('error')
-def test_a_force_that_is_scaled_to_nothing_has_no_direction(leg):
+def test_a_force_that_is_scaled_to_zero_has_no_direction(leg):
     assert not screen_with(leg, imu__accel_scale=0.0)[0].up_b.any()
 
 
-def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
+def test_fixes_with_the_status_no_fix_are_excluded(leg):
     def lost(rows):
         return spoilt(leg, 'fix', status=(rows, -1), latitude=(rows, np.nan),
                       longitude=(rows, np.nan))
@@ -70,7 +70,7 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
         Code.FIXES_UNUSABLE: f'{n} of {n} {FIXES} are not used: {n} with status below 0'}
     assert 'gnss.min_status' in Code.FIXES_UNUSABLE.remedy
     assert len(inputs.t_fix) == 0
-    # asked for, even a fix that is none is no position
+    # also as configured, a message without a fix is not a position
     inputs, _ = screen_with(lost(slice(0, 9)), gnss__min_status=-1)
     assert len(inputs.t_fix) == n - 9
     assert np.isfinite(inputs.geodetic).all()
@@ -80,10 +80,10 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
     ({'latitude': 0.0, 'longitude': 0.0}, '4 at an invalid position (the first: '
      'latitude 0, longitude 0 deg, altitude '),
     ({'latitude': 2.0}, '4 at an invalid position (the first: latitude 114.592, '),
-    ({'longitude': 1.0}, '4 at an invalid position'),      # half a world from the others
+    ({'longitude': 1.0}, '4 at an invalid position'),      # thousands of km from the others
     ({'height': 5e4}, 'altitude 50000 m)'),      # 50 m in mm
     ({'status': -1}, '4 with status below 0')])
-def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
+def test_fixes_at_impossible_places_are_excluded(leg, columns, text):
     inputs, codes = screen_with(spoilt(
         leg, 'fix', **{k: (slice(70, 74), v) for k, v in columns.items()}))
     assert text in codes[Code.BAD_ROWS_DROPPED]
@@ -101,7 +101,7 @@ def test_fixes_that_other_reasons_name_are_not_counted_as_invalid(leg):
 @pytest.mark.parametrize('column', [
     *({'covariance_n': (slice(None), value)} for value in (0.0, np.nan, np.inf, -1.0)),
     {'covariance_type': (slice(None), 0)}])
-def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, column):
+def test_an_unknown_covariance_is_taken_from_the_settings_and_reported(leg, column):
     inputs, codes = screen_with(spoilt(leg, 'fix', **column), gnss__default_sigma=4.0)
     n = len(leg.fix.stamp_ns)
     assert codes[Code.COVARIANCE_UNKNOWN] == (
@@ -110,7 +110,7 @@ def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, column):
     assert len(inputs.t_fix) == n         # unknown is not above gnss.max_sigma
 
 
-def test_a_height_without_a_variance_leaves_the_level_part_standing(leg):
+def test_a_height_without_a_variance_keeps_the_horizontal_variances(leg):
     inputs, codes = screen_with(spoilt(leg, 'fix', covariance_n=((slice(None), 2, 2), np.nan)))
     assert codes == {}
     np.testing.assert_array_equal(inputs.covariance_n[:, :2, :2], leg.fix.covariance_n[:, :2, :2])
@@ -125,7 +125,7 @@ def test_the_limit_of_poor_fixes_rises_with_the_median_of_the_leg(leg):
     assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
 
 
-def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
+def test_poor_fixes_are_excluded_by_a_setting_that_zero_disables(leg):
     poor = spoilt(leg, 'fix', covariance_n=(slice(100, 300), 25 * np.eye(3)))
     inputs, (reason,) = screen(poor, Config())
     assert reason.code is Code.BAD_ROWS_DROPPED
@@ -138,7 +138,7 @@ def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
 
 
 @pytest.mark.parametrize('slot', ['odometer', 'fix'])
-def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
+def test_a_gap_far_beyond_the_usual_interval_of_a_topic_is_a_note(leg, slot):
     _, (reason,) = screen(without(leg, slot, 30, 42), Config())
     assert reason.code is Code.TOPIC_GAP
     assert reason.text.startswith(f'{slot} gap of 12.')
@@ -147,7 +147,7 @@ def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
 
 
 @pytest.mark.parametrize(('length', 'size'), [(1, 50.0), (2, 5.0), (5, 10.0), (15, 3.0)])
-def test_a_burst_of_false_rates_is_left_out(leg, length, size):
+def test_a_burst_of_wrong_turn_rates_is_excluded(leg, length, size):
     inputs, codes = screen_with(spoilt(leg, 'imu', w_i=((slice(4000, 4000 + length), 2), size)))
     assert f'{length} of' in codes[Code.BAD_ROWS_DROPPED]
     assert 'isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
@@ -156,7 +156,7 @@ def test_a_burst_of_false_rates_is_left_out(leg, length, size):
 
 @pytest.mark.parametrize(('slot', 'name', 'axis', 'size'), [
     ('w_i', 'w_b', 2, 0.05), ('w_i', 'w_b', 0, -0.7), ('f_i', 'f_b', 1, 20.0)])
-def test_one_row_off_by_what_a_sensor_might_say_is_left_out(leg, slot, name, axis, size):
+def test_one_row_with_a_wrong_but_possible_rate_is_excluded(leg, slot, name, axis, size):
     """In 0.1 s, 0.4 rad/s turned a track by 2 deg: a scale 13 sigmas off was accepted."""
     rows = [4000, 5000, 6001]
     off = ((rows, axis), getattr(leg.imu, slot)[rows, axis] + size)
@@ -166,11 +166,11 @@ def test_one_row_off_by_what_a_sensor_might_say_is_left_out(leg, slot, name, axi
                           np.delete(getattr(screen_with(leg)[0], name), rows, axis=0))
 
 
-def test_hard_driving_is_no_glitch():
+def test_hard_driving_is_not_a_glitch():
     """
-    A robot that spins up by 10 rad/s^2 to 2 rad/s and stops as hard keeps all rows.
+    All rows are kept of a robot that turns at up to 2 rad/s with 10 rad/s^2 at start and stop.
 
-    At 50 Hz that is 0.2 rad/s from row to row, a quarter of the least bound of a glitch.
+    At 50 Hz that is 0.2 rad/s from row to row, a quarter of the smallest limit of a glitch.
     """
     leg = drive(scenario='straight', duration=200.0, imu_grade='consumer', seed=6).leg()
     t = seconds(leg, leg.imu)
@@ -192,13 +192,13 @@ def test_a_gyro_that_hangs_while_the_wheels_roll_is_a_gap(leg):
         return screen_with(spoilt(leg, 'imu', w_i=(slice(first, last), leg.imu.w_i[first])))[1]
     assert hung(60.0, 64.0)[Code.IMU_GAP].startswith(
         'the gyro repeats one value for 3.98 s at t = 60.00 s')
-    # at rest a quantised gyro may well repeat itself
+    # at rest a quantised gyro may repeat its value
     assert Code.IMU_GAP not in hung(-30.0, -20.0)
 
 
 @pytest.mark.parametrize('q', [1e200, np.nan, 5e-324, 0.0, 7.0])
 @pytest.mark.parametrize('variance', [0.01, np.nan, 1e300])
-def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
+def test_an_invalid_orientation_is_not_used(leg, q, variance):
     rows = slice(40, 60)
     bad = spoilt(leg, 'imu', q_ni=(rows, q), yaw_variance=(rows, variance))
     with np.errstate(all='raise'):
@@ -209,13 +209,13 @@ def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
 
 
 @pytest.mark.parametrize('options', [{}, {'two_wheels': True}, {'odometer': 'speed'}])
-def test_the_motion_alone_is_that_of_the_whole_screening(options):
+def test_screening_of_motion_only_agrees_with_the_whole_screening(options):
     some = drive(scenario='town', duration=120.0, imu_grade='consumer', outliers=0.02, seed=4,
                  **options)
     leg = spoilt(some.leg(), 'imu', w_i=(slice(1500, 3500), 0.5), q_ni=(slice(40, 60), 1e200))
     whole, found = screen(leg, settings(some))
     alone, _ = screen(leg, settings(some), check_faults=False)
-    assert Code.IMU_GAP in {r.code for r in found}        # which the search for legs does not ask
+    assert Code.IMU_GAP in {r.code for r in found}        # not needed in the search for legs
     for name in ('t_imu', 'w_b', 'f_b', 't_fix', 'geodetic', 'covariance_n'):
         np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
     np.testing.assert_array_equal(alone.travel.s, whole.travel.s)

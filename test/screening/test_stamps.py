@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Screening of stamps: none, repeated, out of order; clocks that were set or that differ."""
+"""Screening of stamps: missing, repeated, out of order; clock steps and clock offsets."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from odocal_ros.settings.config import Config
 pytestmark = pytest.mark.core
 
 
-def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
+def test_rows_without_a_stamp_are_dropped_and_located_by_arrival(leg):
     inputs, codes = screen_with(spoilt(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
     n, t = len(leg.odometer.stamp_ns), (leg.odometer.received_ns[100] - leg.start_ns) * 1e-9
     assert codes[Code.BAD_ROWS_DROPPED] == (
@@ -28,7 +28,7 @@ def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
     assert inputs.travel.s[-1] == leg.odometer.value[-1] - leg.odometer.value[0]
 
 
-def test_one_stamp_in_the_future_costs_one_row(leg):
+def test_one_stamp_in_the_future_excludes_one_row(leg):
     inputs, codes = screen_with(spoilt(
         leg, 'imu', stamp_ns=(500, leg.imu.stamp_ns[500] + 3600 * 10**9)))
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns) - 1
@@ -41,33 +41,33 @@ def test_one_stamp_in_the_future_costs_one_row(leg):
     ('imu', -2.0), ('imu', -0.02), ('imu', 0.5), ('odometer', -2.0), ('odometer', 0.02),
     ('fix', -2.0), ('fix', 0.5)])
 @pytest.mark.parametrize('wrong', ['before', 'after'])
-def test_a_clock_that_was_set_runs_on(leg, slot, by, wrong):
+def test_stamps_are_continuous_after_a_clock_step(leg, slot, by, wrong):
     stamps, moved = leg.rows(slot).stamp_ns, round(by * 1e9)
     at = len(stamps) * 2 // 5
     part, moved, mark = ((slice(at, None), moved, 'stop_ns') if wrong == 'after' else
                          (slice(at), -moved, 'start_ns'))
     other = spoilt(leg, slot, stamp_ns=(part, stamps[part] + moved))
-    if slot == 'imu':       # which has its stamps
+    if slot == 'imu':       # whose stamps are used
         other = replace(other, **{mark: getattr(leg, mark) + moved})
     inputs, codes = screen_with(other)
     alone, _ = screen_with(leg)
     assert f'set by {by:+.3f} s' in codes[Code.CLOCK_SET]
     assert Code.CLOCKS_DIFFER not in codes
-    # arrivals of this leg are exact: what they show is
+    # arrivals of this leg are exact, and with them the step
     for name in ('t_imu', 't_fix'):
         np.testing.assert_allclose(getattr(inputs, name), getattr(alone, name), atol=1e-6)
     np.testing.assert_allclose(inputs.travel.t, alone.travel.t, atol=1e-6)
 
 
 @pytest.mark.parametrize('rows', [10, 50])
-def test_stamps_in_disorder_are_no_clock_that_was_set(leg, rows):
+def test_stamps_out_of_order_are_not_a_clock_step(leg, rows):
     rng, order = np.random.default_rng(2), np.arange(len(leg.imu.stamp_ns) // rows * rows)
     order = rng.permuted(order.reshape(-1, rows), axis=1).ravel()
     mixed = replace(take(leg.imu, order), received_ns=leg.imu.received_ns[:len(order)])
     assert Code.CLOCK_SET not in screen_with(replace(leg, imu=mixed))[1]
 
 
-def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
+def test_rows_without_a_stamp_or_out_of_order_are_not_a_clock_step(leg):
     unstamped = spoilt(leg, 'imu', stamp_ns=(slice(3000, 3200), 0))
     assert Code.CLOCK_SET not in screen_with(unstamped)[1]
     order = np.arange(len(leg.imu.stamp_ns))
@@ -77,14 +77,14 @@ def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
     assert (np.diff(inputs.t_imu) > 0).all()
 
 
-def test_the_clock_of_the_recorder_is_not_that_of_the_sender(leg):
+def test_a_step_of_the_recorder_clock_is_not_reported(leg):
     lost = take(leg.imu, np.arange(len(leg.imu.stamp_ns)) != 4000)
     set_by = changed(lost, received_ns=(slice(4000), lost.received_ns[:4000] - 10**18))
     assert Code.CLOCK_SET not in screen_with(replace(leg, imu=set_by))[1]
 
 
 @pytest.mark.parametrize('late_s', [0.05, 0.3])
-def test_a_topic_that_arrives_again_later_is_no_clock_that_was_set(leg, late_s):
+def test_a_topic_that_arrives_again_later_is_not_a_clock_step(leg, late_s):
     again = replace(leg.fix, received_ns=leg.fix.received_ns + round(late_s * 1e9))
     both = join([leg.fix, again])
     inputs, codes = screen_with(replace(leg, fix=take(both, np.argsort(both.received_ns))))
@@ -93,7 +93,7 @@ def test_a_topic_that_arrives_again_later_is_no_clock_that_was_set(leg, late_s):
 
 
 @pytest.mark.parametrize('packet', [2, 5])
-def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
+def test_imu_packets_with_one_stamp_are_distributed_over_their_interval(leg, packet):
     n = len(leg.imu.stamp_ns) // packet * packet
     imu = take(leg.imu, slice(0, n))
     stamp = np.repeat(imu.stamp_ns[packet - 1::packet], packet)
@@ -117,8 +117,8 @@ def test_duplicates_are_used_once(leg):
             Code.STAMPS_NOT_RISING]
 
 
-def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
-    """A node in simulated time that stands still for 8 s of 10 has them all at the same time."""
+def test_queued_messages_that_arrive_together_are_not_a_clock_offset(leg):
+    """In simulated time that pauses for 8 s of 10, all arrive at the same time."""
     def queued(samples):
         t = seconds(leg, samples)
         late = np.where(t % 10 < 8, t - t % 10 + 8, t)
@@ -132,11 +132,11 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
 @pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
                                                ('fix', 'gnss.time_offset')])
 @pytest.mark.parametrize('late', [0.8, -0.8])
-def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, setting, late):
+def test_clock_offsets_reject_the_leg_until_an_offset_is_configured(leg, slot, setting, late):
     moved = spoilt(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
     _, codes = screen_with(moved)
     seen = float(codes[Code.CLOCKS_DIFFER].split('differ by ')[1].split(' s')[0])
-    assert abs(seen - late) < 0.055       # fixes take 0.05 s to arrive, which looks the same
+    assert abs(seen - late) < 0.055       # the 0.05 s until fixes arrive looks the same
     assert f'to {setting}' in codes[Code.CLOCKS_DIFFER]
     if slot == 'fix':       # positions of marks have IMU stamps
         assert Code.CLOCKS_DIFFER not in screen_with(moved, reference__points=[0.0, 0.0])[1]
@@ -146,7 +146,7 @@ def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, set
     np.testing.assert_allclose(t, seconds(leg, leg.rows(slot)), atol=1e-9)
 
 
-def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
+def test_an_offset_of_an_hour_suggests_no_setting_beyond_its_range(leg):
     _, found = screen(spoilt(leg, 'fix', stamp_ns=lambda a: a - 3600 * 10**9), Config())
     reason, = (r for r in found if r.code is Code.CLOCKS_DIFFER)
     assert '-3600.0' in reason.text
@@ -154,7 +154,7 @@ def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
     assert 'use_sim_time' in reason.remedy
 
 
-def test_the_imus_own_offset_moves_the_others_since_marks_are_imu_stamps(leg):
+def test_the_imu_offset_moves_other_topics_as_marks_are_imu_stamps(leg):
     inputs, _ = screen_with(leg, imu__time_offset=0.25)
     np.testing.assert_allclose(inputs.travel.t, seconds(leg, leg.odometer) - 0.25, atol=1e-9)
     np.testing.assert_allclose(inputs.t_fix, seconds(leg, leg.fix) - 0.25, atol=1e-9)
