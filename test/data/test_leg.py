@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs: how a stream was chopped and raced leaves no trace; what is kept of it."""
+"""Legs do not depend on block sizes and arrival order of topics; which rows are kept."""
 
 from dataclasses import fields
 
@@ -63,13 +63,13 @@ WHOLE = recorded(TOPICS, [(s, 0, 10**6) for s in TOPICS]).close(START, STOP, pre
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_chopping_and_racing_leave_no_trace(data):
+def test_a_leg_does_not_depend_on_block_sizes_and_arrival_order(data):
     pieces = {}
     for slot, block in TOPICS.items():
         n = len(block.stamp_ns)
         cuts = sorted(data.draw(st.sets(st.integers(1, n - 1), max_size=6), label=slot))
         pieces[slot] = list(zip([0, *cuts], [*cuts, n], strict=True))
-    # each topic keeps its order, between topics anything goes
+    # the order is fixed within a topic, random between topics
     race = data.draw(st.permutations([s for s in pieces for _ in pieces[s]]), label='race')
     queues = {slot: iter(p) for slot, p in pieces.items()}
     recorder = recorded(TOPICS, [(slot, *next(queues[slot])) for slot in race])
@@ -84,7 +84,7 @@ def placed(block):
     return np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
 
 
-def test_the_preroll_is_cut_and_the_first_row_after_the_stop_is_kept():
+def test_a_leg_has_the_preroll_and_one_row_after_the_stop():
     for slot, block in TOPICS.items():
         key, every = placed(WHOLE.rows(slot)), placed(block)
         assert key.min() >= START - 5 * S
@@ -93,7 +93,7 @@ def test_the_preroll_is_cut_and_the_first_row_after_the_stop_is_kept():
         assert len(key) == np.sum((every >= START - 5 * S) & (every <= key.max()))
 
 
-def test_how_late_a_leg_is_closed_leaves_no_trace():
+def test_a_leg_does_not_depend_on_the_time_of_closing():
     early, late = LegRecorder(), LegRecorder()
     for slot, block in TOPICS.items():
         early.feed(slot, take(block, placed(block) <= STOP + 3 * S))
@@ -101,7 +101,7 @@ def test_how_late_a_leg_is_closed_leaves_no_trace():
     assert_same(early.close(START, STOP, 5.0), late.close(START, STOP, 5.0))
 
 
-def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
+def test_clear_removes_all_rows_and_the_newest_stamp_is_the_last_fed():
     recorder = recorded(TOPICS, [('imu', 0, 100)])
     assert recorder.newest_ns('imu') == TOPICS['imu'].stamp_ns[99]
     assert recorder.newest_ns('fix') == 0
@@ -110,7 +110,7 @@ def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
     assert all(len(column) == 0 for column in rows(recorder.close(START, STOP)).values())
 
 
-def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():
+def test_a_first_row_years_after_the_mark_is_not_in_the_leg():
     late = 10**9 * 86400 * 4000
     recorder = LegRecorder()
     recorder.feed('odometer', OdometerSamples([10, 20, 30 + late], [10, 20, 30 + late], [1, 2, 3]))
@@ -119,8 +119,8 @@ def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():
         recorder.close(5, 40 + late)
 
 
-def test_rows_of_another_recorder_are_held_uncopied():
-    """Under another name too; what comes to that one later is not, and nothing is none."""
+def test_rows_of_another_recorder_are_shared_without_a_copy():
+    """Also under another name; later rows of that recorder are not shared."""
     one, both = recorded(TOPICS, [('odometer', 0, 100)]), recorded(TOPICS, [('imu', 0, 50)])
     both.adopt('odometer_right', one, 'odometer')
     both.adopt('imu', one, 'imu')
@@ -151,7 +151,7 @@ def test_closing_legs_from_snapshots_does_not_keep_old_rows():
     assert kept(recorder, 'odometer') == 16 * 5
 
 
-def test_forgetting_one_topic_leaves_the_others_and_a_snapshot_its_rows():
+def test_removing_one_topic_keeps_other_topics_and_snapshots():
     recorder = LegRecorder()
     for slot in ('odometer', 'odometer_right'):
         for second in range(1, 10):

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples: checked at birth, cut, joined; in pieces and in files the same to the last bit."""
+"""Samples: checked when created, cut, joined; identical in pieces and in files."""
 
 import errno
 import os
@@ -55,7 +55,7 @@ def test_a_block_is_read_only_and_owns_its_rows():
         block.value = value
 
 
-def test_counters_stay_whole_and_speeds_stay_real():
+def test_counters_remain_integers_and_speeds_floats():
     assert s.OdometerSamples([1], [1], np.array([2**63 - 1])).value[0] == 2**63 - 1
     assert s.OdometerSamples([1], [1], np.array([3], np.uint16)).value.dtype == np.int64
     assert s.OdometerSamples([1], [1], np.array([0.5], np.float32)).value.dtype == np.float64
@@ -71,7 +71,7 @@ def test_a_wrong_shape_is_refused_by_name(bad):
         bad()
 
 
-def test_what_is_cut_and_joined_is_the_whole(imu):
+def test_cut_and_joined_samples_equal_the_whole(imu):
     parts = [take(imu, slice(a, b)) for a, b in ((0, 1), (1, 1), (1, 5), (5, N))]
     assert_same(s.join(parts), imu)
     assert s.join([imu]) is imu
@@ -94,20 +94,20 @@ def wild(*shape):
 
 @pytest.mark.parametrize('columns', [1, 3, 4])
 @pytest.mark.parametrize('ufunc', [np.maximum, np.add, np.logical_and, np.logical_or])
-def test_across_is_what_numpy_reduces_rows_to(ufunc, columns):
+def test_across_equals_the_reduction_by_numpy(ufunc, columns):
     x = np.abs(wild(1000, columns))
     x = x > 1 if ufunc in (np.logical_and, np.logical_or) else x
     np.testing.assert_array_equal(reduce_columns(ufunc, x), ufunc.reduce(x, axis=1))
 
 
 @pytest.mark.parametrize('columns', [3, 4])
-def test_lengths_are_numpys_norms_of_rows(columns):
+def test_lengths_equal_the_row_norms_of_numpy(columns):
     x = wild(1000, columns)
     with np.errstate(over='ignore'):
         np.testing.assert_array_equal(lengths(x), np.linalg.norm(x, axis=1))
 
 
-# of which the subset that tells the median says much, little, or nothing
+# data of which the subset gives a good, a poor or no bound of the median
 UNLIKE = {'noise': lambda x: x, 'steps': np.round, 'one': np.ones_like, 'sorted': np.sort,
           'misled': lambda x: np.where(np.arange(len(x)) % 64, x, 9.0),
           'infinite': lambda x: np.where(x > 0, np.inf, x),
@@ -115,7 +115,7 @@ UNLIKE = {'noise': lambda x: x, 'steps': np.round, 'one': np.ones_like, 'sorted'
 
 
 @pytest.mark.parametrize('kind', UNLIKE)
-def test_a_median_of_many_rows_is_numpys(kind):
+def test_median_of_many_rows_equals_that_of_numpy(kind):
     for n in (PIECE_ROWS, PIECE_ROWS + 1):
         x = UNLIKE[kind](np.random.default_rng(5).normal(size=n))
         np.testing.assert_array_equal(median(x), np.median(x))
@@ -124,13 +124,13 @@ def test_a_median_of_many_rows_is_numpys(kind):
 
 
 @pytest.mark.parametrize('rows', [0, 5, PIECE_ROWS, 2 * PIECE_ROWS + 100])
-def test_evenly_spaced_rows_are_those_of_a_slice(rows):
+def test_evenly_spaced_rows_equal_a_slice(rows):
     x = np.arange(3 * rows).reshape(-1, 3)
     for expected in (4, 1000, PIECE_ROWS):
         np.testing.assert_array_equal(thinned(x, expected), x[::max(1, rows // expected)])
 
 
-def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():
+def test_an_integral_over_pieces_equals_the_integral_at_once():
     rng = np.random.default_rng(4)
     t = np.cumsum(rng.uniform(0.5, 1.5, 2 * PIECE_ROWS + 100))
     x = rng.normal(size=(len(t), 2))
@@ -148,7 +148,7 @@ def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Let rows go to the file from 200 kB on."""
+    """Move rows to the file from 200 kB on."""
     for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
                        ('MERGED_BYTES', 20_000)):
         monkeypatch.setattr(spool, name, size)
@@ -161,7 +161,7 @@ def fed(recorder, imu, first, last):
     return recorder
 
 
-def test_rows_of_a_file_are_those_that_came(imu):
+def test_rows_of_a_file_equal_the_received_ones(imu):
     recorder = fed(LegRecorder(), imu, 0, 9_025)
     copy = recorder.snapshot()
     fed(recorder, imu, 9_050, 15_000)
@@ -170,13 +170,13 @@ def test_rows_of_a_file_are_those_that_came(imu):
     release_mapped_memory()
     assert_same(rows, imu, 0, 9_050)
     assert_same(recorder.rows('imu'), imu, 0, 15_000)
-    # the pre-roll of the next leg is what is left, and the copy is as it was
+    # only the pre-roll of the next leg remains, and the copy is unchanged
     recorder.forget_before(int(imu.stamp_ns[14_000]))
     assert_same(fed(recorder, imu, 15_000, N).rows('imu'), imu, 14_000, N)
     assert_same(copy.rows('imu'), imu, 0, 9_050)
 
 
-def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
+def test_a_large_array_is_zero_and_can_be_released(monkeypatch):
     monkeypatch.setattr(arrays, 'WORK_ARRAY_BYTES', 4_000)
     for dtype in (float, bool, np.int64):
         array = arrays.work_array(1000, 5, dtype=dtype)
@@ -192,10 +192,10 @@ def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
     def full(*_):
         raise OSError(28, 'no space left on device')
     monkeypatch.setattr(arrays.os, 'posix_fallocate', full)
-    assert arrays.work_array(1000, 5).sum() == 0.0        # in memory, then
+    assert arrays.work_array(1000, 5).sum() == 0.0        # in memory instead
 
 
-def test_arrays_in_files_are_let_go_once_they_are_large(monkeypatch):
+def test_large_arrays_in_files_are_released(monkeypatch):
     array = arrays.work_array(arrays.WORK_ARRAY_BYTES // 8)
     array[:] = 1
 
@@ -223,7 +223,7 @@ def test_a_leg_takes_no_more_memory_as_it_grows(imu):
     assert grown < 5 * N // 2 < ROW * N // 2      # bytes for each row
 
 
-def test_a_full_disk_costs_memory_only(imu, monkeypatch):
+def test_rows_are_kept_in_memory_if_the_disk_is_full(imu, monkeypatch):
     write, left = os.pwrite, [40]
 
     def full(*args):

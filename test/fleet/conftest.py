@@ -39,7 +39,7 @@ class Fleet:
 
 
 def arguments(*options: str):
-    """Return replay's options: the quick method, unless they say another."""
+    """Return options of replay: the quick method by default."""
     parser = ArgumentParser()
     add_calibration_arguments(parser)
     return parser.parse_args(['--method', 'two_point', *options])
@@ -60,7 +60,7 @@ def client():
     import dask
     with engine(None, 2, 2**31, 1) as client:
         keys = client.security
-        # the command, given the address, takes them from where those of a cluster stand
+        # the command with the address reads them from the configuration, as for a cluster
         with dask.config.set({'distributed.comm.require-encryption': True,
                               'distributed.comm.tls.ca-file': keys.tls_ca_file,
                               'distributed.comm.tls.client.cert': keys.tls_client_cert,

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which bags are meant: manifests, folders, globs, patterns, URLs; and legs kept as text."""
+"""Selection of bags: manifests, folders, globs, patterns, URLs; and legs stored as text."""
 
 import shutil
 import zipfile
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.core
 pytest.importorskip('fsspec')
 
 
-def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
+def test_a_manifest_gives_the_same_bags_from_csv_and_parquet(fleet, tmp_path):
     from pyarrow import csv, parquet
     bags = find_bags([fleet.manifest], None)
     assert [(b.vehicle, b.model, b.odometer_km) for b in bags] == [
@@ -33,7 +33,7 @@ def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
     assert find_bags([str(fleet.folder / 'manifest.parquet')], None) == bags
 
 
-def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
+def test_bags_in_folders_and_globs_are_found_and_named_by_their_path(fleet):
     whole = find_bags([str(fleet.folder)], None)
     assert [(b.vehicle, b.bag) for b in whole] == sorted(
         (row['vehicle'], str(fleet.folder / row['bag'])) for row in fleet.rows)
@@ -51,7 +51,7 @@ def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
     ('vehicle,model\na,b\n', 'no column bag'), ('vehicle,bag\n', 'no bag'),
     ('vehicle,bag\n,x\n', 'row 2: vehicle or bag is empty'),
     ('vehicle,bag,odometer_km\na,x,far\n', "'far' is not a number"), ('', 'cannot be read')])
-def test_a_wrong_manifest_says_where(text, what, tmp_path):
+def test_a_wrong_manifest_is_refused_with_the_place_of_the_error(text, what, tmp_path):
     (tmp_path / 'm.csv').write_text(text)
     with pytest.raises(BadUsage, match=what):
         find_bags([str(tmp_path / 'm.csv')], None)
@@ -83,7 +83,7 @@ def test_a_bag_by_url_is_copied_and_the_copy_removed(tmp_path):
         bag_fingerprint(f'{tmp_path}/gone', '')
 
 
-def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
+def test_a_remote_bag_stays_in_its_folder_within_the_free_space(tmp_path, monkeypatch):
     from fsspec.implementations.memory import MemoryFileSystem
     memory = MemoryFileSystem()
     memory.pipe('/odd/../x.mcap', b'12345')
@@ -99,7 +99,7 @@ def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
         pass
 
 
-def test_folders_of_vehicles_are_their_own():
+def test_each_vehicle_has_a_separate_valid_folder():
     names = ['7', '.7', '..', '', '../x', 'x' * 300, 'x' * 299 + 'y', '\u00fc' * 200, 'a b']
     folders = [folder_name(name) for name in names]
     assert len(set(folders)) == len(names)
@@ -111,7 +111,7 @@ def test_folders_of_vehicles_are_their_own():
 
 @pytest.mark.parametrize('spoil', [lambda data: data[:len(data) // 2], lambda data: b'',
                                    lambda data: b'PAR1' + b'x' * 50 + b'PAR1'])
-def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
+def test_a_truncated_row_is_computed_again(tmp_path, spoil):
     store, key = RowStore(tmp_path), key_of('a bag')
     row = Row(key=key, bag='drive', vehicle='7')
     store.put(row)
@@ -128,7 +128,7 @@ def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
 
 
 def test_legs_from_text_combine_to_the_same_digits():
-    """Of the smoother too, whose legs are combined on their border."""
+    """Also of the smoother, whose legs are combined by their shared constants."""
     legs = []
     for seed in (1, 2):
         made = drive(scenario='town', duration=135.0, fix_noise='rtk', imu_rate=25.0,
@@ -138,7 +138,7 @@ def test_legs_from_text_combine_to_the_same_digits():
     text = text_of_legs(legs)
     again = legs_from_text(text)
     assert text_of_legs(again) == text
-    kept = [leg.numbers() for leg in legs]      # what is drawn is left out
+    kept = [leg.numbers() for leg in legs]      # without data for the plots
     found, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
     assert found == known
     assert found['result']['scale_factor']['method'] == 'smoother'
@@ -152,7 +152,7 @@ def test_legs_from_text_combine_to_the_same_digits():
     (['{fleet}', '--accept', 'x=1:2'], '--accept'), (['{fleet}', '--leg', '3'], '--leg'),
     (['{fleet}', '--task-timeout', '0'], '--task-timeout'),
     (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'no answer')])
-def test_wrong_usage_is_told_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
+def test_wrong_usage_is_refused_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = [word.format(fleet=fleet.manifest) for word in argv]
     assert main(['fleet', *words, '--output', str(tmp_path / 'out')]) == 2

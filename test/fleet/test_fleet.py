@@ -6,7 +6,6 @@
 from contextlib import contextmanager
 import csv
 from dataclasses import replace
-from datetime import datetime, UTC
 import json
 import os
 import re
@@ -24,7 +23,6 @@ from odocal_ros.fleet import calibrate_bags
 from odocal_ros.fleet.bag_jobs import computed_rows
 from odocal_ros.fleet.bags import find_bags
 from odocal_ros.fleet.engine import FEWEST_TASKS, task_results
-from odocal_ros.fleet.page import remarks
 from odocal_ros.fleet.rows import DONE, FAILED, read_rows
 from odocal_ros.offline.cli import main
 
@@ -32,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 
 def stored(output):
-    """Return all rows in an output folder, by bag, but for how long each took."""
+    """Return all rows in an output folder by bag, without the computing times."""
     rows = list(read_rows(sorted((output / 'rows').rglob('*.parquet'))))
     by_bag = {row.bag: replace(row, seconds=0.0) for row in rows}
     assert len(by_bag) == len(rows)      # one row a bag
@@ -61,7 +59,7 @@ def output(fleet, client, tmp_path_factory):
     return folder
 
 
-def test_each_bag_has_one_row_with_what_replay_says_of_it(fleet, output, tmp_path):
+def test_each_bag_has_one_row_with_the_result_of_replay(fleet, output, tmp_path):
     rows = stored(output)
     assert len(rows) == len(fleet.rows)
     bag = fleet.folder / fleet.rows[0]['bag']
@@ -77,7 +75,7 @@ def test_each_bag_has_one_row_with_what_replay_says_of_it(fleet, output, tmp_pat
         found[key] for key in ('value', 'sigma', 'unit')]
 
 
-def test_a_vehicle_is_what_replay_of_its_bags_since_the_change_says(fleet, output, tmp_path):
+def test_a_vehicle_has_the_result_of_replay_of_its_bags_since_the_change(fleet, output, tmp_path):
     table = table_of(output).set_index('vehicle')
     changed = next(v for v in fleet.truth if v['changes'][0]['value'] == 'scale_factor')
     row, = [table.loc[changed['vehicle']]]
@@ -97,7 +95,7 @@ def test_a_vehicle_is_what_replay_of_its_bags_since_the_change_says(fleet, outpu
     assert 'report.html' in {p.name for p in (output / 'reports' / changed['vehicle']).iterdir()}
 
 
-def test_changes_and_broken_counters_are_found_when_they_were(fleet, output):
+def test_changes_and_broken_counters_are_found_at_their_time(fleet, output):
     table = table_of(output).set_index('vehicle')
     for vehicle in fleet.truth:
         row, (change,) = table.loc[vehicle['vehicle']], vehicle['changes']
@@ -105,7 +103,7 @@ def test_changes_and_broken_counters_are_found_when_they_were(fleet, output):
         if change['value'] == 'scale_factor':
             assert [(c['after'], c['by']) for c in found] == [(change['after'], change['by'])]
             assert abs(found[0]['size'] - change['size']) < 4 * found[0]['sigma'] + 2e-3
-        else:      # no heading is known: two_point says nothing of the yaw
+        else:      # without a heading two_point does not give the yaw
             assert found == []
         broken = change['value'] == 'counter'
         assert (row.rejected_since == row.rejected_since) == broken      # NaT is not
@@ -114,13 +112,13 @@ def test_changes_and_broken_counters_are_found_when_they_were(fleet, output):
             assert row.rejected_for == 'ODOMETER_STILL'
             assert row.reasons.split()[0] == 'ODOMETER_STILL'
         assert (row.verdict == 'rejected') == broken
-        # its scale now: 4 sigma, one draw in 16,000; the walk of the weeks is in the sigma
+        # its scale now: 4 sigma, one draw in 16,000; the random walk of the weeks is in the sigma
         good = len(vehicle['start']) - 1 if not broken else change['bag'] - 2
         assert abs(row.scale_factor - vehicle['scale_factor'][good]) < 4 * np.hypot(
             row.scale_factor_sigma, 1e-4 * 7**0.5 * 2 * row.scale_factor)
 
 
-def test_tables_and_page_hold_the_fleet(fleet, output):
+def test_tables_and_page_contain_all_vehicles(fleet, output):
     legs = table_of(output, 'legs')
     assert len(legs) == len(fleet.rows)
     assert set(legs.columns) >= {'vehicle', 'bag', 'scale_factor', 'period', 'verdict', 'start'}
@@ -152,37 +150,27 @@ def test_a_second_run_computes_only_what_is_new_or_changed(fleet, client, output
     jobs = fleet.jobs(output)
     before = stored(output)
     assert computed(client, jobs) == (0, [DONE] * len(jobs))
-    # another date or place: the bag is read, known by its content, and not computed
+    # another date or place: the bag is read, recognised by its content, and not computed
     bag = fleet.folder / fleet.rows[0]['bag']
     for path in bag.iterdir():
         os.utime(path, (1, 1))
     assert computed(client, jobs)[0] == 0
     assert {k: replace(row, seen='') for k, row in stored(output).items()} == {
         k: replace(row, seen='') for k, row in before.items()}
-    # limits do not touch legs, what a leg must be does
+    # legs do not depend on limits of the result, but on requirements for a leg
     assert computed(client, fleet.jobs(output, '--accept', 'scale_ratio=0:9')[:2])[0] == 0
     assert computed(client, fleet.jobs(tmp_path, '--set', 'leg.min_distance=50')[:2])[0] == 2
     assert stored(tmp_path)[str(bag)].key != before[str(bag)].key
 
 
-def test_rejected_legs_are_stated_once():
-    row = {'decision': 'UNDECIDED', 'changes': '[]', 'outlier': '', 'odd_legs': '', 'legs': 4,
-           'legs_good': 2, 'rejected_for': 'ODOMETER_STILL', 'bags_failed': 0,
-           'rejected_since': datetime(2025, 6, 29, tzinfo=UTC)}
-    why = 'rejected: ODOMETER_STILL: the last 2 legs, since 2025-06-29, are all rejected'
-    assert remarks(row | {'why': why}) == ['UNDECIDED', why]
-    assert remarks(row | {'why': ''})[1] == (
-        '2 of 4 legs rejected (ODOMETER_STILL), all since 2025-06-29')
-
-
-def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, output, capsys):
+def test_limits_give_a_json_line_per_vehicle_and_the_exit_code(fleet, client, output, capsys):
     argv = ['fleet', fleet.manifest, '--output', str(output), '--scheduler',
             client.scheduler.address, '--method', 'two_point', '--reports', 'none', '--quiet']
     assert main([*argv, '--accept', 'scale_ratio=0.9:1.1']) == 1
     reported = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {one['vehicle'] for one in reported} == {v['vehicle'] for v in fleet.truth}
     broken = {v['vehicle'] for v in fleet.truth if v['changes'][0]['value'] == 'counter'}
-    # its good drives are of the past
+    # its good drives are before the fault
     assert {one['vehicle']: one['decision'] for one in reported} == {
         v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else 'PASS' for v in fleet.truth}
     why, = [one['why'] for one in reported if one['vehicle'] in broken]
@@ -200,12 +188,12 @@ def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, o
 
 @contextmanager
 def silent_server():
-    """Give the URL of a bag on a server that takes a call and never says a word."""
+    """Yield the URL of a bag on a server that accepts a connection and never replies."""
     with socket.create_server(('127.0.0.1', 0)) as server:
         yield f'ftp://127.0.0.1:{server.getsockname()[1]}/drive.mcap'
 
 
-def test_a_bag_that_hangs_and_one_that_is_none_stop_nobody(fleet, client, tmp_path):
+def test_a_bag_that_hangs_and_an_invalid_one_do_not_stop_others(fleet, client, tmp_path):
     (tmp_path / 'no.mcap').write_bytes(b'nothing of a bag')
     good = find_bags([fleet.manifest], None)[:3]
     with silent_server() as url:
@@ -217,12 +205,12 @@ def test_a_bag_that_hangs_and_one_that_is_none_stop_nobody(fleet, client, tmp_pa
     assert rows[url].reason == 'exceeded the time limit --task-timeout (6 s)'
     assert 'no.mcap' in rows[bags[1].bag].reason
     assert {row.status for bag, row in rows.items() if bag in {b.bag for b in good}} == {DONE}
-    # what failed is kept, and tried once more on request
+    # failed rows are kept, and computed again on request
     assert computed(client, jobs[1:]) == (0, [DONE] * 3 + [FAILED])
     assert computed(client, jobs[1:2], again=True) == (1, [FAILED])
 
 
-def test_a_bag_whose_worker_is_killed_is_a_row_that_says_so(fleet, client, tmp_path):
+def test_a_bag_whose_worker_is_killed_has_a_row_with_the_reason(fleet, client, tmp_path):
     good = find_bags([fleet.manifest], None)[:3]
     with silent_server() as url:
         jobs = fleet.jobs(tmp_path, bags=[replace(good[0], bag=url), *good], seconds=0)
@@ -233,7 +221,7 @@ def test_a_bag_whose_worker_is_killed_is_a_row_that_says_so(fleet, client, tmp_p
 
 
 def kill_at(client, job):
-    """Kill the worker that a job is on, once it has no other: of one try none would be left."""
+    """Kill the worker of a job when it has no other job, which would lose its only try."""
     def at_work():
         return [address for address, keys in client.processing().items()
                 if len(keys) == 1 and job.failed_key in str(keys[0])]
@@ -242,17 +230,17 @@ def kill_at(client, job):
     os.kill(client.run(os.getpid, workers=where)[where[0]], signal.SIGKILL)
 
 
-def test_a_bag_that_needs_more_memory_than_it_may_is_a_row_that_says_so(fleet, client, tmp_path):
+def test_a_bag_beyond_the_memory_limit_has_a_row_with_the_reason(fleet, client, tmp_path):
     bag = find_bags([fleet.manifest], None)[0]
     jobs = fleet.jobs(tmp_path, '--method', 'smoother', bags=[bag], memory=2**23, seconds=60.0)
     assert computed(client, jobs) == (1, [FAILED])
     assert 'exceeds the memory limit --task-memory' in stored(tmp_path)[bag.bag].reason
-    # the worker lives, and has its memory back
+    # the worker continues, and its memory is free again
     assert computed(client, fleet.jobs(tmp_path / 'b', bags=[bag])) == (1, [DONE])
 
 
 def test_libraries_are_loaded_before_memory_is_limited():
-    """OpenBLAS that is loaded with 8 to 64 MB left tries for ever to map its buffer."""
+    """OpenBLAS that is loaded with 8 to 64 MB of free memory never stops mapping its buffer."""
     code = ('import resource\nimport numpy as np\nfrom odocal_ros.fleet import bag_jobs\n'
             'bag_jobs._load_libraries()\nmost = bag_jobs._data_bytes() + 2**24\n'
             'resource.setrlimit(resource.RLIMIT_DATA, (most, -1))\n'
@@ -261,17 +249,17 @@ def test_libraries_are_loaded_before_memory_is_limited():
     assert subprocess.run([sys.executable, '-c', code], timeout=60.0).returncode == 0
 
 
-def test_the_scheduler_is_given_some_tasks_at_a_time(client):
+def test_the_scheduler_receives_tasks_in_portions(client):
     found, most = {}, 0
     keys = [str(k) for k in range(400)]
     for i, result, error in task_results(client, abs, range(-400, 0), 'abs', keys):
         found[i], most = (result, error), max(most, len(client.futures))
     assert found == {i: (400 - i, None) for i in range(400)}
-    assert most <= 2 * FEWEST_TASKS      # and given anew when half are left
+    assert most <= 2 * FEWEST_TASKS      # more when half are left
 
 
-def test_a_process_that_has_read_rows_ends_well(output):
-    """Three processes: with threads of its own pyarrow aborted seven of eight as they ended."""
+def test_a_process_that_has_read_rows_ends_without_an_error(output):
+    """Three processes: with threads of pyarrow, seven of eight aborted at the end."""
     code = ('import sys\nfrom odocal_ros.fleet.rows import read_rows\n'
             'assert list(read_rows(sys.argv[1:]))')
     files = [str(path) for path in (output / 'rows').rglob('*.parquet')]
@@ -279,7 +267,7 @@ def test_a_process_that_has_read_rows_ends_well(output):
         assert subprocess.run([sys.executable, '-c', code, *files]).returncode == 0
 
 
-def test_only_who_holds_the_key_gives_local_workers_work(client):
+def test_local_workers_accept_only_clients_with_the_key(client):
     import dask
     from distributed import Client
     address = client.scheduler.address
@@ -291,7 +279,7 @@ def test_only_who_holds_the_key_gives_local_workers_work(client):
         Client(address.replace('tls', 'tcp'), timeout='2s')
 
 
-def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
+def test_calibrate_bags_returns_a_data_frame_of_legs(fleet, client, tmp_path):
     import pandas as pd
     manifest = pd.read_csv(fleet.manifest)[['vehicle', 'bag', 'model']].head(2)
     manifest['bag'] = [str(fleet.folder / bag) for bag in manifest.bag]

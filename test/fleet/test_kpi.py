@@ -1,8 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal fleet: --kpi and changes of a vehicle, by the normal law."""
+"""odocal fleet: --kpi, changes of a vehicle by the normal law, and remarks."""
 
+from datetime import datetime, UTC
 import json
 import math
 from statistics import NormalDist
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.fleet.kpi import FEWEST_LEGS, kpi
+from odocal_ros.fleet.page import remarks
 from odocal_ros.fleet.statistics import covariance, history, MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.fleet.tables import VALUES
 from odocal_ros.offline.cli import main
@@ -20,7 +22,7 @@ LIMITS = {'scale_ratio': (0.99, 1.01)}
 NONE = {f'{name}{part}': None for name in VALUES for part in ('', '_sigma')}
 N = 10
 DAYS = 7.0 * np.arange(N)
-V = covariance(np.full(N, 1e-5**2), [], DAYS, 1e-4)      # the walk rules: 265 ppm in a week
+V = covariance(np.full(N, 1e-5**2), [], DAYS, 1e-4)      # dominated by the walk: 265 ppm in a week
 
 
 def row(vehicle, value, sigma, **more):
@@ -32,7 +34,7 @@ def leg(vehicle, value, sigma=1e-3, minutes=1.0, period=1, **more):
     return row(vehicle, value, sigma, duration_s=60 * minutes, period=period, **more)
 
 
-def test_rates_are_those_counted_by_hand():
+def test_rates_agree_with_a_manual_count():
     vehicles = [row('good', 1.0, 1e-4), row('bad', 1.02, 1e-4), row('edge', 1.01, 1e-4),
                 row('few', 1.0, 1e-4)]
     legs = [leg('good', 1.0), leg('good', 1.001), leg('good', 1.02), leg('good', 1.009),
@@ -52,14 +54,14 @@ def test_rates_are_those_counted_by_hand():
     assert found['by_minutes'][1]['false_accept'] == 1.0
 
 
-def test_only_the_legs_since_the_last_change_count():
+def test_rates_use_only_the_legs_since_the_last_change():
     legs = [leg('a', 1.02, period=1)] * 4 + [leg('a', 1.0, period=2)] * FEWEST_LEGS
     found = kpi([row('a', 1.0, 1e-4)], legs, LIMITS)['all']
     assert (found['legs'], found['recall']) == (FEWEST_LEGS, 1.0)
 
 
-def test_a_vehicle_that_wanders_across_the_limit_is_on_it():
-    """Its last result is surely bad; half of its drives were not."""
+def test_a_vehicle_that_drifts_across_the_limit_is_on_the_limit():
+    """Its last result is outside the limit; half of its drives are inside."""
     legs = [leg('a', value, 1e-5) for value in (1.0097, 1.0098, 1.0102, 1.0103)]
     found = kpi([row('a', 1.0103, 2e-5)], legs, LIMITS)
     assert found['vehicles'] == {'good': 0, 'bad': 0, 'on_the_limit': 1}
@@ -81,7 +83,7 @@ def test_drawn_legs_have_the_rates_of_the_normal_law():
     assert found['false_accept'] == pytest.approx(share(-3), abs=4 * math.sqrt(0.0014 / n))
 
 
-def test_the_command_writes_them(fleet, tmp_path, capsys):
+def test_the_command_writes_the_kpi(fleet, tmp_path, capsys):
     command = ['fleet', fleet.manifest, '--output', str(tmp_path / 'out'), '--method',
                'two_point', '--workers', '1', '--reports', 'none', '--kpi']
     assert main(command) == 2
@@ -99,37 +101,37 @@ def drawn(rng):
     return np.linalg.cholesky(V) @ rng.standard_normal(N)
 
 
-def test_nothing_is_invented_more_often_than_said():
+def test_false_changes_and_outliers_have_the_stated_rate():
     rng = np.random.default_rng(4)
     found = [history(drawn(rng), V) for _ in range(2000)]
     # one in 1000 at most, by Bonferroni: 2 of 2000, and 3 sigma of that count
     assert sum(bool(h.changes or h.outliers) for h in found) <= 2 + 3 * 2**0.5
 
 
-def test_a_change_is_found_where_it_is_with_an_honest_sigma():
+def test_a_change_is_found_at_its_leg_with_a_correct_sigma():
     rng, off = np.random.default_rng(5), []
     for k in range(300):
         leg = 1 + k % (N - 1)
         change, = history(drawn(rng) + 0.005 * (np.arange(N) >= leg), V).changes
         assert change.leg == leg
         off.append((change.size - 0.005) / change.sigma)
-        # what a step between two neighbours of a walk is known to: the walk of a week
+        # uncertainty of a step between adjacent legs of a random walk: the walk of a week
         assert change.sigma == pytest.approx(np.hypot(1e-4 * 7**0.5, 2**0.5 * 1e-5), rel=0.03)
     assert abs(np.mean(off)) < 3 / 300**0.5
     assert abs(np.std(off) - 1) < 3 / 600**0.5
 
 
-def test_two_changes_and_an_odd_leg_are_told_apart():
+def test_two_changes_and_an_outlier_leg_are_distinguished():
     y = 0.004 * (np.arange(N) >= 3) - 0.006 * (np.arange(N) >= 7) + 0.02 * (np.arange(N) == 5)
     found = history(y, V)
     assert [(c.leg, round(c.size, 4)) for c in found.changes] == [(3, 0.004), (7, -0.006)]
     assert found.outliers == (5,)
-    # nothing comes after the last leg that could say it was odd
+    # the last leg may be a change: no leg follows that shows it as an outlier
     assert history(0.02 * (np.arange(N) == N - 1), V).changes[0].leg == N - 1
 
 
-def test_an_error_that_all_legs_share_is_no_reason_to_doubt_a_change():
-    """It moves the level and no step: what is the same in all legs drops out, exactly."""
+def test_an_error_shared_by_all_legs_does_not_affect_a_change():
+    """It changes the level and no step: an error common to all legs cancels exactly."""
     own = np.full(N, 1e-5**2)
     y = 2e-4 * (np.arange(N) >= 4)
     alone, = history(y, covariance(own)).changes
@@ -137,7 +139,7 @@ def test_an_error_that_all_legs_share_is_no_reason_to_doubt_a_change():
     assert shared.sigma == pytest.approx(alone.sigma, rel=1e-6)
     # the mean of 4 against that of 6
     assert alone.sigma == pytest.approx(1e-5 * (1 / 4 + 1 / 6)**0.5, rel=1e-12)
-    # half of the legs have it and the others do not: then it may be the step
+    # an error of half of the legs only may be the step
     half = np.where(np.arange(N) >= 4, 1e-2, 0.0)[:, None]
     assert history(y, covariance(own, [half])).changes == ()
 
@@ -150,7 +152,7 @@ def test_the_slope_of_a_drift_has_the_sigma_of_the_regression():
     assert found.slope_sigma == pytest.approx(1e-5 / np.sqrt(((t - t.mean())**2).sum()), rel=1e-9)
 
 
-def test_the_population_is_that_of_the_many_and_names_the_few():
+def test_population_describes_most_vehicles_and_lists_the_outliers():
     rng = np.random.default_rng(6)
     means, spreads = [], []
     for _ in range(60):
@@ -171,3 +173,13 @@ def test_the_population_is_that_of_the_many_and_names_the_few():
     assert np.mean(spreads) == pytest.approx(1.05, abs=3 * 0.18 / 60**0.5)
     few = population(np.array([1.0, 9.0]), np.array([0.1, 0.1]))
     assert np.isnan(few.deviates).all()
+
+
+def test_rejected_legs_are_stated_once():
+    legs = {'decision': 'UNDECIDED', 'changes': '[]', 'outlier': '', 'odd_legs': '', 'legs': 4,
+            'legs_good': 2, 'rejected_for': 'ODOMETER_STILL', 'bags_failed': 0,
+            'rejected_since': datetime(2025, 6, 29, tzinfo=UTC)}
+    why = 'rejected: ODOMETER_STILL: the last 2 legs, since 2025-06-29, are all rejected'
+    assert remarks(legs | {'why': why}) == ['UNDECIDED', why]
+    assert remarks(legs | {'why': ''})[1] == (
+        '2 of 4 legs rejected (ODOMETER_STILL), all since 2025-06-29')

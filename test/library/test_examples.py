@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The examples run as they stand, and what they print is true."""
+"""The examples run unchanged and print correct values."""
 
 import json
 import os
@@ -26,7 +26,7 @@ NUMBER = r'([\d.]+)'
 
 
 def run(name, monkeypatch, folder, *argv):
-    """Run a script in a folder, as a person would."""
+    """Run a script in a folder with arguments."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, 'argv', [name, *map(str, argv)])
     runpy.run_path(str(EXAMPLES / name), run_name='__main__')
@@ -48,7 +48,7 @@ def test_calibrate_a_bag(town, tmp_path, monkeypatch, capsys):
     assert (tmp_path / 'result' / 'calibration.json').exists()
 
 
-def test_a_bag_of_other_names_is_taken_and_what_is_none_is_said_in_a_sentence(
+def test_a_bag_with_other_topics_is_read_and_a_missing_one_refused(
         town, tmp_path, monkeypatch, capsys):
     drive, _ = town
     bag = write_bag(tmp_path / 'own', [
@@ -126,14 +126,14 @@ def test_live_result(tmp_path):
     node = rclpy.create_node('calibrator', context=context)
     for name, value in (('scale_factor', 0.0213), ('scale_factor_sigma', 2e-6)):
         node.create_publisher(Float64, f'/calibrator/{name}', latched).publish(Float64(data=value))
-    hearer = subprocess.Popen([sys.executable, EXAMPLES / 'live_result.py'], text=True,
+    listener = subprocess.Popen([sys.executable, EXAMPLES / 'live_result.py'], text=True,
                                 stdout=subprocess.PIPE, cwd=tmp_path, env=os.environ)
-    watchdog = threading.Timer(60.0, hearer.kill)     # for a machine where nothing is heard
+    watchdog = threading.Timer(60.0, listener.kill)     # if no message arrives
     watchdog.start()
     try:
-        assert hearer.stdout.readline() == 'scale factor 0.0213 +- 2e-06\n'
+        assert listener.stdout.readline() == 'scale factor 0.0213 +- 2e-06\n'
     finally:
         watchdog.cancel()
-        hearer.kill()
-        hearer.communicate()
+        listener.kill()
+        listener.communicate()
         rclpy.shutdown(context=context)

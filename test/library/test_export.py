@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Each exported file as its own program reads it, or by the rule of its format."""
+"""Each exported file, read by its own program or checked by its format specification."""
 
 import csv
 import operator
@@ -23,14 +23,14 @@ from odocal_ros.output.program_files import features
 
 @pytest.fixture(scope='module')
 def exported(calibration, tmp_path_factory):
-    """Write all that need nothing beyond the package itself."""
+    """Write all formats that need no other package."""
     folder = tmp_path_factory.mktemp('exported')
     calibration.export(*(folder / name for name in KNOWN
                          if not name.endswith(('.parquet', '.rrd'))))
     return folder
 
 
-def test_tum_is_what_evo_reads(calibration, exported):
+def test_tum_has_the_format_that_evo_reads(calibration, exported):
     """evo: eight entries a row by single spaces, seconds first, a quaternion x y z w last."""
     found = calibration.trajectory()
     text = (exported / 'trajectory.tum').read_text()
@@ -43,7 +43,7 @@ def test_tum_is_what_evo_reads(calibration, exported):
     assert stamps == found['stamp_ns'].tolist()
 
 
-def test_evo_itself_reads_it(calibration, exported):
+def test_evo_reads_the_tum_file(calibration, exported):
     files = pytest.importorskip('evo.tools.file_interface', reason='no evo: pip install ".[dev]"')
     found = files.read_tum_trajectory_file(str(exported / 'trajectory.tum'))
     whole, details = found.check()
@@ -54,7 +54,7 @@ def test_evo_itself_reads_it(calibration, exported):
 
 
 @pytest.mark.parametrize('name', ['trajectory', 'states', 'residuals'])
-def test_csv_holds_every_digit(calibration, exported, name):
+def test_csv_contains_all_digits(calibration, exported, name):
     with (exported / f'{name}.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     for column, values in getattr(calibration, name)().items():
@@ -62,7 +62,7 @@ def test_csv_holds_every_digit(calibration, exported, name):
             np.array([row[column] for row in rows]).astype(values.dtype), values)
 
 
-def test_parquet_holds_every_digit(calibration, tmp_path):
+def test_parquet_contains_all_digits(calibration, tmp_path):
     parquet = pytest.importorskip('pyarrow.parquet', reason='pip install pandas pyarrow')
     calibration.export(tmp_path / 'residuals.parquet')
     table = parquet.read_table(tmp_path / 'residuals.parquet')
@@ -83,7 +83,7 @@ def test_kml_is_a_line_of_the_track(calibration, exported):
     np.testing.assert_allclose(triples[:, 1], pose['latitude_deg'], atol=6e-9)
 
 
-def test_mcap_is_a_bag(calibration, exported):
+def test_mcap_is_a_readable_bag(calibration, exported):
     with AnyReader([exported / 'debug.mcap']) as bag:
         found = {}
         for connection, stamp, raw in bag.messages():
@@ -113,7 +113,7 @@ def test_mcap_is_a_bag(calibration, exported):
         np.testing.assert_array_equal(values[:, names.index(sigma)], left['sigma'][one])
 
 
-def test_foxglove_draws_what_the_mcap_holds(exported):
+def test_foxglove_layout_shows_topics_of_the_mcap(exported):
     layout = shown.foxglove('odocal_result_foxglove.json')['configById']
     topics, drawn = set(layout['map!track']['topicColors']), {}
     for panel in layout.values():
@@ -133,7 +133,7 @@ def test_foxglove_draws_what_the_mcap_holds(exported):
                     assert np.isfinite(operator.attrgetter(field)(message))
 
 
-def test_the_map_has_one_scale_and_a_true_bar(calibration, exported):
+def test_the_map_has_one_scale_and_a_correct_scale_bar(calibration, exported):
     """The bar against the geodesic on the ellipsoid; a degree of both axes in metres a pixel."""
     figure = map_figure(features(1, calibration.result.legs[0], 400))
     ax, = figure.axes
@@ -169,7 +169,7 @@ def test_rerun_reads_what_was_written(calibration, tmp_path):
     assert found['/leg_1/map'].is_static
 
 
-def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
+def test_the_command_writes_exports_next_to_the_results(town, tmp_path, capsys):
     out = tmp_path / 'out'
     argv = ['replay', str(town[1]), '--method', 'two_point', '--leg', '0:', '--output', str(out)]
     assert main([*argv, '--export', 'residual.csv']) == 2
@@ -182,7 +182,7 @@ def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
     assert (out / 'residuals.csv').exists()
 
 
-def test_without_pyarrow_the_line_that_installs_it_is_said(calibration, tmp_path, monkeypatch):
+def test_without_pyarrow_the_error_states_how_to_install_it(calibration, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__('sys').modules, 'pyarrow', None)
     with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
         calibration.export(tmp_path / 'residuals.parquet')

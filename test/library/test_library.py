@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The library on a simulated drive: against its truth, and against what the commands print."""
+"""The library on a simulated drive: against its truth and the output of the commands."""
 
 import json
 import sys
@@ -37,7 +37,7 @@ def printed(capsys, *argv):
     return json.loads(capsys.readouterr().out)
 
 
-def test_the_command_gives_what_the_function_gives(town, calibration, tmp_path, capsys):
+def test_command_and_function_give_the_same_result(town, calibration, tmp_path, capsys):
     bag = town[1]
     reported = printed(
         capsys, 'replay', bag, '--config', bag.parent / 'calibrator.yaml', '--output',
@@ -48,7 +48,7 @@ def test_the_command_gives_what_the_function_gives(town, calibration, tmp_path, 
     assert saved == out
 
 
-def test_values_are_those_of_the_drive(town, calibration):
+def test_values_agree_with_the_true_ones(town, calibration):
     truth = town[0].truth
     for name, true in (('scale_factor', truth.scale), ('yaw_mounting_angle', truth.yaw),
                        ('pitch_mounting_angle', truth.pitch)):
@@ -58,8 +58,8 @@ def test_values_are_those_of_the_drive(town, calibration):
     assert str(calibration).startswith('ACCEPTED')
 
 
-def test_the_trajectory_is_the_motion(town, calibration):
-    """A smoothed track errs by less than its fixes of 1.5 m."""
+def test_trajectory_agrees_with_the_true_motion(town, calibration):
+    """Errors of a smoothed track are smaller than those of its fixes of 1.5 m."""
     drive, found = town[0], calibration.trajectory()
     state = drive.motion.at((found['stamp_ns'] - drive.options.start_ns) * 1e-9)
     metres = 6.37e6 * np.hypot(np.deg2rad(found['latitude_deg']) - state.latitude, np.cos(
@@ -73,7 +73,7 @@ def test_the_trajectory_is_the_motion(town, calibration):
     assert set(found['leg']) == {1}
 
 
-def test_biases_are_those_of_the_drive(town, calibration):
+def test_biases_agree_with_the_true_ones(town, calibration):
     found = calibration.states()
     for i, axis in enumerate('xyz'):
         sigma = calibration.sigmas[f'gyro_bias_{axis}']
@@ -86,8 +86,8 @@ def test_biases_are_those_of_the_drive(town, calibration):
     assert np.abs(found['roll']).max() < np.deg2rad(1.0)      # the road is level
 
 
-def test_of_a_rejected_drive_the_values_are_there_and_none(town, tmp_path):
-    """An IMU that is turned by a right angle: no leg is computed, so no method gave a value."""
+def test_values_of_a_rejected_drive_are_none(town, tmp_path):
+    """With an IMU that is rotated by 90 deg no leg is computed, so no method gives a value."""
     turned = calibrate_bag(town[1], config={'imu.mounting_rpy': (0.0, 0.0, np.pi / 2)})
     assert turned.verdict.value == 'rejected'
     assert not turned.result.estimates
@@ -102,7 +102,7 @@ def of(found, sensor, component):
     return {name: column[rows] for name, column in found.items()}
 
 
-def test_residuals_of_the_track_are_those_of_the_check(calibration):
+def test_residuals_of_the_track_agree_with_the_result(calibration):
     found, check = calibration.residuals(), calibration.to_dict()['check']
     for name, sensor in (('after', 'track'), ('before', 'track_before')):
         along, left = (of(found, sensor, component) for component in ('along', 'left'))
@@ -113,7 +113,7 @@ def test_residuals_of_the_track_are_those_of_the_check(calibration):
 
 
 def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
-    """Of each second as many; nothing is left over but noise, of which the fit takes a part."""
+    """The same number per second; residuals are noise, of which the fit removes a part."""
     found, seconds = calibration.residuals(), len(calibration.states()['t_s']) - 1
     residuals = calibration.result.legs[0].methods['smoother'].details['residuals']
     for sensor, unit, rows in (('fix', 'm', residuals['fixes']), ('odometer', 'm', seconds),
@@ -132,7 +132,7 @@ def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
     np.testing.assert_array_equal(one['stamp_ns'], calibration.states()['stamp_ns'][1:])
 
 
-def test_of_a_method_without_a_fit_the_track_is_left(town):
+def test_residuals_of_a_method_without_a_fit_are_of_the_track_only(town):
     found = calibrate_bag(town[1], config={'method': 'two_point'}, legs='0:').residuals()
     assert set(found['sensor']) == {'track', 'track_before'}
 
@@ -144,7 +144,7 @@ def test_fixes_that_end_in_the_middle_of_a_bag_are_stated(tmp_path):
     texts = [reason.text for reason in calibrate_bag(**half).reasons]
     (text,) = (text for text in texts if 'before the last topic' in text)
     assert text.startswith('fix ends')
-    # a requested leg is as requested
+    # a leg given by the user is used as given
     assert not [r for r in calibrate_bag(**half, legs='0:90').reasons
                 if 'before the last topic' in r.text]
 
@@ -157,13 +157,13 @@ def test_a_table_has_a_row_for_each_value(calibration):
     assert table.loc['scale_factor', 'unit'] == 'm/pulse'
 
 
-def test_without_pandas_the_line_that_installs_it_is_said(calibration, monkeypatch):
+def test_without_pandas_the_error_states_how_to_install_it(calibration, monkeypatch):
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
         calibration.to_frame()
 
 
-def test_figures_draw_the_leg(calibration):
+def test_figures_show_the_leg(calibration):
     from matplotlib.figure import Figure
     ax, lower = Figure().subplots(2)
     assert calibration.plot_track(ax) is ax
@@ -179,7 +179,7 @@ def test_figures_draw_the_leg(calibration):
         calibration.plot_track(ax, leg=2)
 
 
-def test_a_result_without_a_track_says_so(calibration):
+def test_a_result_without_a_track_is_reported(calibration):
     from dataclasses import replace
     empty = Calibration(replace(calibration.result, legs=()))
     for series in (empty.trajectory, empty.states, empty.residuals):
@@ -187,7 +187,7 @@ def test_a_result_without_a_track_says_so(calibration):
             series()
 
 
-def test_samples_of_a_bag_are_those_sent(town):
+def test_samples_of_a_bag_equal_the_messages(town):
     drive, bag = town
     found = read_bag(bag)
     np.testing.assert_array_equal(found.samples('imu').w_i, drive.imu.w_i)
@@ -198,7 +198,7 @@ def test_samples_of_a_bag_are_those_sent(town):
     assert found.spans([]) == [(found.legs()[0].start_ns, found.legs()[0].stop_ns)]
 
 
-def test_settings_may_come_in_any_form(town):
+def test_settings_are_accepted_in_each_form(town):
     path = town[1].parent / 'calibrator.yaml'
     names = {'imu.grade': 'tactical', 'leg.standstill': 3.0}
     # as text: since Python 3.13 dataclasses with a NaN are unequal
@@ -213,26 +213,26 @@ def test_settings_may_come_in_any_form(town):
 
 @pytest.mark.parametrize(('legs', 'seconds'), [
     ('10:70', [60]), (['10:70', '80:90'], [60, 10]), ((10, 70), [60]), ([(10, 70.5)], [60.5])])
-def test_legs_may_come_in_any_form(town, legs, seconds):
+def test_legs_are_accepted_in_each_form(town, legs, seconds):
     from odocal_ros.library.arguments import legs_of
     found = [(leg.stop_ns - leg.start_ns) * 1e-9 for leg in legs_of(legs)]
     assert found == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize('legs', [[5.0], [(1, 2, 3)], '70:10', ['a:b']])
-def test_legs_that_are_none_are_refused(town, legs):
+def test_invalid_legs_are_refused(town, legs):
     with pytest.raises(OdocalError, match='leg'):
         calibrate_bag(town[1], legs=legs)
 
 
-def test_what_is_said_on_the_way_is_kept(town):
+def test_notes_of_the_reader_are_in_the_result(town):
     bag = town[1]
     found = calibrate_bag([bag, bag], config={'method': 'two_point'}, legs='0:')
     assert found.notes == (f'{bag} is given twice; it is read once',)
     assert len(found.result.legs) == 1
 
 
-def test_a_plan_is_what_the_command_prints(capsys):
+def test_a_plan_equals_the_output_of_the_command(capsys):
     reported = printed(
         capsys, 'plan', '--distance', 500, '--speed', 10, '--turns', 2, '--imu-grade',
         'tactical', '--fix-sigma', 1, '--set', 'method=two_point')
@@ -244,7 +244,7 @@ def test_a_plan_is_what_the_command_prints(capsys):
         plan(speed=10)
 
 
-def test_a_comparison_is_what_the_command_prints(calibration, tmp_path, capsys):
+def test_a_comparison_equals_the_output_of_the_command(calibration, tmp_path, capsys):
     calibration.save(tmp_path / 'a')
     calibration.save(tmp_path / 'b')
     reported = printed(capsys, 'compare', tmp_path / 'a', tmp_path / 'b')
@@ -256,7 +256,7 @@ def test_a_comparison_is_what_the_command_prints(calibration, tmp_path, capsys):
                for change in same.changes for entry in change.entries)
 
 
-def test_an_option_that_is_none_is_told():
+def test_an_unknown_option_is_refused_by_name():
     with pytest.raises(OdocalError, match='durations'):
         simulate('town', durations=3.0)
 
@@ -265,7 +265,7 @@ def test_an_option_that_is_none_is_told():
     (b'\xff',), ('\0',), (3.5,), (None,), ([],), ('x' * 5000,), ('{bag}', 3), ('{bag}', None, 3),
     ('{bag}', None, '\0'), ('{bag}', None, None, 3), ('{bag}', {'imu_2': '/x'}),
     ('{bag}', {3: '/x'})])
-def test_arguments_that_make_no_sense_are_usage_errors(odd, tmp_path):
+def test_invalid_arguments_are_usage_errors(odd, tmp_path):
     from odocal_ros.errors import BadUsage
     from odocal_ros.library.calibrate_bag import calibrate_bag
     args = [str(tmp_path) if one == '{bag}' else one for one in odd]

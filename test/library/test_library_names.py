@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The names that other programs use: they stay, with their arguments."""
+"""The public names and their arguments do not change."""
 
 import inspect
 import subprocess
@@ -31,13 +31,13 @@ DATA = {'result', 'config', 'inputs', 'notes', 'created', 'verdict', 'reasons', 
 
 
 def untyped(function) -> str:
-    """Return a signature without its annotations, which may become better."""
+    """Return a signature without its annotations, which may change."""
     found = inspect.signature(function)
     bare = [p.replace(annotation=p.empty) for p in found.parameters.values()]
     return str(found.replace(parameters=bare, return_annotation=found.empty))
 
 
-def test_names_and_arguments_stay():
+def test_public_names_and_arguments_are_unchanged():
     assert set(odocal_ros.__all__) == {*SIGNATURES, 'Calibration', 'Comparison', 'Config',
                                        'OdocalError', 'Planned', 'Recording'}
     assert {name: untyped(getattr(odocal_ros, name)) for name in SIGNATURES} == SIGNATURES
@@ -47,7 +47,7 @@ def test_names_and_arguments_stay():
     assert set(dir(odocal_ros)) >= set(odocal_ros.__all__)
 
 
-def test_each_name_has_an_example_no_room_of_its_name_and_others_are_errors():
+def test_public_names_are_documented_and_differ_from_modules():
     for name in SIGNATURES:
         assert 'Raises' in getattr(odocal_ros, name).__doc__, name
     from test_border import PACKAGE
@@ -57,7 +57,7 @@ def test_each_name_has_an_example_no_room_of_its_name_and_others_are_errors():
         _ = odocal_ros.calibrate_bags
 
 
-def test_the_first_page_imports_nothing():
+def test_importing_the_package_does_not_import_numpy():
     probe = 'import odocal_ros, sys; print("numpy" in sys.modules, odocal_ros.Config.__name__)'
     assert subprocess.check_output([sys.executable, '-c', probe],
                                    text=True).split() == ['False', 'Config']

@@ -27,7 +27,7 @@ def drive(config, start=(0.3, 0.4, 2.0), late=0, scale=1.0, noise=0.0):
     """
     Return (n, 6) t, x, y, heading, speed, turn rate until the route is driven.
 
-    late : commands in steps.   scale : of what the robot does, over the command.
+    late : commands in steps.   scale : motion of the robot over the command.
     noise : m, of the pose.
     """
     route, rng = route_of(config, start[:2]), np.random.default_rng(1)
@@ -72,12 +72,12 @@ def test_a_robot_stays_near_the_route_and_keeps_the_limits(pattern, late, scale,
 
 
 @pytest.mark.parametrize(('pattern', 'length', 'left', 'right'), [
-    # 5 m by 4 m inside the margin: path, m, and turns, in parts of a full one. The square has
+    # 5 m by 4 m inside the margin: path, m, and turns, in full turns. The square has
     # three corners to each side, and half turns in between to the left, right, left
     ('straight', 4 * 5.0, 2 / 2, 1 / 2),
     ('square', 2 * 8 * 4.0, 2 * 3 / 4 + 2 / 2, 2 * 3 / 4 + 1 / 2),
     ('figure_eight', 8 * math.pi * 1.25, 2, 2)])
-def test_length_and_turns_are_those_of_the_closed_form(pattern, length, left, right):
+def test_length_and_turns_agree_with_the_closed_form(pattern, length, left, right):
     config = settings(pattern=pattern, rounds=2)
     route = route_of(config, (0.3, 0.4))[1:]
     assert sum(piece.length for piece in route) == pytest.approx(length)
@@ -92,7 +92,7 @@ def test_length_and_turns_are_those_of_the_closed_form(pattern, length, left, ri
     assert still.sum() * DT >= (sum(p.rests for p in route) - 1) * config.rest - 1e-9
 
 
-def test_pieces_are_located_on_arcs_by_their_geometry():
+def test_positions_on_arcs_are_located_by_geometry():
     for piece in route_of(settings(pattern='figure_eight'), (0.0, 0.0))[1:]:
         radius = 1 / piece.curvature
         centre = (piece.x - radius * math.sin(piece.heading),
@@ -108,7 +108,7 @@ def test_pieces_are_located_on_arcs_by_their_geometry():
     ({'rectangle': (0.0, 0.0, 1.4, 9.0)}, 'the pattern has 0.40 m, required: 0.5 m'),
     ({'rectangle': (0.0, 0.0, 1.0)}, 'rectangle has 3 values'),
     ({'rectangle': ()}, 'rectangle has 0 values')])
-def test_a_rectangle_that_cannot_be_is_refused(given, message):
+def test_an_impossible_rectangle_is_refused(given, message):
     with pytest.raises(BadConfig, match=message):
         route_of(settings(**given), (0.0, 0.0))
 
@@ -119,12 +119,12 @@ def test_a_rectangle_that_cannot_be_is_refused(given, message):
     ({'pose': (5.01, 0.0, 0.0)}, 'outside the rectangle, at x 5.01 m'),
     ({'pose': (0.0, -2.01, 0.0)}, 'outside'), ({'pose': (math.nan, 0.0, 0.0)}, 'outside'),
     ({'pose': (0.0, 0.0, math.nan)}, 'no heading'), ({'driven_s': 600.1}, 'timeout of 600 s')])
-def test_why_a_robot_stops(change, message):
+def test_a_robot_stops_with_a_reason(change, message):
     given = {'pose': (0.0, 0.0, 0.0), 'age_s': 0.1, 'rectangle': rectangle_of(settings()),
              'bumped': False, 'driven_s': 1.0, 'timeout_s': 600.0} | change
     assert message in stop_cause(**given)
     assert bool(stop_cause(**given)) == bool(message)
 
 
-def test_corners_in_any_order_are_the_same_rectangle():
+def test_corners_in_any_order_give_the_same_rectangle():
     assert rectangle_of(settings(rectangle=(5.0, -2.0, -1.0, 3.0))) == BOX

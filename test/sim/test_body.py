@@ -19,7 +19,7 @@ pytestmark = pytest.mark.core
 KERBS = ((5.0, 0.08), (9.0, -0.08))
 
 
-def test_slopes_are_derivatives_and_chords_their_means():
+def test_slopes_are_derivatives_of_the_height_and_chords_are_means():
     road, h = Hills(0.03, 70.0, KERBS), 1e-5
     s = np.linspace(4.9, 9.7, 600)
     _, by, by2 = road(s)
@@ -38,7 +38,7 @@ def test_slopes_are_derivatives_and_chords_their_means():
     assert_allclose(chord, hill.chord(s, 0.5)[0] + kerbs.chord(s, 0.5)[0], atol=1e-15)
 
 
-def test_a_drive_over_kerbs_climbs_them_with_its_body_on_both_axles():
+def test_the_body_climbs_kerbs_with_both_axles():
     real = Real(kerbs=0.08, kerb_distance=2.0, wheelbase=0.5)
     motion = motion_of(resolved(SimOptions(scenario='yard', duration=120.0, real=real)))
     t = np.arange(0.0, 120.0, 0.05)
@@ -50,7 +50,7 @@ def test_a_drive_over_kerbs_climbs_them_with_its_body_on_both_axles():
     assert_allclose(np.arcsin(x_n[:, 2]), motion.hills.chord(state.travel, 0.5)[0], atol=1e-5)
 
 
-def test_a_cross_slope_leans_the_vehicle_and_turns_gravity_into_its_side():
+def test_a_cross_slope_rolls_the_vehicle_and_gives_lateral_gravity():
     lean = np.radians(2.0)
     drive = simulate(SimOptions(scenario='yard', duration=120.0, imu_grade='perfect', pitch=0.0,
                                 yaw=0.0, real=Real(cross_slope=lean)))
@@ -59,10 +59,10 @@ def test_a_cross_slope_leans_the_vehicle_and_turns_gravity_into_its_side():
     roll = np.arctan2(drive.imu.f_i[still, 1], drive.imu.f_i[still, 2])
     want = lean * np.sin(2 * np.pi * drive.motion.at(t[still]).travel / 20.0)
     assert np.ptp(want) > lean / 2
-    assert_allclose(roll, want, atol=1e-5)      # the Earth's turn has no force at rest
+    assert_allclose(roll, want, atol=1e-5)      # the Earth rate has no force at rest
 
 
-def test_the_contact_of_the_wheels_does_not_slide_in_a_banked_curve():
+def test_the_wheel_contact_has_no_sideslip_in_a_banked_curve():
     real = Real(banking=0.5)
     options = resolved(SimOptions(scenario='oval', odometer_lever_arm=(0.0, 0.0, -0.3), real=real))
     motion = motion_of(options)
@@ -94,7 +94,7 @@ def test_an_oval_turns_left_by_half_a_turn_at_each_end_and_closes():
 SQUAT, ROLL = 0.003, 0.009     # rad per m/s^2
 
 
-def test_springs_answer_a_ramp_as_the_equation_does():
+def test_springs_respond_to_a_ramp_by_the_closed_form():
     t = np.arange(0, 5, 0.02)
     y, dy = body.sprung_response(0.7 + 0.4 * t, 0.02)
     w, z = body.FREQUENCY, body.DAMPING
@@ -114,20 +114,20 @@ def bends():
                   tilt=body.tilts(speed, rate, Real(squat=SQUAT, body_roll=ROLL)))
 
 
-def test_the_nose_rises_and_the_body_leans_outwards():
+def test_the_body_pitches_up_when_accelerating_and_rolls_outwards_in_turns():
     motion = bends()
-    t = np.array([3.0, 9.0])        # steady push for some 1.5 s each
+    t = np.array([3.0, 9.0])        # constant acceleration for some 1.5 s each
     x_n, y_n = (np.moveaxis(attitude(motion.at(t)) @ body.rotation(motion, t), -1, 0)[k]
                 for k in (0, 1))
     push, side = 10 / 3, 10 * 0.8 / 3.5
-    # what is left of the swing, e^(-z w 1 s) of it, and of the ramp
+    # the rest of the oscillation, e^(-z w 1 s) of it, and of the ramp
     assert x_n[0, 2] == pytest.approx(SQUAT * push, rel=0.15)
     assert y_n[1, 2] == pytest.approx(ROLL * side, rel=0.15)      # the left side is up
 
 
-def test_the_imu_on_the_body_feels_how_its_place_moves():
+def test_the_imu_measures_the_motion_of_its_place_on_the_body():
     motion, h, arm = bends(), 1e-4, np.array([0.7, -0.4, 1.1])
-    t = np.arange(1.5, 17.0, 0.01)      # as an IMU of 100 Hz
+    t = np.arange(1.5, 17.0, 0.01)      # like an IMU at 100 Hz
     stiff = Motion(motion.speed, motion.yaw_rate, motion.start)
     w, f = body.imu_output(motion, motion.at(t), arm)
     R, before, after = (body.rotation(motion, t + k * h) for k in (0, -1, 1))
@@ -137,7 +137,7 @@ def test_the_imu_on_the_body_feels_how_its_place_moves():
     want = np.einsum('nij,ni->nj', R, w_v) + np.stack([spin[:, 2, 1], spin[:, 0, 2],
                                                        spin[:, 1, 0]], -1)
     assert_allclose(w, want, atol=1e-6)
-    # f: second difference of the place that the body takes the IMU to, in a stiff vehicle's axes
+    # f: second difference of the IMU position on the body, in axes of a rigid vehicle
     a_arm = (after + before - 2 * R) @ arm / h**2
     rate = (after - before) @ arm / (2 * h)
     _, f_0 = body.imu_output(stiff, stiff.at(t), (0.0, 0.0, 0.0))
@@ -147,15 +147,15 @@ def test_the_imu_on_the_body_feels_how_its_place_moves():
     place = R @ arm
     want = np.einsum('nij,ni->nj', R, f_0 + a_arm + 2 * np.cross(w_0, rate)
                      + np.cross(dw, place) + np.cross(w_0, np.cross(w_0, place)))
-    # what the turn rate's derivative by differences misses where its flank begins, w" dt / 2,
-    # over the up to 4 cm that the IMU is moved; round-off of the second difference is 1e-8
+    # error of the turn rate's derivative by differences at the begin of its ramp, w" dt / 2,
+    # times the IMU displacement of up to 4 cm; round-off of the second difference is 1e-8
     assert_allclose(f, want, atol=(6 * 0.8 / 3.5 / 1.5**2) * 0.01 / 2 * 0.04)
 
 
-def test_a_rear_axle_drifts_outwards_by_what_pushes_it():
+def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
     options = resolved(SimOptions(scenario='town', duration=200.0, real=Real(sideslip=0.004)))
     motion = motion_of(options)
-    state = motion.at(np.arange(0, 200, 0.1))      # where the drift is as computed
+    state = motion.at(np.arange(0, 200, 0.1))      # where the sideslip is at the computed value
     side = state.speed * state.yaw_rate
     assert np.abs(side).max() > 1
     assert_allclose(state.sway[:, 0], -0.004 * side * state.speed, atol=1e-12)
@@ -164,7 +164,7 @@ def test_a_rear_axle_drifts_outwards_by_what_pushes_it():
         scenario='town', duration=200.0))).at(state.t).travel, atol=1e-9)
 
 
-def test_on_a_crossfall_the_body_leans_and_the_axle_drifts_downhill():
+def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
     fall, straight = 0.025, {'scenario': 'straight', 'duration': 190.0}
     real = Real(crossfall=fall, body_roll=ROLL, sideslip=0.004)
     motion = motion_of(resolved(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
@@ -176,7 +176,7 @@ def test_on_a_crossfall_the_body_leans_and_the_axle_drifts_downhill():
     assert_allclose(state.sway[:, 0], -0.004 * force * state.speed, atol=1e-12)
 
 
-def test_a_bus_kneels_at_its_stops_on_the_way_only():
+def test_a_bus_kneels_only_at_stops_within_the_drive():
     down = np.radians(2.0)
     options = SimOptions(scenario='town', duration=300.0, real=Real(kneeling=down))
     motion = motion_of(resolved(options))
@@ -186,7 +186,7 @@ def test_a_bus_kneels_at_its_stops_on_the_way_only():
     begin, end = (np.flatnonzero(np.diff(np.r_[0, still, 0]) == sign) for sign in (1, -1))
     assert len(begin) > 3
     assert roll[begin[0]:end[0]].max() < 1e-12
-    assert np.abs(roll[begin[-1] + 100:]).max() < 1e-3      # of the last swing
+    assert np.abs(roll[begin[-1] + 100:]).max() < 1e-3      # of the last oscillation
     for a, b in zip(begin[1:-1], end[1:-1], strict=True):
         most = min((b - a) * 0.01 / body.KNEELING_TIME, 1.0)
         # springs overshoot by exp(-pi z / sqrt(1 - z^2)) of a step, of a ramp by far less

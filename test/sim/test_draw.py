@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drawn vehicles: each effect alone is the one in the whole, and every draw can be driven."""
+"""Drawn vehicles: an effect alone is that of the whole vehicle; every draw can be driven."""
 
 from dataclasses import asdict
 from itertools import cycle
@@ -18,7 +18,7 @@ from odocal_ros.sim.truth import settings
 pytestmark = pytest.mark.slow
 
 
-def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
+def test_a_clean_vehicle_has_no_imperfections_and_the_true_settings():
     options, there = draw_vehicle(7, 'town', 'industrial', ())
     assert options.real == Real()
     assert there == ()
@@ -29,13 +29,13 @@ def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
 
 
 @pytest.mark.parametrize('name', EFFECTS)
-def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
+def test_an_effect_alone_changes_the_drive_and_is_that_of_the_whole(name):
     seeds = range(100, 140)
     alone = [draw_vehicle(seed, 'town', 'industrial', (name,)) for seed in seeds]
     clean = [draw_vehicle(seed, 'town', 'industrial', ())[0] for seed in seeds]
     assert sum(one != bare for (one, _), bare in zip(alone, clean, strict=True)) >= 10
     if name in (*ODOMETER_EFFECTS, 'fix_stamps', 'multipath', 'outages'):
-        return                    # alone they are made sure of
+        return                    # alone they always occur
     for seed, (one, there) in zip(seeds, alone, strict=True):
         whole, names = draw_vehicle(seed, 'town', 'industrial')
         assert not there or name in names
@@ -45,7 +45,7 @@ def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
 
 
 @pytest.mark.parametrize('name', RARE)
-def test_a_rare_effect_is_drawn_where_it_is_named_only(name):
+def test_a_rare_effect_is_drawn_only_if_it_is_named(name):
     one, there = draw_vehicle(7, 'town', 'industrial', (name,))
     assert there == (name,)
     assert one != draw_vehicle(7, 'town', 'industrial', ())[0]
@@ -67,18 +67,18 @@ def test_a_drawn_vehicle_can_be_driven(kind, grade):
     assert (again.fix.latitude == drive.fix.latitude).all()
 
 
-def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
+def test_settings_contain_zero_lever_arms_and_wrong_grades():
     vehicles = [draw_vehicle(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0]
                 for seed in range(60)]
     zero = [o for o in vehicles if np.allclose(np.add(o.antenna_lever_arm,
                                                       o.real.antenna_arm_error), 0)]
     assert len(zero) == pytest.approx(0.3 * 60, abs=5 * np.sqrt(60 * 0.21))
-    # consumer cannot be too modest: a third of the draws says industrial
+    # consumer is the lowest grade: a third of the draws states industrial
     wrong = [o for o in vehicles if o.real.configured_grade == 'industrial']
     assert len(wrong) == pytest.approx(60 / 3, abs=5 * np.sqrt(60 * 2 / 9))
 
 
-def test_what_is_given_is_what_effects_go_by():
+def test_given_options_determine_the_effects():
     arm = (1.0, 0.2, 1.5)
     seed = next(s for s in range(50) if np.allclose(np.add(
         (o := draw_vehicle(s, 'town', 'consumer')[0]).antenna_lever_arm,
@@ -96,6 +96,6 @@ def test_what_is_given_is_what_effects_go_by():
     ({'effects': ('rust',)}, '--effect rust: required: one of triads'),
     ({'effects': ('coarse_sped',)}, '--effect coarse_sped: did you mean coarse_speed'),
     ({'grade': 'navigation'}, 'required: one of consumer')])
-def test_what_cannot_be_drawn_is_said(change, message):
+def test_invalid_draws_are_refused_with_a_message(change, message):
     with pytest.raises(BadUsage, match=message):
         draw_vehicle(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)

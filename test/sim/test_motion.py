@@ -22,18 +22,18 @@ from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
 pytestmark = pytest.mark.core
 
 
-def test_ramps_and_turns_have_their_speed_path_and_angle():
+def test_ramps_and_turns_have_the_requested_speed_path_and_angle():
     speed = chain(hold(3) + ramp(10, 12, 1.0) + hold(5)).integral()
     # symmetric about its middle: mean speed 6 m/s over 10 s, then 12 m/s for 5 s
     assert speed([0, 3, 8, 13, 18, 99]) == pytest.approx([0, 0, 6, 12, 12, 12], abs=1e-13)
     assert speed.integral()(18.0) == pytest.approx(6 * 10 + 12 * 5, abs=1e-12)
-    # of a duration below both blends, these are shorter: the gain stays
+    # blends are shorter if both exceed the duration: the gain is the same
     assert chain(ramp(1.5, 3, 1.0)).integral()([0.75, 1.5]) == pytest.approx([1.5, 3.0])
     for blend in (0.5, 2.0, 4.0):
         assert chain(turn(8, 1.3, blend)).integral()(8.0) == pytest.approx(1.3, abs=1e-14)
 
 
-def test_derivative_undoes_the_integral():
+def test_derivative_is_the_inverse_of_the_integral():
     rate = chain([smooth(2, 0, 3), smooth(5, 3, -1), *hold(1)])
     t = np.linspace(0.01, 7.99, 1000)
     assert_allclose(rate.integral().derivative()(t), rate(t), atol=1e-14)
@@ -41,7 +41,7 @@ def test_derivative_undoes_the_integral():
     assert_allclose((rate(t + h) - rate(t - h)) / (2 * h), rate.derivative()(t), atol=3e-10)
 
 
-def test_a_jump_has_the_mean_of_its_sides():
+def test_a_step_has_the_mean_of_both_sides():
     acceleration = chain(hold(300) + ramp(40, 20, 0.0) + hold(1))
     at = np.array([299.99, 300.0, 300.00000000000006, 300.01, 340.0])
     assert acceleration.mean(at) == pytest.approx([0, 0.25, 0.25, 0.5, 0.25])
@@ -63,7 +63,7 @@ def lively(start=HOME, slope=0.05, **sway):
 
 
 def swaying():
-    """Return ``lively`` that slides to the side by up to 1 m/s and heaves half as much."""
+    """Return ``lively`` with sideslip of up to 1 m/s and half as much vertical velocity."""
     side = chain(hold(2) + turn(8, 4.0, 2.0) + hold(10))
     rise = chain(hold(4) + turn(6, 1.5, 2.0) + hold(10))
     return lively(sway=(side, rise))
@@ -82,7 +82,7 @@ def test_the_papers_drive_is_11200_m_of_loxodrome():
     end = motion.at([motion.duration])
     assert motion.distance == pytest.approx(11_200, abs=1e-9)
     north = pyproj.Geod(ellps='WGS84').inv(0, 40, 0, np.degrees(end.latitude[0]))[2]
-    # 1e-12 of 11 km of summed rounding, and Geod's own nanometres
+    # summed rounding, 1e-12 of 11 km, and some nanometres of Geod
     assert north == pytest.approx(11_200 * np.sqrt(0.5), abs=2e-8)
 
     def isometric(latitude):
@@ -94,10 +94,10 @@ def test_the_papers_drive_is_11200_m_of_loxodrome():
 
 def integrate(motion, rate, arm):
     """
-    Return how far an Earth-fixed strapdown strays from the truth over the drive, m and rad.
+    Return the errors of an Earth-fixed strapdown navigation over the drive, m and rad.
 
     Second order in the step: mean rate as rotation vector, force turned by the mean attitude,
-    trapezoid for the rest. Written apart from the package's own navigation.
+    trapezoid for the rest. Independent of the navigation in the package.
     """
     from odocal_ros.nav.geodesy import geodetic_from_ecef
     n = int(motion.duration * rate) + 1
@@ -128,13 +128,13 @@ def integrate(motion, rate, arm):
 
 @pytest.mark.parametrize(('arm', 'drive'), [
     ((0.0, 0.0, 0.0), lively), (ARM, lively), (ARM, swaying)])
-def test_an_imu_integrated_back_reaches_the_truth_with_second_order(arm, drive):
+def test_integrated_imu_converges_to_the_truth_with_second_order(arm, drive):
     misses = [integrate(drive(), rate, arm) for rate in (25, 50, 100)]
     for coarse, fine in zip(misses, misses[1:], strict=False):
-        # a halved step leaves a quarter; a wrong term would leave what does not shrink
+        # half of the step leaves a quarter of the error; a wrong term leaves a constant error
         assert np.linalg.norm(coarse[0]) / np.linalg.norm(fine[0]) == pytest.approx(4, rel=0.1)
         assert np.linalg.norm(coarse[1]) / np.linalg.norm(fine[1]) == pytest.approx(4, rel=0.1)
-    # Richardson: a step of no length. The next term, of fourth order, is 1.6e-3 m of the coarse
+    # Richardson: step length zero. The next term, of fourth order, is 1.6e-3 m of the coarse
     # run times (0.5 rad/s * 0.02 s)^2 = 1e-4, for the attitude 4e-6 rad times as much
     (_, _), (r2, p2), (r4, p4) = misses
     assert np.linalg.norm(r4 + (r4 - r2) / 3) < 3e-7
@@ -146,7 +146,7 @@ def test_wheels_differ_by_track_times_turn_rate():
     track = 1.6
     left, right = (0.0, track / 2, 0.0), (0.0, -track / 2, 0.0)
     apart = true_motion.contact_speed(state, right) - true_motion.contact_speed(state, left)
-    # the level itself turns against the Earth by v tan(L) / R < 2e-6 rad/s
+    # the local level turns relative to the Earth by v tan(L) / R < 2e-6 rad/s
     assert_allclose(apart, track * state.yaw_rate, atol=track * 2.1e-6)
     assert np.abs(apart).max() > 0.3
     rolled = true_motion.contact_travel(state, right) - true_motion.contact_travel(state, left)

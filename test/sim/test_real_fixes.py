@@ -22,22 +22,22 @@ TAU = 0.8
 
 
 def north(drive, times):
-    """Return how far north of the start a receiver without noise tells the antenna, m."""
+    """Return the antenna position from a receiver without noise, m north of the start."""
     options = resolved(drive)
     latitude, _, _ = real_sensors.positions(motion_of(options), np.asarray(times), options)
     return (latitude - options.latitude) * 6.36e6
 
 
 @pytest.mark.parametrize(('receiver', 'behind', 'tolerance'), [
-    # at 20 m/s the lag is tau; in the ramp of 0.5 m/s^2 since 300 s the filter has settled;
+    # at 20 m/s the lag is tau; in the ramp of 0.5 m/s^2 since 300 s the filter is in steady state;
     # 3e-3: the metres of a radian of latitude here
     ({'receiver_lag': TAU}, {450.0: 20 * TAU, 330.0: 15 * TAU - 0.5 * TAU**2}, {'rel': 3e-3}),
-    # a steady speed is followed without lag; an even acceleration with tau^2 of it
+    # no lag at constant speed; tau^2 of it at constant acceleration
     ({'receiver_tracking': TAU}, {450.0: 0.0, 330.0: 0.5 * TAU**2}, {'abs': 2e-3}),
     # at 20 m/s since 340 s: exp(-110 / 15) of it is missing
     ({'receiver_odometer': 0.02, 'receiver_odometer_time': 15.0}, {450.0: -0.02 * 20 * 15},
      {'rel': 3e-3})], ids=['lag', 'tracking', 'odometer'])
-def test_a_receiver_that_filters_is_behind_by_its_closed_form(receiver, behind, tolerance):
+def test_lag_of_a_receiver_filter_is_the_closed_form(receiver, behind, tolerance):
     filtered = replace(PAPER, real=Real(**receiver))
     for t, want in behind.items():
         late = (north(PAPER, [t]) - north(filtered, [t]))[0]
@@ -46,7 +46,7 @@ def test_a_receiver_that_filters_is_behind_by_its_closed_form(receiver, behind, 
     assert north(filtered, [0.3])[0] == pytest.approx(0, abs=1e-8)
 
 
-def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
+def test_satellite_errors_are_smoothed_by_an_odometer_in_the_receiver():
     t, options = np.arange(0.0, 4000.0), replace(PAPER, real=Real(receiver_odometer=0.01))
     white = np.random.default_rng(1).standard_normal((len(t), 3))
     left = real_sensors.fused_errors(t, white, options)
@@ -56,7 +56,7 @@ def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
     assert real_sensors.fused_errors(t, white, PAPER) is white
 
 
-def test_slow_errors_have_their_size_and_the_covariance_knows():
+def test_slow_errors_have_their_size_and_are_in_the_covariance():
     slow = ((1.2, 5.0), (0.9, 20.0))
     options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=Real(slow_errors=slow,
                                                                      stated_factor=0.5))
@@ -83,7 +83,7 @@ def test_bursts_come_and_go_smoothly():
     assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_sensors.ONSET_RANGE[0]
 
 
-def test_the_antenna_leans_with_the_body():
+def test_the_antenna_moves_with_the_roll_of_the_body():
     options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
                                   real=Real(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
@@ -93,7 +93,7 @@ def test_the_antenna_leans_with_the_body():
                      (leaning[1] - stiff[1]) * np.cos(options.latitude)) * 6.37e6
     state = motion.at(t)
     most = np.abs(state.speed * state.yaw_rate).max()
-    # 2 m times 0.01 rad per m/s^2; the springs overshoot by 37 % of a sudden push at most
+    # 2 m times 0.01 rad per m/s^2; the springs overshoot by 37 % of a step at most
     assert 0.5 < aside.max() / (2 * 0.01 * most) < 1.4
 
 
@@ -105,7 +105,7 @@ def test_fixes_are_dropped_at_random_and_stamped_late():
     assert (np.diff(real.fix.stamp_ns) > 0).all()
 
 
-def test_a_receiver_in_a_tunnel_reckons_by_its_odometer_and_is_right_after_it():
+def test_a_receiver_in_a_tunnel_uses_its_odometer_and_is_right_afterwards():
     tunnel, quiet = ((400.0, 60.0),), {'fix_sigma': 0.0, 'fix_rate': 1.0}
     wrong, right = (simulate(replace(PAPER, real=Real(tunnels=tunnel, tunnel_odometer=x,
                                                       tunnel_heading=y), **quiet))
@@ -117,7 +117,7 @@ def test_a_receiver_in_a_tunnel_reckons_by_its_odometer_and_is_right_after_it():
     since = t[inside] - t[inside][0]
     # to the north at 20 m/s; heading error grows by 0.01 rad a minute; 3e-3: metres of a radian
     assert_allclose(north_m[inside], 0.02 * 20 * since, rtol=3e-3, atol=1e-6)
-    # 1: a step's turn is that of its end
+    # 1: the heading of a step is that of its end
     assert_allclose(-east_m[inside] * np.cos(wrong.options.latitude),
                     20 * 0.01 / 60 * since**2 / 2, rtol=5e-3, atol=0.01 / 60 * 20 * 60)
     assert not north_m[~inside].any()
@@ -138,14 +138,14 @@ def times(drive):
     return sensors.stamps(drive.motion.duration, 10.0, sensors.PHASE['fix'])[1]
 
 
-def test_it_is_that_of_the_antenna():
+def test_velocity_is_that_of_the_antenna():
     drive = simulate(TOWN)
     # the height of the antenna, 51 m, over the Earth's radius: 1e-5 of 15 m/s, and rounding
     np.testing.assert_allclose(drive.velocity.velocity_n, true(drive, times(drive)), atol=5e-4)
     assert not len(simulate(replace(TOWN, velocity_sigma=None)).velocity.stamp_ns)
 
 
-def test_delay_scale_and_smoothing():
+def test_velocity_has_its_delay_scale_and_smoothing():
     late = simulate(replace(TOWN, velocity_delay=0.2)).velocity
     assert (late.stamp_ns - simulate(TOWN).velocity.stamp_ns == 200_000_000).all()
     drive = simulate(TOWN)
@@ -153,28 +153,28 @@ def test_delay_scale_and_smoothing():
     np.testing.assert_allclose(grown, 1.01 * drive.velocity.velocity_n, rtol=1e-12)
     smooth = simulate(replace(TOWN, velocity_lag=0.5)).velocity.velocity_n
     t = times(drive)
-    # first order: v + tau dv/dt = what goes in; differences over 0.2 s, kinks of 1 m/s^3 left out
+    # first order: v + tau dv/dt = input; differences over 0.2 s, without kinks of 1 m/s^3
     rate = np.gradient(smooth, t, axis=0)
     off = smooth + 0.5 * rate - drive.velocity.velocity_n
     assert np.abs(off[5:-5]).max() < 0.05
     assert np.abs(smooth - drive.velocity.velocity_n).max() > 0.3
 
 
-def test_errors_have_their_size_and_time():
+def test_velocity_errors_have_their_size_and_correlation_time():
     clean = simulate(TOWN).velocity.velocity_n
-    for time, alike in ((0.0, 0.0), (0.5, np.exp(-0.2))):
+    for time, expected in ((0.0, 0.0), (0.5, np.exp(-0.2))):
         sent = simulate(replace(TOWN, velocity_sigma=0.1, velocity_correlation_time=time)).velocity
         error = sent.velocity_n - clean
         # 3000 draws, of 0.5 s a tenth of them
         assert error.std() == pytest.approx(0.1, rel=0.1 if time else 0.04)
-        assert (error[1:] * error[:-1]).mean() / error.var() == pytest.approx(alike, abs=0.06)
+        assert (error[1:] * error[:-1]).mean() / error.var() == pytest.approx(expected, abs=0.06)
         assert (sent.variance_n == pytest.approx(0.01))
     far = simulate(replace(TOWN, velocity_outliers=0.1)).velocity.velocity_n - clean
     assert (np.abs(far).max(axis=1) > 0).mean() == pytest.approx(0.1, abs=0.04)
 
 
 @pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
-def test_fix_errors_are_what_the_covariance_says(noise, sigma):
+def test_fix_errors_agree_with_the_covariance(noise, sigma):
     options = resolved(replace(ROAD, fix_noise=noise, fix_sigma=sigma))
     errors = sensors.fix_errors(np.arange(20_000) * 0.2, options)
     stated = simulate(options).fix
@@ -186,7 +186,7 @@ def test_fix_errors_are_what_the_covariance_says(noise, sigma):
     assert set(stated.status.tolist()) == {2 if noise == 'rtk' else 0}
 
 
-def test_fix_errors_go_east_north_and_up():
+def test_fix_errors_are_applied_east_north_and_up():
     noisy, bare = (simulate(replace(ROAD, fix_sigma=sigma)) for sigma in (5.0, 0.0))
     t = (bare.fix.stamp_ns - bare.options.start_ns) * 1e-9
     errors = sensors.fix_errors(t, noisy.options)
@@ -198,7 +198,7 @@ def test_fix_errors_go_east_north_and_up():
     assert_allclose(noisy.fix.height - bare.fix.height, errors[:, 2], atol=1e-8)
 
 
-def test_correlated_fixes_keep_their_power_and_forget_slowly():
+def test_correlated_fix_errors_have_their_variance_and_correlation_time():
     options = resolved(replace(ROAD, fix_noise='correlated', fix_correlation_time=10.0))
     t = np.arange(100_000) * 0.2
     errors = sensors.fix_errors(t, options)[:, :2]
@@ -209,7 +209,7 @@ def test_correlated_fixes_keep_their_power_and_forget_slowly():
     assert together == pytest.approx(1.5**2 * np.exp(-1), abs=1.5**2 * spread)
 
 
-def test_fixes_lie_about_the_antenna():
+def test_fixes_are_positions_of_the_antenna():
     drive = simulate(replace(ROAD, fix_sigma=0.0, antenna_lever_arm=(2.0, 0.5, 1.5)))
     bare = simulate(replace(ROAD, fix_sigma=0.0))
     assert_allclose(drive.fix.height - bare.fix.height, 1.5, atol=1e-6)
@@ -217,10 +217,10 @@ def test_fixes_lie_about_the_antenna():
     east = (drive.fix.longitude - bare.fix.longitude)[0] * 6.386e6 * np.cos(np.radians(40))
     # heading 45 deg: forward 2 and left 0.5; radii to 0.2 %
     assert [east, north] == pytest.approx([1.5 / np.sqrt(2), 2.5 / np.sqrt(2)], rel=2e-3)
-    assert drive.fix.covariance_n[0, 0, 0] == sensors.SIGMA_FLOOR**2   # no receiver says zero
+    assert drive.fix.covariance_n[0, 0, 0] == sensors.SIGMA_FLOOR**2   # no receiver states zero
 
 
-def test_outliers_are_as_many_and_as_far_as_said():
+def test_outliers_have_the_configured_share_and_size():
     options = resolved(replace(ROAD, outliers=0.1, fix_sigma=0.0))
     far = np.hypot(*sensors.fix_errors(np.arange(20_000) * 0.2, options)[:, :2].T)
     # 5 sigma of a binomial share

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a real IMU: triads and the two frames they make, warmth, vibration, late stamps."""
+"""Errors of a real IMU: axes of both triads, warm-up, vibration, late stamps."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def options(**figures):
     return resolved(replace(STRAIGHT, real=Real(**figures)))
 
 
-def test_the_imu_reads_by_its_model():
+def test_imu_readings_obey_the_error_model():
     rng = make_rng(1, 'test')
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
@@ -38,7 +38,7 @@ def test_the_imu_reads_by_its_model():
         assert_allclose(f_m[k], (np.eye(3) + accel) @ f[k], atol=1e-15)
 
 
-def test_a_bias_given_is_the_bias_and_warms_along_its_curve():
+def test_a_given_bias_is_used_and_follows_its_warm_up_curve():
     given = options(gyro_bias=(0.01, -0.02, 0.03), gyro_slope=(1e-4, 0, -2e-4), warm_rise=10.0,
                     warm_time=50.0)
     drive, plain = simulate(given), simulate(STRAIGHT)
@@ -50,7 +50,7 @@ def test_a_bias_given_is_the_bias_and_warms_along_its_curve():
     assert (drive.imu.f_i == plain.imu.f_i).all()
 
 
-def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
+def test_bias_instability_starts_at_the_bias_and_is_a_markov_process():
     t = np.arange(0.0, 100.0, 0.05)
     ends = [real_sensors.drift_and_vibration(t, np.zeros(len(t)), replace(options(
         gyro_wander=0.01, wander_time=200.0), seed=seed))[0] for seed in range(300)]
@@ -62,7 +62,7 @@ def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
 
 
 @pytest.mark.parametrize('rate', [50.0, 200.0])
-def test_vibration_shakes_as_said_and_goes_nowhere(rate):
+def test_vibration_has_the_configured_size_and_no_drift(rate):
     x = real_sensors.vibration(make_rng(2, 'test'), 0.5, rate, MANY)
     # resonances 6 Hz wide: some 2 * 6 Hz draws a second
     assert x.var() / 0.25 == pytest.approx(1, rel=5 * np.sqrt(2 / (3 * MANY / rate * 12)))
@@ -89,10 +89,10 @@ def test_a_bias_steps_once_by_its_size():
     assert (accel == np.where(t >= 7.0, [[0.1], [0.0], [-0.2]], 0.0).T).all()
 
 
-def test_stamps_are_late_in_order_and_in_batches():
+def test_late_stamps_are_in_order_and_in_batches():
     ns = np.arange(MANY) * 10_000_000
     late = (real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.02, 0.003) - ns) * 1e-9
-    # stamps so far apart seldom cross: mean within 5 sigma, spread as said
+    # at this interval stamps rarely cross: mean within 5 sigma, scatter as configured
     assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
     assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
     wild = real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.02, 0.02)
@@ -104,7 +104,7 @@ def test_stamps_are_late_in_order_and_in_batches():
     assert (batch[:4] - ns[3] >= 2_000_000).all()
 
 
-def test_late_stamps_move_no_true_mark():
+def test_late_stamps_do_not_move_the_true_marks():
     plain, late = simulate(STRAIGHT), simulate(options(imu_latency=0.07))
     assert late.truth.start_ns - plain.truth.start_ns == 70_000_000
     assert (late.imu.f_i == plain.imu.f_i).all()
@@ -119,7 +119,7 @@ def test_late_stamps_move_no_true_mark():
     ({'slow_errors': ((1, 0),)}, 'required: pairs'),
     ({'warm_time': 0.0}, 'required: above 0'), ({'squat': float('nan')}, 'required: finite'),
     ({'imu_batch': 1.5}, 'a whole number, 1 or more')])
-def test_figures_that_cannot_be_are_refused(figures, message):
+def test_impossible_options_are_refused(figures, message):
     from odocal_ros.errors import BadUsage
     with pytest.raises(BadUsage, match=message):
         Real(**figures)
@@ -142,7 +142,7 @@ def test_sensor_axes_are_those_of_measured_turns_and_forces(seed):
     assert_allclose(R, np.eye(3) + cross(*theta), atol=3 * (5 * 0.02)**2)
 
 
-def test_an_instrument_turned_in_its_housing_is_one_mounted_so():
+def test_a_sensor_rotated_in_its_housing_equals_a_rotated_mounting():
     theta = np.array([0.6e-3, -1.0e-3, 0.8e-3])
     M, C_bi = cross(*theta), matrix_from_rpy([0.1, 0.2, 0.4])
     flat = tuple((C_bi.T @ M @ C_bi).ravel())
@@ -159,7 +159,7 @@ def test_an_instrument_turned_in_its_housing_is_one_mounted_so():
     assert_allclose(turned.imu.w_i, ideal.imu.w_i, atol=3 * size * w)
     assert_allclose([turned.truth.yaw, turned.truth.pitch],
                     [ideal.truth.yaw, ideal.truth.pitch], atol=3 * size)
-    # and the first order is there to be seen
+    # and the first order is significant
     assert turned.truth.yaw - 0.03 == pytest.approx(-0.8e-3, abs=0.1e-3)
     assert turned.truth.pitch - 0.01 == pytest.approx(1.0e-3, abs=0.1e-3)
     assert (turned.truth.yaw_housing, turned.truth.pitch_housing) == pytest.approx((0.03, 0.01))

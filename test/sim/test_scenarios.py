@@ -35,7 +35,7 @@ def chord(state):
     return np.hypot(north, east)
 
 
-def test_paper_is_the_papers_drive():
+def test_scenario_paper_is_the_drive_of_the_paper():
     motion, state = states('paper')
     assert motion.duration == 930
     assert motion.distance == pytest.approx(11_200, abs=1e-9)
@@ -48,7 +48,7 @@ def test_paper_is_the_papers_drive():
     assert np.degrees(options.yaw) == pytest.approx(1)
 
 
-def test_straight_is_the_methods_straight_run():
+def test_scenario_straight_is_the_straight_run_of_the_method():
     motion, state = states('straight')
     assert motion.duration == 720
     # 60 still, 25 up, 550 at 12 m/s, 25 down, 60 still
@@ -57,7 +57,7 @@ def test_straight_is_the_methods_straight_run():
     assert (state.yaw_rate == 0).all()
 
 
-def test_out_and_back_stops_at_the_far_end_and_comes_back():
+def test_out_and_back_stops_at_the_far_end_and_returns():
     motion, state = states('out_and_back')
     assert chord(state) < 60 < motion.distance / 20
     assert state.yaw[-1] - state.yaw[0] == pytest.approx(np.pi)
@@ -71,10 +71,10 @@ def test_out_and_back_stops_at_the_far_end_and_comes_back():
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_town_is_lively_and_gets_away(seed):
+def test_town_has_stops_and_turns_and_a_long_chord(seed):
     motion, state = states('town', seed=seed)
     assert motion.duration == 600
-    assert chord(state) > 0.35 * motion.distance    # the two-point method wants a fifth
+    assert chord(state) > 0.35 * motion.distance    # the two-point method requires a fifth
     assert (state.speed[:200] == 0).all()
     assert (state.speed[-150:] == 0).all()
     moves = state.speed > 0
@@ -84,7 +84,7 @@ def test_town_is_lively_and_gets_away(seed):
     assert np.degrees(np.abs(state.yaw_rate)).max() > 8
     assert np.abs(state.speed * state.yaw_rate).max() < 3.3        # m/s^2 to the side
     assert state.speed.min() >= 0
-    assert (np.abs(state.yaw_rate[~moves]) == 0).all()             # no turning on the spot
+    assert (np.abs(state.yaw_rate[~moves]) == 0).all()             # no turns on the spot
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
@@ -101,7 +101,7 @@ def test_marks_are_imu_stamps_at_rest(name):
     assert leg.imu is drive.imu
 
 
-def test_every_choice_is_filled_in():
+def test_every_option_has_a_value():
     for name in SCENARIOS:
         options = resolved(SimOptions(scenario=name))
         for field in ('duration', 'imu_grade', 'yaw', 'pitch', 'scale', 'nominal_scale',
@@ -140,15 +140,15 @@ def test_every_choice_is_filled_in():
     ({'scenario': 'out_and_back', 'duration': 200.0}, 'scenario out_and_back: .* too short'),
     ({'scenario': 'town', 'duration': 46.0}, 'scenario town: .* is too short for a stop-and-go '
      'cycle')])
-def test_what_cannot_be_driven_is_said(change, message):
+def test_impossible_drives_are_refused_with_a_message(change, message):
     with pytest.raises(BadUsage, match=message):
         simulate(replace(SimOptions(), **change))
 
 
-def test_sway_is_as_large_as_said_and_no_wheel_rolls_it():
+def test_sway_has_the_configured_size_and_is_not_in_the_wheel_travel():
     (motion, state), (bare, plain) = (states('town', sway=x) for x in (0.05, 0.0))
     fast = state.speed > 1.0
-    # draws lie at the 10 Hz of these states; 5 sigma of a variance
+    # draws are at the 10 Hz of these states; 5 sigma of a variance
     n = 2 * fast.sum()
     assert state.sway[fast].var() / 0.05**2 == pytest.approx(1, rel=5 * np.sqrt(2 / n))
     assert (state.sway[state.speed == 0] == 0).all()
@@ -160,7 +160,7 @@ def test_sway_is_as_large_as_said_and_no_wheel_rolls_it():
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_a_motorway_is_fast_long_and_gentle(seed):
+def test_scenario_motorway_is_fast_long_and_has_gentle_turns(seed):
     motion, state = states('motorway', seed=seed)
     assert motion.duration == pytest.approx(600)
     assert state.speed[[0, -1]] == pytest.approx([0, 0], abs=1e-11)
@@ -174,7 +174,7 @@ def test_a_motorway_is_fast_long_and_gentle(seed):
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_a_yard_is_slow_and_winding_and_goes_backwards_too(seed):
+def test_scenario_yard_is_slow_has_turns_and_reversing(seed):
     motion, state = states('yard', seed=seed)
     assert motion.duration == pytest.approx(600)
     assert np.abs(state.speed).max() < 2.3
@@ -187,7 +187,7 @@ def test_a_yard_is_slow_and_winding_and_goes_backwards_too(seed):
 
 
 @pytest.mark.parametrize('name', SCENARIOS)
-def test_a_drive_too_short_is_told_what_is_enough(name):
+def test_a_drive_that_is_too_short_is_refused_with_the_minimum(name):
     with pytest.raises(BadUsage, match='too short') as error:
         states(name, duration=20.0)
     enough = float(re.search(r'give (\d+) s', str(error.value))[1])
@@ -207,7 +207,7 @@ def indoor(**options):
 
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('duration', [30.0, 180.0])
-def test_a_robot_drives_straight_in_arcs_and_turns_on_the_spot(seed, duration):
+def test_a_robot_drives_straight_sections_arcs_and_turns_on_the_spot(seed, duration):
     motion = motion_of(resolved(SimOptions(scenario='indoor', seed=seed, duration=duration)))
     assert motion.duration == pytest.approx(duration)
     state = motion.at(np.arange(0.0, duration, 0.05))
@@ -226,7 +226,7 @@ def test_a_robot_drives_straight_in_arcs_and_turns_on_the_spot(seed, duration):
 
 
 @pytest.mark.parametrize('kind', LOCAL_KINDS)
-def test_a_bag_holds_the_positions_that_the_leg_has(kind, tmp_path):
+def test_a_bag_contains_the_positions_of_the_leg(kind, tmp_path):
     made = indoor(duration=40.0, reference=kind)
     leg, topic = made.leg(), REFERENCES[kind].topic
     bag = write_bag(tmp_path / 'bag', drive_topics(made))
@@ -246,14 +246,14 @@ def test_a_bag_holds_the_positions_that_the_leg_has(kind, tmp_path):
 
 
 @pytest.mark.parametrize(('kind', 'sigma'), [('mocap', 1e-3), ('total_station', 2e-3)])
-def test_errors_have_the_size_of_the_kind(kind, sigma):
+def test_position_errors_have_the_size_of_the_kind_of_source(kind, sigma):
     exact = indoor(duration=180.0, reference=kind, fix_sigma=0.0).positions()
     error = indoor(duration=180.0, reference=kind).positions() - exact
     # 1800 rows or more: 5 sigma of a standard deviation are 9 %
     assert error[:, :2].std() == pytest.approx(sigma, rel=0.1)
 
 
-def test_amcl_keeps_its_error_at_rest_and_forgets_it_with_the_path():
+def test_amcl_error_is_constant_at_rest_and_decorrelates_with_the_path():
     options = resolved(SimOptions(scenario='indoor', reference='amcl'))
     t = np.arange(0.0, 20_000.0, 1.0)
     travel = np.where(t < 10_000.0, 0.0, t - 10_000.0)
@@ -271,13 +271,13 @@ def test_slam_drifts_with_the_path_and_jumps_back():
     steps = np.diff(reference_drift(t, t, free)[:, :2], axis=0)       # at 1 m/s
     assert steps.std() == pytest.approx(0.01 * np.sqrt(0.1), rel=0.02)
     error = reference_drift(t, t, closing)[:, :2]
-    # between closures 30 s apart, in the mean: sqrt(30 m) of walk
+    # between loop closures 30 s apart on average: sqrt(30 m) of random walk
     assert 0.02 < np.abs(error).max() < 0.3
     jumps = np.hypot(*np.diff(error, axis=0).T) > 0.02
-    assert 40 < jumps.sum() < 100       # of 100 closures, those that have something to close
+    assert 40 < jumps.sum() < 100       # of 100 loop closures, those with an error to correct
 
 
-def test_wheels_slip_in_turns_on_the_spot_too():
+def test_wheels_slip_also_in_turns_on_the_spot():
     made, bare = (indoor(seed=4, duration=60.0, slip_walk=slip) for slip in (1e-3, 0.0))
     state = made.motion.at((made.odometer.stamp_ns - made.options.start_ns) * 1e-9)
     spot = (state.speed == 0.0) & (state.yaw_rate != 0.0)

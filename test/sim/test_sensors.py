@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sensors: noise of the stated density, bounded pulses, streams that do not disturb each other."""
+"""Sensors: noise of the stated density, bounded pulses, independent random streams."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def sure(n):
     """
     Return 5 sigma of the relative error of a variance from n independent draws.
 
-    Tiny variances are compared as ratios: approx forgives 1e-12 whatever ``rel`` says.
+    Tiny variances are compared as ratios: approx tolerates 1e-12 for any ``rel``.
     """
     return 5 * np.sqrt(2 / n)
 
@@ -39,12 +39,12 @@ def motion(speed=5.0, seconds=20.0):
                   Start(0.7, 0.2, 0.0, 0.3))
 
 
-def test_grades_are_those_of_the_method():
+def test_grades_have_the_figures_of_the_method():
     industrial = GRADES['industrial']
     # 0.15 deg/sqrt(h) at 1 Hz: 0.15 deg of random walk after an hour
     assert np.degrees(industrial.gyro_noise) * 60 == pytest.approx(0.15)
     assert np.degrees(industrial.gyro_bias) * 3600 == pytest.approx(20)
-    # 5 deg/h per sqrt(h): after an hour the bias has gone 5 deg/h
+    # 5 deg/h per sqrt(h): after an hour the bias has changed by 5 deg/h
     assert np.degrees(industrial.gyro_bias_walk) * 3600 * 60 == pytest.approx(5)
     assert industrial.accel_noise * 60 == pytest.approx(0.03)
     assert industrial.accel_bias == 0.02
@@ -55,7 +55,7 @@ def test_grades_are_those_of_the_method():
 def test_white_noise_has_its_density_at_any_rate(rate):
     noise = white(make_rng(3, 'test'), 0.02, rate, (MANY, 3))
     assert noise.var() / rate == pytest.approx(0.02**2, rel=sure(3 * MANY))
-    # white: neighbours do not know each other, 5 / sqrt(n)
+    # white: adjacent samples are uncorrelated, 5 / sqrt(n)
     together = (noise[1:] * noise[:-1]).mean() / noise.var()
     assert abs(together) < 5 / np.sqrt(3 * MANY)
 
@@ -85,22 +85,22 @@ def test_gauss_markov_is_stationary_with_its_correlation_time():
 
 
 @pytest.mark.parametrize('grade', list(GRADES))
-def test_imu_errors_have_the_grades_figures(grade):
+def test_imu_errors_have_the_size_of_the_grade(grade):
     options = resolved(replace(TOWN, imu_grade=grade))
     figures = GRADES[grade]
     gyro, accel = sensors.imu_errors(options, 30_000)
     for errors, noise, walk in ((gyro, figures.gyro_noise, figures.gyro_bias_walk),
                                 (accel, figures.accel_noise, figures.accel_bias_walk)):
-        steps = np.diff(errors, axis=0)   # no bias left: twice the white variance, and the walk's
+        steps = np.diff(errors, axis=0)   # without bias: twice the white variance, and the walk's
         wanted = 2 * noise**2 * options.imu_rate + walk**2 / options.imu_rate
-        # neighbouring steps share a draw: correlation -1/2 makes the variance 1.5 times as wide
+        # adjacent differences share a draw: correlation -1/2 increases the variance 1.5 times
         assert steps.var() / wanted == pytest.approx(1, rel=sure(90_000 / 1.5))
     starts = [sensors.turn_on_biases(replace(options, seed=s)) for s in range(500)]
     for k, sigma in enumerate((figures.gyro_bias, figures.accel_bias)):
         assert np.std([s[k] for s in starts]) / sigma == pytest.approx(1, rel=sure(1500) / 2)
 
 
-def test_biases_walk_as_the_grade_says(monkeypatch):
+def test_biases_have_the_random_walk_of_the_grade(monkeypatch):
     monkeypatch.setitem(sensors.SIM_GRADES, 'perfect', Grade(0, 0, 2e-6, 0, 0, 3e-5))
     options = resolved(replace(TOWN, imu_grade='perfect'))
     for errors, walk in zip(sensors.imu_errors(options, 10_000), (2e-6, 3e-5), strict=True):
@@ -109,7 +109,7 @@ def test_biases_walk_as_the_grade_says(monkeypatch):
         assert (errors[0] == 0).all()
 
 
-def test_a_perfect_imu_reads_the_motion_through_its_mounting():
+def test_a_perfect_imu_measures_the_motion_in_its_mounted_axes():
     options = resolved(replace(TOWN, imu_grade='perfect', yaw=0.3, pitch=-0.1, roll=0.05,
                                mounting_rpy=(np.pi, 0.0, 0.0), imu_lever_arm=(1.0, 0.5, 0.2)))
     drive = simulate(options)
@@ -141,14 +141,14 @@ def test_orientation_and_heading_have_one_error_for_the_drive():
 
 
 @pytest.mark.parametrize('speed', [5.0, -5.0])
-def test_pulses_lag_the_travel_by_less_than_one(speed):
+def test_pulses_are_behind_the_travel_by_less_than_one(speed):
     drive, options = motion(speed), resolved(TOWN)
     (sent,) = sensors.odometers(drive, options)
     t = (sent.stamp_ns - options.start_ns) * 1e-9
     left = drive.at(t).travel / options.scale - (sent.value - sent.value[0])
     assert sent.value.dtype == np.int64
     assert np.ptp(left) < 1              # floor of travel + phase
-    assert np.ptp(left) > 0.9            # and truly whole pulses
+    assert np.ptp(left) > 0.9            # and whole pulses
     steps = np.diff(sent.value) * np.sign(speed)
     assert steps.min() == 0
     assert steps.sum() == pytest.approx(abs(drive.distance) / options.scale, abs=1)
@@ -177,7 +177,7 @@ def test_late_stamps_change_no_value():
     assert np.array_equal(late.fix.latitude, plain.fix.latitude)
 
 
-def test_slip_spins_only_while_moving_and_as_much_as_said():
+def test_slip_occurs_only_in_motion_with_the_configured_size():
     options = resolved(replace(TOWN, slip_walk=0.01, odometer_rate=200.0))
     drive = motion(seconds=200.0)
     _, t = sensors.stamps(drive.duration, 200.0)
@@ -206,8 +206,8 @@ def test_a_wheel_slips_after_each_start_and_not_elsewhere():
     assert len(starts) > 1
     for start in starts:
         at = np.searchsorted(t, start) - 1       # the last sample at rest; 5 s are 250 samples
-        way, slipped = (x[at + 250] - x[at] for x in (state.travel, spun))
-        assert slipped == pytest.approx(0.005 * way, rel=1e-9)
+        path, slipped = (x[at + 250] - x[at] for x in (state.travel, spun))
+        assert slipped == pytest.approx(0.005 * path, rel=1e-9)
         stop = at + 251 + np.flatnonzero(~moving[at + 251:])[0]
         assert np.ptp(spun[at + 250:stop]) == 0.0
     assert spun[0] == 0.0
@@ -218,7 +218,7 @@ def same(a, b):
                for n in a.__dataclass_fields__)
 
 
-def test_a_seed_is_a_drive_and_no_sensor_disturbs_another():
+def test_a_seed_determines_the_drive_and_sensors_are_independent():
     drive = simulate(TOWN)
     again = simulate(TOWN)
     assert same(drive.imu, again.imu)
@@ -240,7 +240,7 @@ def test_topics_are_not_sampled_together():
     assert not set(drive.odometer.stamp_ns.tolist()) & set(drive.fix.stamp_ns.tolist())
 
 
-def test_heading_topic_is_of_the_body_frame_and_the_orientation_of_the_sensors():
+def test_heading_topic_is_of_the_body_and_orientation_of_the_imu_axes():
     sideways = (np.pi / 2, 0.0, -np.pi / 2)
     drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=20.0,
                                 mounting_rpy=sideways, heading_sigma=1e-9,
@@ -251,7 +251,7 @@ def test_heading_topic_is_of_the_body_frame_and_the_orientation_of_the_sensors()
         return np.arctan2(C[0, 1, 0], C[0, 0, 0])
 
     assert heading_from_yaw(yaw(drive.heading.q_ni)) == pytest.approx(drive.truth.heading)
-    # the sensor's own x axis points to the side
+    # the x axis of the sensor points to the side
     off = wrap(yaw(drive.imu.q_ni) - yaw(drive.heading.q_ni))
     assert abs(off) > 1.0
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A simulated fleet is what its truth says."""
+"""Bags and changes of a simulated fleet agree with its truth."""
 
 from collections import Counter
 
@@ -24,7 +24,7 @@ def test_sixty_vehicles_have_six_tyres_three_imus_and_two_counters_changed():
     assert len({vehicle.name for vehicle in fleet}) == 60
 
 
-def test_values_change_by_what_is_said_and_the_scale_walks_besides():
+def test_values_change_by_the_stated_steps_and_the_scale_random_walk():
     steps = []
     for vehicle in fleet_of(300, 10, seed=4):
         jump, turn = np.diff(np.log(vehicle.scale)), np.diff(vehicle.yaw)
@@ -39,7 +39,7 @@ def test_values_change_by_what_is_said_and_the_scale_walks_besides():
     assert np.sqrt(np.mean(np.square(steps))) == pytest.approx(WALK * 7**0.5, rel=0.05)
 
 
-def test_a_drive_is_that_of_its_vehicle_and_a_broken_counter_stands():
+def test_a_drive_has_the_values_of_its_vehicle_or_a_broken_counter():
     vehicle = fleet_of(1, 2, seed=5)[0]
     options = drive_options(vehicle, 0, 1, SimOptions(scenario='straight', duration=200.0))
     assert (options.scale, options.yaw) == (vehicle.scale[1], vehicle.yaw[1])

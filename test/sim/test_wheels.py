@@ -33,7 +33,7 @@ def robot(**options):
 
 
 def paths(made):
-    """Return a fine state, and the metres that each wheel has rolled by name of the wheel."""
+    """Return states in small steps, and the rolled path of each wheel by its name, m."""
     state = made.motion.at(np.arange(0.0, made.motion.duration, 0.01))
     return state, {one.name: robot_path(state, made.options, one)
                    for one in wheels_of(made.options)}
@@ -82,7 +82,7 @@ def test_positions_of_a_mecanum_robot_move_sideways():
     assert path > 1.2 * made.truth.distance
 
 
-def test_a_robot_without_an_imu_sends_none_and_can_be_read(tmp_path):
+def test_a_robot_without_an_imu_has_a_readable_bag_without_imu(tmp_path):
     made = robot(imu=False)
     assert not len(made.leg().imu.stamp_ns)
     bag = write_bag(tmp_path / 'bag', drive_topics(made))
@@ -133,7 +133,7 @@ def test_a_steered_wheel_rolls_along_its_own_curve():
     rolled = (sent.value - sent.value[0]) * wheel.scale
     at = (sent.stamp_ns - drive.options.start_ns) * 1e-9
     assert np.ptp(state.turned) > 1.0
-    # the derivatives by differences of 1 ms are off by some ppm
+    # derivatives by differences over 1 ms have errors of some ppm
     np.testing.assert_allclose(rolled, np.interp(at, t, path), atol=0.01)
     assert rolled[-1] - state.travel[-1] > 0.5        # m: far above that
 
@@ -154,21 +154,21 @@ def test_a_tyre_grows_with_the_square_of_the_speed_and_as_it_warms():
     assert wheels.tyre_growth(state, real)[cruise] == pytest.approx(want, abs=0.002 * 3e-4)
 
 
-def test_tyres_slip_by_the_force_over_the_load():
+def test_tyre_slip_is_proportional_to_force_over_load():
     _, state, real = run(tyre_slip=1 / 30)
     spun = wheels.tyre_slip(state, real)
     a, b = (np.flatnonzero(state.t == x)[0] for x in (65.0, 80.0))
     push = 12 / 24                                    # m/s^2 between the blends of its ramp
-    way = state.travel[b] - state.travel[a]
+    path = state.travel[b] - state.travel[a]
     air = wheels.AIR_DRAG * (state.speed[a:b + 1]**2 * np.gradient(state.travel[a:b + 1])).sum()
-    want = 2 / 30 * ((push / 9.81 + wheels.ROLLING_RESISTANCE) * way + air)
-    assert spun[b] - spun[a] == pytest.approx(want, rel=2e-3)      # the ends of the sum
+    want = 2 / 30 * ((push / 9.81 + wheels.ROLLING_RESISTANCE) * path + air)
+    assert spun[b] - spun[a] == pytest.approx(want, rel=2e-3)      # at the ends of the sum
     braked = wheels.tyre_slip(state, Real(tyre_slip=1 / 30, driven=False))
     assert braked[b] == 0
     assert braked[-1] < 0
 
 
-def test_up_a_slope_tyres_slip_by_its_share_of_the_load():
+def test_tyre_slip_uphill_is_proportional_to_the_slope():
     _, level, real = run(tyre_slip=1 / 30)
     up = replace(level, slope=np.full(len(level.t), 0.05))
     pulls = level.acceleration > 0.1
@@ -181,8 +181,8 @@ def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
     real = Real(speed_law=0.01, warming=0.01, warming_time=50.0, tyre_slip=1 / 30)
     drive = simulate(SimOptions(**RUN, odometer=odometer, real=real, start_slip=0.01))
     t, value = (drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9, drive.odometer.value
-    way = ((value[1:] + value[:-1]) / 2 * np.diff(t)).sum()
-    counted = way if odometer == 'speed' else value[-1] - value[0]
+    path = ((value[1:] + value[:-1]) / 2 * np.diff(t)).sum()
+    counted = path if odometer == 'speed' else value[-1] - value[0]
     # a pulse of 2 cm at either end; the sums of speeds at 50 Hz and of the truth's own steps
     at = 2 * 0.0213 / drive.truth.distance if odometer == 'counts' else 1e-6
     assert drive.truth.scale == pytest.approx(drive.truth.distance / counted, rel=at)
@@ -190,7 +190,7 @@ def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
     assert drive.truth.scale / drive.options.scale != pytest.approx(1, abs=1e-3)
 
 
-def test_speeds_are_sent_in_steps_the_same_to_and_fro():
+def test_speed_quantisation_is_symmetric_in_both_directions():
     v = np.array([0.0, 0.2, 0.3, 0.99, -0.99, 1.6])
     floor, near = (Real(speed_step=0.5, speed_rounding=r) for r in ('floor', 'round'))
     assert_allclose(wheels.quantized(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
