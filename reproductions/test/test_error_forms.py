@@ -77,11 +77,11 @@ def test_straight_leg_is_the_model_without_earth_rate_and_tilt():
     phi_U0, eps_z = PHI_U, 20 * DRIFT
     closed = straight_leg(phi_U0, eps_z, T, speed * np.cos(yaw), speed * np.sin(yaw), latitude)
     x = propagate(path, [0, 0, phi_U0, 0, 0, 0], [0, 0, eps_z], PAPER_RADIUS)[-1]
-    # left out of (24)-(31): phi_E grows by w cos L phi_U t and feeds back w cos L phi_E: half of
+    # omitted in (24)-(31): phi_E grows by w cos L phi_U t and feeds back w cos L phi_E: half of
     # (5.6e-5 t)^2 = 5.6e-4; vN tan L / R phi_U: 1.8e-6 t = 1.1e-3; dL by 5.96e-5 t v t / 2R: 3e-5
     assert x[2] == pytest.approx(closed.phi_U, rel=2e-3)
     assert x[3] == pytest.approx(closed.dL, rel=2e-3)
-    # the latitude changes by 1.3e-3 rad on the way: half of it times tan L in the secant
+    # the latitude changes by 1.3e-3 rad along the path: half of it times tan L in the secant
     assert x[4] == pytest.approx(closed.dlam, rel=3e-3)
     # estimate less truth: phi_U > 0 turns the track clockwise, which (33) takes from alpha
     assert closed.dL < 0 < closed.dlam
@@ -98,13 +98,13 @@ def test_end_error_through_plane_and_chord_is_minus_the_mean_heading_error():
     dx, dy = plane_error(path.latitude[-1], path.longitude[-1], longitude, x[3], x[4])
     dK, dalpha = chord_error(n1 - n0, e1 - e0, dx, dy, np.hypot(n1 - n0, e1 - e0), 1.0)
     expected, _ = profile.heading_and_drift(PHI_U, DRIFT)
-    # plane_error's C in the place of N: 0.3 %; the rest of the model: 0.1 % (test above)
+    # C instead of N in plane_error: 0.3 %; the rest of the model: 0.1 % (test above)
     assert dalpha == pytest.approx(expected, rel=4e-3)
-    # a common turn changes no length; 0.6 % of unlike radii in dx and dy leave phi / 2 times that
+    # a common rotation changes no length; radii in dx and dy differ by 0.6 %: phi / 2 times that
     assert abs(dK) < PHI_U * 0.0035
 
 
-def test_profile_of_constant_speed_gives_the_papers_forms():
+def test_profile_of_constant_speed_gives_the_forms_of_the_paper():
     t = np.linspace(0.0, 600.0, 301)
     closed = straight_leg(PHI_U, DRIFT, 600.0, 14.0, 14.0, 0.7)
     dalpha, dK = SpeedProfile(t, 20 * t).heading_and_drift(PHI_U, DRIFT)
@@ -112,7 +112,7 @@ def test_profile_of_constant_speed_gives_the_papers_forms():
     assert dK == pytest.approx(closed.dK, rel=1e-9)      # a difference of squares 2e3 times larger
 
 
-def test_papers_profile_gives_the_independently_computed_errors():
+def test_profile_of_the_paper_gives_independently_computed_errors():
     profile, _ = papers_profile()
     # computed independently: eps_z +8.33e-4 deg and 3e-11 K (symmetric profile: mean time 300 s),
     # phi_U0 -0.0600 deg and 0; three digits and one
@@ -127,13 +127,13 @@ def test_papers_profile_gives_the_independently_computed_errors():
     assert noise == pytest.approx(2.4e-4, abs=0.05e-4)
 
 
-def test_mounting_error_is_that_of_a_wandering_track():
-    """Lay a straight track with a wandering heading and nose by hand and measure its chord."""
+def test_mounting_error_is_that_of_a_track_with_varying_heading():
+    """Sum a straight track with a varying heading and pitch, and measure its chord."""
     profile, _ = papers_profile()
     t, ds = profile.t, np.diff(profile.s)
     phi = 2e-3 * np.sin(t / 90) + 1e-5 * t
     tilt = 3e-3 * np.cos(t / 50)
-    # phi > 0: computed axes turned against the clock in n, so the computed track turns clockwise
+    # phi > 0: computed axes are rotated counterclockwise in n, the computed track clockwise
     east_north = np.exp(1j * (np.pi / 4 - phi)) * np.cos(tilt)
     end = np.sum((east_north[1:] + east_north[:-1]) / 2 * ds)
     dalpha, dK = profile.mounting_error(phi, tilt)
@@ -142,11 +142,11 @@ def test_mounting_error_is_that_of_a_wandering_track():
     assert profile.s[-1] / abs(end) - 1 == pytest.approx(dK, rel=1e-4)
 
 
-def test_noise_sigma_is_the_spread_of_drawn_walks():
+def test_noise_sigma_is_the_scatter_of_drawn_random_walks():
     profile, _ = papers_profile(601)
     density, rng = 1e-5, np.random.default_rng(11)
     steps = density * rng.standard_normal((4000, 600))     # of 1 s
     walk = np.concatenate([np.zeros((4000, 1)), np.cumsum(steps, axis=1)], axis=1)
     errors = [profile.mounting_error(w)[0] for w in walk]
-    # 4000 draws know a sigma to 1 / sqrt(8000) = 1.1 %; four of them
+    # a sigma from 4000 draws is known to 1 / sqrt(8000) = 1.1 %; four of them
     assert np.std(errors) == pytest.approx(profile.noise_sigma(density), rel=0.045)

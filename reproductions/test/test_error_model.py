@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The linear error model against finite differences of the dead reckoning that is really run."""
+"""The linear error model against finite differences of the actual dead reckoning."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def _C_vb(options):
 
 
 def reckon(town, x_0, eps_b):
-    """Run the real thing with states x_0 at the start; return the track and where n is fixed."""
+    """Run dead reckoning with states x_0 at the start; return the track and the origin of n."""
     t, w_b, travel, start, C_nb = town
     origin = Origin(*(start + x_0[3:]))
     epochs, q_nb = attitude(t, w_b + eps_b, quat_from_matrix(exp_so3(-x_0[:3]) @ C_nb),
@@ -97,7 +97,7 @@ def difference(town, column, k):
 
 
 def size(path, k):
-    """Return one unit of each state in metres or rad x 1 m, to weigh the six alike."""
+    """Return one unit of each state in metres or rad x 1 m, for equal weights of all six."""
     meridian, normal = radii(path.latitude[k])
     return np.stack([np.ones_like(meridian)] * 3
                     + [meridian, normal * np.cos(path.latitude[k]), np.ones_like(meridian)], -1)
@@ -109,7 +109,7 @@ def test_the_model_is_the_derivative_of_the_real_dead_reckoning(town, column):
     path = path_of(track, origin)
     k = np.linspace(0, len(path.t) - 1, 12).astype(int)[1:]
     unit = np.eye(9)[column]
-    start = unit[:6]       # what the states were is no test: only their change is
+    start = unit[:6]       # the states themselves are not tested: only their change is
     model = propagate(path, start, unit[6:])[k] - start
     real = difference(town, column, k) - start
     # both sum by trapezoids: second order in the turn per sample, 0.4 rad/s / 100 Hz, so
@@ -129,12 +129,12 @@ def test_fixed_axes_show_the_error_of_strapdown_and_dead_reckoning(town):
     turn = matrix_from_quat(plus.q_nb) @ transpose(matrix_from_quat(minus.q_nb))
     seen = np.stack([turn[:, 1, 2] - turn[:, 2, 1], turn[:, 2, 0] - turn[:, 0, 2],
                      turn[:, 0, 1] - turn[:, 1, 0]], -1) / 4
-    # trapezoids as above, and phi^2 = 1e-7 of what is left of third order
+    # trapezoids as above, and phi^2 = 1e-7 of the terms of third order
     assert_allclose(psi, seen, rtol=0, atol=4e-6 * np.abs(seen).max())
     assert_allclose(dr, (plus.P - minus.P) @ FORWARD / 2, rtol=0, atol=4e-6 * np.abs(dr).max())
 
 
-def test_without_drift_only_the_earth_turns_the_error_in_fixed_axes(town):
+def test_without_drift_the_error_in_fixed_axes_rotates_by_the_earth_only(town):
     track, origin = reckon(town, np.zeros(6), np.zeros(3))
     path = path_of(track, origin)
     psi_0 = np.array([1e-4, 2e-4, -3e-4])
@@ -145,7 +145,7 @@ def test_without_drift_only_the_earth_turns_the_error_in_fixed_axes(town):
     assert_allclose(psi, turned, rtol=0, atol=1e-7 * np.abs(psi_0).max())
 
 
-def test_the_sphere_gives_the_papers_coefficients():
+def test_the_sphere_gives_the_coefficients_of_the_paper():
     F = coefficients(np.deg2rad(40.0), 0.0, [14.0, 14.0, 0.0], PAPER_RADIUS)
     # by (15)-(23), corrected, computed independently: value, unit of the last digit
     figures = {('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
@@ -158,7 +158,7 @@ def test_the_sphere_gives_the_papers_coefficients():
     for (row, column), figure in figures.items():
         expected[_state(row), _state(column)], unit[_state(row), _state(column)] = figure
     assert (np.abs(F[:5, :5] - expected) <= unit).all()
-    # dh: the third row of (21), fed back nowhere
+    # dh: the third row of (21), without feedback
     assert_allclose(F[5], [-14.0, 14.0, 0, 0, 0, 0])
     assert (F[:, 5] == 0).all()
 
@@ -182,7 +182,7 @@ def test_the_sphere_follows_the_printed_equations_at_any_velocity(latitude):
 
 
 @pytest.mark.parametrize('n', [1, 2, 3, 4, 63, 64, 65, 129, 500, 4097, 4500])
-def test_running_products_are_those_of_a_loop(n):
+def test_running_products_equal_those_of_a_loop(n):
     rng = np.random.default_rng(5)
     t = np.cumsum(rng.uniform(5.0, 15.0, n))
     path = planned_path(t, rng.uniform(0, 30, n), rng.uniform(-3, 3, n), 0.6)
@@ -202,7 +202,7 @@ def test_the_series_is_of_second_order():
 
     def end(n):
         path = planned_path(np.linspace(0, 3000, n + 1), np.full(n + 1, 30.0), 0.4, 0.7)
-        # one latitude for all steps: only the exponential is looked at
+        # one latitude for all steps: only the exponential is tested
         level = replace(path, latitude=np.full(n + 1, 0.7))
         return propagate(level, x_0, eps_b)[-1]
 
@@ -213,13 +213,13 @@ def test_the_series_is_of_second_order():
     assert miss[1] / miss[2] == pytest.approx(4, rel=0.1)
 
 
-def test_a_planned_drive_is_the_one_that_is_then_driven():
+def test_a_planned_drive_equals_the_simulated_one():
     drive = simulate(SimOptions(scenario='paper', imu_grade='perfect', imu_rate=10.0, yaw=0.0))
     t = (drive.imu.stamp_ns - drive.options.start_ns) * 1e-9
     state = drive.motion.at(t)
     path = planned_path(t, state.speed, state.yaw, state.latitude[0], state.longitude[0],
                         state.height[0])
-    # speed is straight between samples, yaw constant: only the radii are taken at the middle of a
+    # speed is linear between samples, yaw constant: only the radii are taken at the middle of a
     # step, 2 m: nothing; round-off of 1e4 sums of 1e-6 rad
     assert_allclose(path.latitude, state.latitude, rtol=0, atol=1e-13)
     assert_allclose(path.longitude, state.longitude, rtol=0, atol=1e-13)

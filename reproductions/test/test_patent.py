@@ -42,7 +42,7 @@ def test_json_and_page_have_the_same_lines_and_the_truth_is_found(same_drive, ca
     out = json.loads(capsys.readouterr().out)
     rows = {row['name']: row for row in out['rows']}
     whole = rows['best of all 441']
-    # of all combinations the true one is best, though none of those printed is it
+    # the true combination is the best of all, and is not one of those printed
     assert (whole['left'], whole['right'], whole['heading_deg']) == pytest.approx(FOUND)
     assert out['orthogonal_rows'] == 441
     assert main(['patent', '--fix-noise', 'rtk']) == 0
@@ -61,12 +61,12 @@ def test_plot_writes_a_picture_whole(same_drive, capsys, tmp_path, name, begin):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_a_picture_that_cannot_be_is_refused_before_anything_is_computed(capsys, tmp_path):
+def test_an_invalid_picture_file_is_refused_before_any_computation(capsys, tmp_path):
     assert main(['patent', '--plot', str(tmp_path / 'a.gif')]) == 2
     assert '.png, .svg, .pdf' in capsys.readouterr().err
 
 
-def test_the_embodiment_as_printed():
+def test_the_embodiment_gives_the_printed_values():
     leg = patent.planar_leg('white', 0, duration=300.0, imu_grade='perfect', fix_sigma=0.0,
                         odometer_rate=50.0)
     table = embodiment(leg, truth=FOUND)
@@ -79,7 +79,7 @@ def test_the_embodiment_as_printed():
     assert (table.whole.left, table.whole.right, table.whole.heading_deg) == pytest.approx(FOUND)
     for name in ('response surface', 'least squares'):
         found = rows[name]
-        # tracks good to 0.1 mm (the line truth) over 0.4 m for a difference of one
+        # tracks within 0.1 mm (the line truth) over 0.4 m for a difference of one
         assert (found.left, found.right) == pytest.approx(FOUND[:2], abs=RADIUS * 1e-4 / 0.4)
         assert found.heading_deg == pytest.approx(FOUND[2], abs=0.002)
         assert found.criteria['mean'] <= rows['truth'].criteria['mean'] + 1e-6
@@ -94,7 +94,7 @@ def test_one_wrong_cell_makes_an_array_unbalanced():
     assert imbalance(array, (5,) * 6) == 1.0
 
 
-def test_nothing_smaller_than_all_441_is_orthogonal_for_the_embodiment():
+def test_no_array_smaller_than_all_441_is_orthogonal_for_the_embodiment():
     # each pair of columns needs a multiple of its 49 or 63 pairs of levels
     assert least_rows(LEVELS) == 49 * 63 // gcd(49, 63) == 441 == len(full_factorial(LEVELS))
     assert imbalance(full_factorial(LEVELS), LEVELS) == 0.0
@@ -112,7 +112,7 @@ def test_the_printed_combinations_are_levels_but_not_balanced():
     assert FOUND not in PRINTED
 
 
-def test_the_small_array_is_nearly_balanced_and_says_by_how_much():
+def test_the_small_array_is_nearly_balanced_by_the_stated_amount():
     array = nearly_balanced(LEVELS)
     assert array.shape == (81, 3)
     assert (array.max(axis=0) == [6, 6, 8]).all()
@@ -121,5 +121,5 @@ def test_the_small_array_is_nearly_balanced_and_says_by_how_much():
     for a, b in combinations(range(3), 2):
         met = {tuple(pair) for pair in array[:, [a, b]].tolist()}
         assert len(met) == LEVELS[a] * LEVELS[b]
-    # dummies lie alike about the middle: the mean of each column is the middle level
+    # dummies are symmetric about the middle: the mean of each column is the middle level
     assert array.mean(axis=0) == pytest.approx([3, 3, 4])

@@ -25,7 +25,7 @@ def config(drive):
 
 @pytest.fixture(scope='session')
 def exact():
-    """Return settings of an IMU without errors of scale and axes, as it is simulated."""
+    """Return settings of an IMU without scale and axis errors, as in the simulation."""
     return with_settings(Config(), {'imu.grade': 'industrial', 'method': 'smoother',
                                     'imu.accel_scale_sigma': 0.0, 'imu.misalignment_sigma': 0.0,
                                     'imu.gyro_by_force_sigma': 0.0})

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is foreseen of a drive on the way, and each look of the smoother at a growing leg."""
+"""Forecasts of a drive during the recording, and running estimates of a growing leg."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ LOOKS = (30.0, 47.0, 60.0, 95.0, 108.0, 165.0, 172.0, 240.0)    # s after the st
 
 
 def foreseen(drive, config, t_stop, begin_s=float('-inf'), **more):
-    """Return what is foreseen after seconds of a drive; begin_s: of its recording."""
+    """Return the forecast after seconds of a drive; begin_s: begin of its recording."""
     leg = drive.leg()
     cells = thinned(leg, t_stop, begin_s)
     return forecast_leg(cells.leg(leg.start_ns), cells.fix_rate(), config, **more)
@@ -29,7 +29,7 @@ def drive_of(**options):
 
 
 def fit_updates(drive, config, looks=LOOKS):
-    """Return what each look at a growing leg gave, and the leg as sketched at the last."""
+    """Return the running estimates of a growing leg, with the thinned leg of each."""
     whole, cells, so_far, found = drive.leg(), None, SmootherSoFar(), []
     for before, now in zip((-np.inf, *looks), looks, strict=False):
         cells = thinned(whole, now, before, cells)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is foreseen of a leg while it is recorded: sigmas, metres and words."""
+"""Forecast of a leg during its recording: sigmas, distances and texts."""
 
 from dataclasses import replace
 import math
@@ -32,7 +32,7 @@ YAW = ParameterForecast(0.005, 0.0087, 0.0)
 NO_YAW = ParameterForecast(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
 
 
-def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
+def test_forecast_at_the_end_of_a_leg_agrees_with_the_result(drive, config):
     leg = drive.leg()
     result = calibrate(leg, config).methods['two_point'].estimates
     forecast = foreseen(drive, config, (leg.stop_ns - leg.start_ns) / SECOND)
@@ -44,7 +44,7 @@ def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
     assert {name for name, _ in forecast.scale.sources} >= {'fix_start', 'fix_end'}
 
 
-def test_the_metres_foreseen_are_those_it_takes(drive, config):
+def test_forecast_distance_agrees_with_the_distance_required(drive, config):
     t_now = 100.0
     first = foreseen(drive, config, t_now)
     required = first.scale.sigma / 1.6
@@ -58,7 +58,7 @@ def test_the_metres_foreseen_are_those_it_takes(drive, config):
     assert later[0].scale.remaining_m < 0.8 * metres
 
 
-def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, config):
+def test_yaw_is_not_reached_below_the_heading_sigma_or_from_course_alone(drive, config):
     required = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
     yaw = foreseen(drive, required, 150.0).yaw
     assert yaw.remaining_m is None
@@ -70,8 +70,8 @@ def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, 
     assert 'not separable from the course over ground' in yaw.why
 
 
-def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
-    """10 s after a mark set in motion; with another 15 s of such driving the smoother tells it."""
+def test_yaw_is_not_excluded_by_end_points_before_a_smoother_result(drive):
+    """10 s after a mark in motion; after another 15 s of such driving the smoother gives it."""
     cells = thinned(drive.leg(), 110.0, 98.0)
     config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
     leg = cells.leg(drive.leg().start_ns + 100 * SECOND)
@@ -80,12 +80,12 @@ def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     assert 'yaw is not determined yet' in found.as_text()
     assert found.manoeuvres == ['drive on with stops, starts and turns']
     assert not found.complete
-    still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
+    still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # never
     never = forecast_leg(still, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert 'yaw: not separable from the course over ground' in never.as_text()
 
 
-def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
+def test_forecast_uses_a_received_orientation_as_the_heading(drive, config):
     auto = with_settings(config, {'alignment.heading_source': 'auto',
                                   'alignment.heading': math.nan})
     cells = thinned(drive.leg(), 150.0)
@@ -97,7 +97,7 @@ def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
 
 
-def test_nothing_is_foreseen_at_rest_or_before_a_count_is_known_in_metres(drive, config):
+def test_no_forecast_is_made_at_rest_or_before_a_scale_is_known(drive, config):
     with pytest.raises(OdocalError):
         foreseen(drive, config, -5.0)
     with pytest.raises(OdocalError, match='not known yet'):
@@ -106,7 +106,7 @@ def test_nothing_is_foreseen_at_rest_or_before_a_count_is_known_in_metres(drive,
     assert foreseen(drive, known, 6.0).scale.sigma > 0.01    # 0.3 m fixes 10 m apart
 
 
-def test_a_drive_goes_on_from_here_at_its_own_speed():
+def test_a_drive_is_lengthened_at_its_own_speed_and_heading():
     t = np.arange(0.0, 61.0)
     speed = np.where((t < 10) | (t > 50), 0.0, 8.0)
     bend = np.where(t > 30, np.pi / 2, 0.0)
@@ -119,7 +119,7 @@ def test_a_drive_goes_on_from_here_at_its_own_speed():
     assert more.yaw[onward] == pytest.approx(np.pi / 2)
 
 
-def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, monkeypatch):
+def test_a_prediction_uses_few_rows_and_keeps_the_stops(drive, config, monkeypatch):
     seen = []
 
     def counted(planned, sigmas):
@@ -130,7 +130,7 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
     monkeypatch.setattr(leg_forecast, 'predict', counted)
     monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100)
     sparse = foreseen(drive, config, 270.0)
-    assert len(seen[0].t) <= 100 + 2 * 100      # a rest of 10 s is put on in steps of 0.1 s
+    assert len(seen[0].t) <= 100 + 2 * 100      # a standstill of 10 s is added in steps of 0.1 s
     monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100_000)
     dense = foreseen(drive, config, 270.0)
     assert len(seen[-1].t) > 10 * len(seen[0].t)
@@ -139,7 +139,7 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
     assert sparse.yaw.sigma == pytest.approx(dense.yaw.sigma, rel=0.02)
 
 
-def test_a_look_gives_up_at_its_next_step_once_the_leg_is_over(drive, config):
+def test_an_update_stops_at_its_next_step_after_the_end_of_the_leg(drive, config):
     strict, required = with_settings(config, {'verdict.max_scale_sigma': 1e-9}), []
 
     def is_needed():
@@ -158,25 +158,25 @@ def two():
 
 
 def looked_at(made, t_stop, **settings):
-    """Return what is foreseen after so many seconds of a drive."""
+    """Return the forecast after so many seconds of a drive."""
     config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
     return foreseen(made, config, t_stop, smoother=SmootherSoFar())
 
 
 @pytest.fixture(scope='module')
 def found(two):
-    """Return the estimates of the smoother; wheels is another word for it."""
+    """Return the estimates of the smoother; method wheels is an alias of it."""
     return calibrate(two.leg(), with_settings(Config(), {
         'method': 'smoother', 'imu.grade': 'tactical'})).methods['smoother'].estimates
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
-def test_two_wheels_are_foreseen_as_they_come_out(two, found, method):
+def test_forecast_of_two_wheels_agrees_with_the_result(two, found, method):
     whole = two.leg()
     forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
     left, right, width = (found[name] for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
-    # the thinned has a tenth of the rows: their noise is judged anew
+    # the thinned leg has a tenth of the rows, whose noise is estimated again
     assert forecast.wheels.left_right == pytest.approx(
         max(e.sigma / e.value for e in (left, right)), rel=0.25)
     assert forecast.wheels.track_width == pytest.approx(width.sigma / width.value, rel=0.5)
@@ -184,13 +184,13 @@ def test_two_wheels_are_foreseen_as_they_come_out(two, found, method):
         left.value, abs=left.sigma)
 
 
-def test_a_method_of_one_travel_and_a_single_counter_foresee_no_wheels(two, drive):
+def test_two_point_and_a_single_counter_give_no_forecast_of_wheels(two, drive):
     assert looked_at(two, 100.0, method='two_point').wheels is None
     assert looked_at(drive, 100.0, method='smoother').wheels is None
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto'])
-def test_without_an_accelerometer_the_scale_is_foreseen_and_no_angle(two, method):
+def test_without_an_accelerometer_the_forecast_has_a_scale_and_no_angle(two, method):
     still = replace(two, imu=replace(two.imu, f_i=np.zeros_like(two.imu.f_i)))
     forecast = looked_at(still, 200.0, method=method)
     assert 0.0 < forecast.scale.sigma < 0.01
@@ -201,7 +201,7 @@ def test_without_an_accelerometer_the_scale_is_foreseen_and_no_angle(two, method
         'yaw_mounting_angle', 'pitch_mounting_angle'))
 
 
-def test_swapped_wheels_are_said_while_it_is_driven(two):
+def test_swapped_wheels_are_reported_during_the_recording(two):
     leg = two.leg()
     swapped = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
     found = faults_in_cells(swapped, with_settings(Config(), {
@@ -210,7 +210,7 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
     assert 'Swap odometer.left' in found[0].remedy
 
 
-def test_a_coarse_scale_is_said_in_per_cent():
+def test_a_large_scale_sigma_is_printed_in_per_cent():
     assert ParameterForecast(0.138, 1e-3, 2108.0, value_text='1.02').as_text('scale', 'ppm',
                                                                              1e6) == (
         'scale 1.02 ± 13.8 % so far; drive 2200 m more to reach the limit of 0.1 %')
@@ -242,11 +242,11 @@ def hint_text(forecast, **more):
     (Forecast(replace(MORE, sigma=None), NO_YAW, distance_m=300.0), 0.0,
      'scale is not determined yet; drive 240 m more to reach the limit of 1000 ppm; yaw: '
      'limited by the heading uncertainty (1 deg)')])
-def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
+def test_the_hint_states_which_values_are_ok_and_what_is_missing(forecast, still_s, text):
     assert hint_text(forecast, still_s=still_s) == text
 
 
-def test_the_least_leg_comes_first():
+def test_the_hint_states_the_minimum_leg_first():
     assert hint_text(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
         'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then drive on, with '
         'stops and left and right turns, until this hint shows OK for scale and yaw')
@@ -258,7 +258,7 @@ def test_the_distance_decreases_between_updates():
     assert 'drive on to reach the limit of 1000 ppm' in hint_text(forecast, distance_m=600.0)
 
 
-def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
+def test_status_keys_are_numbers_and_empty_without_a_forecast():
     keys = status_keys(Forecast(GOOD, NO_YAW))
     running = {key: keys.pop(key) for key in list(keys) if key.startswith('estimate_')}
     assert running.pop('estimate_method') == ''
@@ -285,9 +285,9 @@ def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
                for end in ('', '_sigma'))
 
 
-def test_an_estimate_is_never_of_a_time_to_come():
+def test_an_estimate_with_a_stamp_in_the_future_has_no_age():
     forecast = Forecast(GOOD, GOOD, until_ns=1_750_000_671_800_000_000)
     assert forecast.age_s(forecast.until_ns + 2_500_000_000) == pytest.approx(2.5)
-    # wild stamps, or none: -1750000671.8 s stood in the status
+    # wrong stamps, or none: the status contained -1750000671.8 s
     for stamp_ns in (0, forecast.until_ns - 1):
         assert math.isnan(forecast.age_s(stamp_ns))

@@ -29,7 +29,7 @@ CONFIG = with_settings(Config(), {'odometer.left': 'topic', 'odometer.right': 't
 
 @pytest.mark.parametrize('drive', ['differential', 'mecanum'])
 @pytest.mark.parametrize('name', PATTERNS)
-def test_a_pattern_ends_where_its_moves_end(name, drive):
+def test_a_pattern_ends_at_the_end_of_its_moves(name, drive):
     """Out and back: both turn directions are equal, a round ends at the heading of its start."""
     d = pattern_motion(name, 3.0, 1, drive).increments
     assert abs(d[:, 2].sum()) < 1e-9
@@ -45,7 +45,7 @@ def test_the_scale_of_exact_positions_is_limited_by_the_slip():
     found = predict_robot(motion, robot, Config())
     moving = (motion.speed > 0).sum() * 0.1
     closed = SLIP * math.sqrt(moving / 2) / motion.distance
-    # the level by metres is that of the mean speed: ramps weigh more than they should
+    # the level per metre is that of the mean speed: the weight of ramps is too large
     assert found.estimates['scale_factor'].sigma == pytest.approx(closed, rel=0.15)
     assert ratio_sigma(found) == pytest.approx(2 * closed, rel=0.15)
 
@@ -55,7 +55,7 @@ def test_the_scale_of_exact_positions_is_limited_by_the_slip():
     ('differential', True, {'yaw_mounting_angle': 1.5, 'track_width': 1.6}),
     ('skid', False, {'scale_factor': 1.5, 'track_width_arc': 1.3})])
 def test_the_forecast_is_near_the_sigma_of_a_simulated_run(drive, imu, values):
-    """Its own noise levels are estimated: benchmarks/indoor_bound.py has their spread."""
+    """The run estimates its noise levels: benchmarks/indoor_bound.py gives their scatter."""
     made = simulate(SimOptions(
         scenario='indoor', duration=150.0, drive=drive, imu=imu, reference='total_station',
         slip_walk=SLIP, odometer='angle', imu_grade='industrial', seed=5))
@@ -83,7 +83,7 @@ def test_marks_determine_the_width_by_squares_and_not_by_an_eight():
     ({'size': 0.0}, '--size 0: required: a number above 0'),
     ({'size': 1e9}, 'more than ten hours'),
     ({'track_width': 0.0}, '--track-width')])
-def test_wrong_figures_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(BadUsage, match=message):
         plan_indoor(**options)
 
@@ -98,7 +98,7 @@ def forecast(leg, seconds, is_needed=lambda: True):
     return planar_forecast(thinned(leg, seconds).leg(leg.start_ns), CONFIG, is_needed)
 
 
-def test_the_last_update_is_near_the_result(leg):
+def test_the_last_update_agrees_with_the_result(leg):
     """Its samples are cells of 0.1 s, within which the speed changes: measured, 0.75 sigma."""
     found, result = forecast(leg, 1e9), calibrate(leg, CONFIG)
     for name in ('scale_factor', 'scale_factor_left', 'track_width'):
@@ -111,7 +111,7 @@ def test_the_last_update_is_near_the_result(leg):
     assert 'yaw: not estimated on this robot' in found.as_text()
 
 
-def test_the_distance_to_go_is_by_the_root_of_the_path(leg):
+def test_remaining_distance_follows_from_sigma_over_root_of_path(leg):
     """Nine times the variance that is required: eight times the path more."""
     result = calibrate(leg, CONFIG)
     scale = result.methods['planar'].estimates['scale_factor']
@@ -120,11 +120,11 @@ def test_the_distance_to_go_is_by_the_root_of_the_path(leg):
     assert found.scale.remaining_m == pytest.approx(8 * result.distance, rel=1e-6)
 
 
-def test_before_the_first_motion_there_is_none(leg):
+def test_there_is_no_forecast_before_the_first_motion(leg):
     with pytest.raises(BadData, match='positions while the wheels have data'):
         forecast(leg, 0.0)
 
 
-def test_an_update_that_nobody_wants_ends(leg):
+def test_an_update_that_is_not_needed_is_abandoned(leg):
     with pytest.raises(Abandoned):
         forecast(leg, 1e9, lambda: False)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults, distance and standstill of a leg while it is driven, as the result will have them."""
+"""Faults, distance and standstill of a leg during its recording agree with the result."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def without(samples, leg, begin_s, end_s):
 
 
 def reset(v):
-    """Return counts that begin again at zero after a third of the drive."""
+    """Return counts that restart at zero after a third of the drive."""
     return v - np.where(np.arange(len(v)) > len(v) // 3, v[len(v) // 3], 0)
 
 
@@ -48,11 +48,11 @@ WRONG = {
 
 
 @pytest.mark.parametrize('wrong', WRONG)
-def test_the_faults_so_far_are_those_of_the_result(made, wrong):
+def test_faults_during_the_recording_are_those_of_the_result(made, wrong):
     config = settings(made)
     leg = replace(made.leg(), **WRONG[wrong](made.leg()))
     result = calibrate(leg, config)
-    # a slip is what a method makes of the hole
+    # a method reports the gap as slip
     lowering = {r.code for r in result.reasons
                 if r.code.severity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in faults(screen_leg(leg, config), config)} == lowering
@@ -60,13 +60,13 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     assert (lowering == set()) == (wrong == 'sound')
 
 
-def test_late_rows_are_put_back_so_far_as_in_the_result(made):
+def test_late_rows_are_corrected_during_the_recording_as_in_the_result(made):
     leg = made.leg()
     late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
     expected = screen(late, settings(made))[0].travel
     cells = ThinnedLeg(leg.form)
     sent_ns = late.odometer.stamp_ns
-    for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
+    for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # update by update
         cells.feed('odometer', take(late.odometer, (sent_ns >= begin)
                                     & (sent_ns < begin + 5 * 10**9)))
     cells.feed('imu', leg.imu)
@@ -81,14 +81,14 @@ def test_late_rows_are_put_back_so_far_as_in_the_result(made):
     assert np.abs(raw - (count - expected.s[0])).max() > 0.2 * speed
 
 
-def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
+def test_an_imu_gap_is_reported_at_once_and_remains(made):
     leg = made.leg()
     gaps, limit = ImuGaps(leg.start_ns, 0.5), 0.5
     rows = without(without(leg.imu, leg, -100.0, 0.0), leg, 40.0, 43.0)
     t = seconds(leg, rows)
     gaps.feed(take(rows, t < 40.0))
     assert gaps.reasons() == ()
-    assert gaps.reasons(silent_s=0.9) == ()         # a busy machine is no gap
+    assert gaps.reasons(silent_s=0.9) == ()         # a busy computer is not a gap
     assert gaps.reasons(silent_s=0.95)[0].code is Code.IMU_GAP      # within a second
     for row in np.flatnonzero(t >= 40.0):
         gaps.feed(take(rows, slice(row, row + 1)))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Manoeuvres put into a planned drive: what they add, what they leave as it was."""
+"""Manoeuvres inserted in a planned drive: what they add, what they do not change."""
 
 import numpy as np
 import pytest
@@ -18,19 +18,19 @@ def straight(rest=30.0):
                                                     [0.0, 15.0, 15.0, 0.0]), np.zeros_like(t))
 
 
-def test_a_stop_on_the_way_adds_its_braking_and_its_rest():
+def test_an_inserted_stop_adds_braking_and_a_standstill():
     drive = straight()
     changed = planned_drive.add_stop_and_start(drive)
     assert changed.duration - drive.duration == pytest.approx(10.0 + 5.0 + 10.0)    # 15 / 1.5
     assert changed.distance - drive.distance == pytest.approx(15.0**2 / 1.5, rel=1e-3)
     rests = changed.standstills(2.0)
     assert [b - a for a, b in rests] == pytest.approx([30.0, 5.0, 30.0], abs=0.11)
-    assert rests[1][0] == pytest.approx(60.0 + 10.0, abs=0.2)      # in the middle of the way
+    assert rests[1][0] == pytest.approx(60.0 + 10.0, abs=0.2)      # in the middle of the path
     assert np.abs(np.diff(changed.speed) / np.diff(changed.t)).max() < 1.6
     assert np.ptp(changed.yaw) == 0.0
 
 
-def test_turns_both_ways_lead_back_to_the_direction_they_began_with():
+def test_turns_in_both_directions_return_to_the_initial_direction():
     drive = straight()
     changed = planned_drive.add_left_and_right_turns(drive)
     assert changed.yaw[-1] == pytest.approx(drive.yaw[-1])
@@ -69,7 +69,7 @@ def test_town_driving_brakes_first_where_the_drive_ends_in_motion():
     assert changed.speed[-1] == 0.0
 
 
-def test_a_drive_that_only_backs_up_is_stopped_backing_up():
+def test_a_stop_is_inserted_in_a_drive_in_reverse_only():
     t = np.arange(0.0, 60.0, 0.1)
     drive = planned_drive.drive_from_rates(t, np.full_like(t, -3.0), np.zeros_like(t))
     changed = planned_drive.add_stop_and_start(drive)

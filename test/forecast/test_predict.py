@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Predicted sigmas against closed forms, against the pipeline, and against drives disturbed."""
+"""Predicted sigmas against closed forms, the pipeline and changed drives."""
 
 import math
 
@@ -57,7 +57,7 @@ def test_white_end_fixes_give_root_two_sigma_over_the_chord():
         assert row(result, source)[YAW] == pytest.approx(expected / math.sqrt(2), rel=1e-3)
 
 
-def test_correlated_fixes_leave_what_a_gauss_markov_mean_leaves():
+def test_correlated_fixes_give_the_sigma_of_a_gauss_markov_mean():
     result = predict(paper_drive(), Sigmas(config=config(correlation=60.0), fix=2.0))
     for source, rest in (('fix_start', 300.0), ('fix_end', 30.0)):
         x = rest / 60.0
@@ -67,9 +67,9 @@ def test_correlated_fixes_leave_what_a_gauss_markov_mean_leaves():
             2.0 * math.sqrt(left) / 11_200, rel=0.01)
 
 
-def test_a_bias_about_the_vertical_turns_by_the_mean_time_of_the_way():
+def test_effect_of_a_vertical_gyro_bias_is_that_of_the_mean_travel_time():
     result = predict(paper_drive(), Sigmas(config=config()))
-    # the trapezoid of speed is symmetric: its way lies 300 s after the start on the mean
+    # the trapezoid of speed is symmetric: the mean time of its travel is 300 s after the start
     sigma = result.alignment.gyro_bias_sigma[2]
     assert row(result, 'gyro_bias_z')[YAW] == pytest.approx(sigma * 300.0, rel=1e-6)
     # 0.01 deg/h times 300 s: 8.33e-4 deg
@@ -96,27 +96,27 @@ def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
                         Sigmas(config=settled, fix_rate=4.0, quantum=options.scale))
     scale = result.estimates[SCALE]
     # a standstill is found up to 0.5 s short at each moving end: 20 s (town) give 2.5 % fewer
-    # fixes and 1.3 % more sigma; the gyro noise measured at rest (300 values) strays by 4 %,
-    # three axes' largest by as much again, but makes a quarter of the variance at most
+    # fixes and 1.3 % more sigma; the gyro noise measured at rest (300 values) has a sigma of 4 %,
+    # the largest of three axes 4 % more, but is a quarter of the variance at most
     assert predicted.sigma(SCALE) == pytest.approx(scale.sigma / scale.value, rel=0.03)
     for name in (YAW, PITCH):
         assert predicted.sigma(name) == pytest.approx(result.estimates[name].sigma, rel=0.03)
     assert set(predicted.method.details['budget']) == set(result.details['budget'])
 
 
-def test_metres_to_go_are_enough_and_no_more_than_needed():
+def test_remaining_distance_is_sufficient_and_not_too_long():
     drive, sigmas = paper_drive(), Sigmas(config=config(correlation=60.0))
     required = predict(drive, sigmas).sigma(SCALE) / 1.5
     metres = find_remaining_distance(drive, sigmas, SCALE, required)
     assert predict(drive.lengthen(metres), sigmas).sigma(SCALE) <= required
     assert predict(drive.lengthen(0.97 * metres), sigmas).sigma(SCALE) > required
-    # fixes alone make it: the sigma falls as the way grows
+    # only fixes contribute: the sigma is inversely proportional to the path length
     assert metres == pytest.approx(0.5 * 11_200, rel=0.03)
     assert find_remaining_distance(drive, sigmas, SCALE, 1.0) == 0.0
     assert find_remaining_distance(drive, sigmas, YAW, 0.9 * HEADING) is None
 
 
-def test_what_is_said_of_a_drive_that_cannot_carry_the_method():
+def test_a_drive_that_the_method_cannot_use_has_the_reasons():
     t = np.arange(0.0, 200.1, 0.1)
     speed = np.interp(t, [20, 30, 170, 180], [0, 10, 10, 0])
     around = drive_from_rates(t, speed, np.where((t > 96) & (t < 104), math.pi / 8, 0.0))
@@ -130,7 +130,7 @@ def test_what_is_said_of_a_drive_that_cannot_carry_the_method():
     moving = drive_from_rates(t, np.full_like(t, 10.0), np.zeros_like(t))
     result = predict(moving, Sigmas(config=config()))
     assert Code.NO_STANDSTILL in {r.code for r in result.reasons}
-    # start and end as fast: the latency cancels, the fixes are those of a second each side
+    # the same speed at start and end: the latency cancels, with fixes of a second on each side
     assert result.standing == (0.0, 0.0)
 
 
@@ -159,7 +159,7 @@ def test_impossible_drives_are_refused():
         predict(short, Sigmas(config=config(), fix_rate=0.5))
 
 
-def test_changes_of_a_drive_change_what_they_say():
+def test_each_change_of_a_drive_changes_only_what_it_states():
     drive = paper_drive()
     longer = drive.lengthen(1000.0)
     assert longer.distance == pytest.approx(12_200, rel=1e-9)
@@ -176,9 +176,9 @@ def test_changes_of_a_drive_change_what_they_say():
     assert predict(half, Sigmas(config=config())).standing[1] == pytest.approx(20.0, abs=0.2)
 
 
-def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest():
+def test_yaw_of_a_recorded_leg_is_corrected_for_the_gyro_bias_at_rest():
     drive = simulate(SimOptions(scenario='town', imu_grade='consumer', imu_rate=50.0, seed=4))
-    assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to take out
+    assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to subtract
     leg = drive.leg()
     config = with_settings(Config(), {'imu.grade': 'consumer'})
     profile = drive_profile(screen(leg, config)[0], config)
@@ -187,6 +187,6 @@ def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest()
     turned, truly = profile.yaw - profile.yaw[0], true - true[0]
     # noise over 20 s at rest leaves 2e-5 rad/s of the bias, 0.012 rad in ten minutes; five of that
     np.testing.assert_allclose(turned, truly, atol=0.06)
-    # and the first course by fixes of 1.5 m over kilometres: a milliradian, the bow of above on it
+    # and the first course by fixes of 1.5 m over kilometres: 1 mrad, and the error of the bias
     off = np.median(profile.yaw - true)
     assert abs((off + math.pi) % (2 * math.pi) - math.pi) < 0.06

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which quantities are good enough, what a drive can tell, and what is said of it."""
+"""Quantities within their limits, observable quantities of a drive, and their texts."""
 
 from dataclasses import replace
 import math
@@ -59,7 +59,7 @@ def ok(judged, two_wheels=True, config=CONFIG):
 @pytest.mark.parametrize(('position', 'names'), list(enumerate((
     ('scale_factor',), ('yaw_mounting_angle',), ('pitch_mounting_angle',),
     ('scale_factor_left', 'scale_factor_right'), ('track_width',)))))
-def test_each_limit_counts_by_itself(position, names):
+def test_each_limit_applies_to_its_own_quantity_only(position, names):
     for name in names:
         for worse in (Estimate(1.0, 0.06, '1'), Estimate(None, None, '1')):
             found = ok(result(WHOLE | {name: worse})).split()
@@ -77,35 +77,35 @@ BARE = WHOLE | {'track_width': Estimate(None, None, 'm')}
 @pytest.mark.parametrize(('judged', 'options', 'found'), [
     (result(), {}, 'yes yes yes yes yes'),
     (result(PPM_950), {}, 'yes yes yes yes yes'), (result(PPM_950), TIGHT, 'no yes yes yes yes'),
-    # a reason counts against its value, or against all
+    # a reason applies to its value, or to all
     (result(None, Code.YAW_FAR_FROM_NOMINAL), {}, 'yes no yes yes yes'),
     (result(None, Code.COVARIANCE_UNKNOWN), {}, 'yes yes yes yes yes'),
     (result(None, Code.LEG_TOO_SHORT), {}, 'no no no no no'),
-    # one counter says nothing of two wheels
+    # one counter does not determine two wheels
     (result(ONE), {'two_wheels': False}, 'yes yes yes unknown unknown'),
     (Forecast(GOOD, YAW, 0.001), {'two_wheels': False}, 'yes yes yes unknown unknown'),
-    # a configured track width is not asked of the drive
+    # a configured track width is not required from the drive
     (result(BARE), GIVEN, 'yes yes yes yes unknown'), (result(), GIVEN, 'yes yes yes yes yes'),
     (Forecast(GOOD, YAW, 0.001, WheelsForecast(1e-4, None)), GIVEN, 'yes yes yes yes unknown'),
     (Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, 0.01)), {}, 'yes yes yes yes yes'),
     (Forecast(BAD, NO_YAW, None, WheelsForecast(None, None)), {}, 'no no no no no'),
     (Forecast(GOOD, YAW, 0.01, WheelsForecast(2e-3, 0.06)), {}, 'yes yes no no no'),
     (Forecast(GOOD, YAW, 0.001), {}, 'yes yes yes unknown unknown')])
-def test_results_and_forecasts_are_judged_by_the_limits(judged, options, found):
+def test_results_and_forecasts_are_compared_with_the_limits(judged, options, found):
     assert ok(judged, **options) == found
 
 
-def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():
+def test_each_quantity_of_a_leg_with_sections_is_from_the_better_one():
     begun = Forecast(BAD, NO_YAW, None, until_ns=2, estimates=estimates(scale_factor=None))
     done = Forecast(GOOD, NO_YAW, 0.002, until_ns=1, estimates=estimates(
         scale_factor=1e-4, yaw_mounting_angle=0.02))
     stated = combine_sections(done, begun)
     assert ok(stated) == 'yes no yes unknown unknown'
-    assert stated.scale.remaining_m == 0.0            # enough is enough
+    assert stated.scale.remaining_m == 0.0            # within the limit
     assert {name: e.sigma for name, e in stated.estimates.items()} == {
         'scale_factor': 1e-4, 'yaw_mounting_angle': 0.02}
     assert stated.until_ns == 2
-    # what is over goes no further: metres are those of the part that goes on
+    # a finished section does not grow: the remaining distance is that of the current one
     coarse = Forecast(ParameterForecast(5e-3, 1e-3, 700.0), YAW, until_ns=3)
     assert combine_sections(begun, coarse).scale == replace(BAD, remaining_m=700.0)
     assert combine_sections(begun, coarse).yaw == YAW
@@ -119,7 +119,7 @@ def recording(**known):
     return SessionView(session, CONFIG, **({'two_wheels': True} | known))
 
 
-def test_each_state_is_judged_by_what_it_has():
+def test_quantities_are_from_the_forecast_or_result_of_the_state():
     now = recording(forecast=Forecast(GOOD, NO_YAW))
     assert quantities_ok(now)['scale'] == 'yes'
     session = now.session
@@ -139,11 +139,11 @@ def test_each_state_is_judged_by_what_it_has():
     assert quantities_ok(fresh)['scale'] == 'no'
 
 
-# what is to be driven
+# driving instructions
 
-def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
+def test_two_wheels_require_turns_and_a_straight_section():
     far = {'distance_m': 500.0, 'max_speed': 10.0}
-    assert manoeuvres(recording(**far)) == [TURNS]           # before the first look
+    assert manoeuvres(recording(**far)) == [TURNS]           # before the first update
     assert manoeuvres(recording(**far, two_wheels=False)) == []
     apart = Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, None))
     assert manoeuvres(recording(**far, forecast=apart)) == [TURNS]
@@ -156,7 +156,7 @@ def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
     assert manoeuvres(recording(**far, forecast=both)) == []
 
 
-def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
+def test_a_configured_width_or_the_mean_of_both_requires_no_turns():
     for settings in ({'odometer.track_width': 1.6}, {'method': 'two_point'}):
         session = Session()
         session.start(1, with_settings(CONFIG, settings))
@@ -164,7 +164,7 @@ def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
                                       max_speed=10.0)) == []
 
 
-def test_a_leg_that_would_be_rejected_is_said_before_all_else():
+def test_the_hint_states_first_that_a_leg_would_be_rejected():
     enough = Forecast(GOOD, YAW, 0.001)
     dead = (Reason(Code.WHEEL_DEAD, 'the left'),)
     now = recording(forecast=enough, distance_m=500.0, faults=dead, missing=['no IMU for 3 s'])
@@ -173,7 +173,7 @@ def test_a_leg_that_would_be_rejected_is_said_before_all_else():
     assert hint(now).endswith('; no IMU for 3 s')
     assert set(quantities_ok(now).values()) == {'no', 'unknown'}
     assert (level(now), level(recording(forecast=enough))) == (b'\x02', b'\x00')
-    # a caution is no reason to drive again: it is said, and the rest as before
+    # a caution does not require another drive: it is stated before the usual hint
     uncertainty = (Reason(Code.COUNTER_RESET, 'by -70'),)
     stated = hint(recording(forecast=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
                             faults=uncertainty))
@@ -181,7 +181,7 @@ def test_a_leg_that_would_be_rejected_is_said_before_all_else():
     assert level(recording(faults=uncertainty)) == b'\x01'
 
 
-def test_seconds_to_stand():
+def test_remaining_seconds_of_standstill_are_stated():
     assert seconds_to_stand(SessionView(Session(), CONFIG, still_s=3.0)) == 7.0
     assert seconds_to_stand(recording(still_s=12.0)) == 0.0
     now = recording(still_s=3.0)
@@ -189,7 +189,7 @@ def test_seconds_to_stand():
     assert seconds_to_stand(now) == 0.0
 
 
-# what a drive can tell as configured
+# what is observable as configured
 
 @pytest.mark.parametrize(('settings', 'received', 'expected'), [
     ({}, {}, 'observable: the scale and the pitch; not observable: the yaw (the only heading is '
@@ -215,14 +215,14 @@ def test_seconds_to_stand():
      {'two_wheels': True}, 'observable: the scale, the yaw (from the configured heading, 0.11 '
      'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
      'their mean)')])
-def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, expected):
+def test_observable_quantities_are_stated_beforehand(monkeypatch, settings, received, expected):
     monkeypatch.setattr(quantities, 'METHODS', ('two_point',))
     known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
     text = find_observable(with_settings(CONFIG, settings), known).as_text()
     assert text.startswith(expected) if expected.endswith(', ') else text == expected
 
 
-def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
+def test_the_smoother_needs_no_external_heading(monkeypatch):
     monkeypatch.setattr(quantities, 'METHODS', ('two_point', 'smoother'))
     found = find_observable(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0))
     assert 'the yaw (from stops, starts and turns)' in found.observable
@@ -230,7 +230,7 @@ def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
     assert len(find_observable(only, Received(NONE, 30.0)).not_observable) == 1
 
 
-def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
+def test_an_orientation_without_variance_or_unit_length_is_not_used():
     def sent(x, variance):
         """Return four orientations, of length x."""
         rows, q = np.arange(4), np.tile(np.multiply([0.0, 0.0, 0.0, 1.0], x), (4, 1))
@@ -238,13 +238,13 @@ def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
 
     assert stated_variance(sent(1.0, [0.1, 0.3, 0.2, np.nan])) == pytest.approx(0.2)
     assert stated_variance(sent(0.0, [0.0] * 4)) == math.inf
-    assert stated_variance(sent(1e200, [0.1] * 4)) == math.inf      # whose square is no number
+    assert stated_variance(sent(1e200, [0.1] * 4)) == math.inf      # whose square overflows
     assert stated_variance(sent(1.0, [np.nan] * 4)) == math.inf
 
 
-# answers
+# service responses
 
-def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
+def test_a_response_has_values_quantities_reasons_and_the_next_action():
     success, text = answers.result_answer(result(None, Code.YAW_FAR_FROM_NOMINAL), (), 0,
                                           'OK: scale; not OK: yaw', 'drive another leg')
     assert success
@@ -259,7 +259,7 @@ def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
     assert again.count(remedy) == 1
 
 
-def test_a_restored_result_is_said_to_be_one():
+def test_a_restored_result_is_stated_as_restored():
     kept = Restored(estimates(scale_factor=1e-4, yaw_mounting_angle=None), 2, True,
                     '2026-01-02T03:04:05Z')
     success, text = answers.restored_answer(kept, 'm/pulse', 'OK: scale')

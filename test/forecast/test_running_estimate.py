@@ -51,7 +51,7 @@ def finished(worker):
     worker.submit(lambda: None, lambda *_: done.append(True))
     deadline = time.monotonic() + 20.0
     while not done and time.monotonic() < deadline:
-        time.sleep(0.001)       # a loop without a rest keeps the interpreter from the worker
+        time.sleep(0.001)       # a loop without sleep blocks the worker by the interpreter lock
         worker.poll()
     assert done
 
@@ -63,7 +63,7 @@ def worker():
     one.close()
 
 
-def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
+def test_the_running_estimate_equals_the_forecast_of_its_thinned_leg(drive, config, worker):
     log = Log()
     estimate, now_ns = watched(drive, config, worker, log)
     estimate.update(drive.leg().start_ns + UPDATE_PERIOD_NS - 1)
@@ -77,7 +77,7 @@ def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
     assert estimate.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
 
 
-def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypatch):
+def test_an_error_in_an_update_is_only_logged(drive, config, worker, monkeypatch):
     def fail(*_):
         raise ValueError('a bug')
 
@@ -95,7 +95,7 @@ def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypa
     assert estimate.forecast is not None
 
 
-def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
+def test_a_leg_that_ends_during_an_update_has_no_forecast(drive, config, worker):
     log = Log()
     estimate, now_ns = watched(drive, config, worker, log)
     estimate.update(now_ns)
@@ -123,5 +123,5 @@ def test_updates_take_a_small_share_of_a_core(drive, config, worker, monkeypatch
         now_ns += UPDATE_PERIOD_NS
         estimate.update(now_ns)
         finished(worker)
-    # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
+    # the first includes imports and does not count, the others are 60 s apart: 1, 2, 62, ... 302 s
     assert len(updates) == 7

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the running estimate of the smoother makes foreseen: sigmas, metres, stops and words."""
+"""Forecast from the running estimate of the smoother: sigmas, distances, stops and texts."""
 
 from dataclasses import replace
 import math
@@ -28,7 +28,7 @@ def forecast_at(seen, config, **settings):
     return forecast_leg(seen.leg, 5.0, with_settings(config, settings), smoother=SmootherSoFar())
 
 
-def test_the_sigma_that_counts_is_of_the_method_that_will_give(exact, updates):
+def test_sigmas_are_of_the_method_that_gives_the_result(exact, updates):
     found = forecast_at(updates[-1], exact, method='auto')
     e = found.methods['smoother'].estimates
     assert found.estimates['scale_factor'] == replace(e['scale_factor'], method='smoother')
@@ -42,7 +42,7 @@ def test_the_sigma_that_counts_is_of_the_method_that_will_give(exact, updates):
     assert ends.scale.sigma > 3 * found.scale.sigma
 
 
-def test_before_the_smoother_can_say_anything_the_end_points_are_foreseen(exact, updates):
+def test_before_the_first_smoother_estimate_the_forecast_is_of_two_point(exact, updates):
     class Silent:
         def update(self, *_):
             raise OdocalError('too little')
@@ -56,7 +56,7 @@ def test_before_the_smoother_can_say_anything_the_end_points_are_foreseen(exact,
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto'])
-def test_what_the_leg_will_be_rejected_for_is_said_at_once(exact, updates, method):
+def test_a_fault_that_rejects_the_leg_is_reported_at_once(exact, updates, method):
     leg = updates[-1].leg
     backwards = replace(leg, odometer=replace(leg.odometer, value=-leg.odometer.value))
     required = with_settings(exact, {'method': method})
@@ -64,7 +64,7 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(exact, updates, metho
     fault = found.faults[0]
     assert (fault.code, fault.text[:41]) == (Code.ODOMETER_REVERSED,
                                              'odometer and IMU have opposite directions')
-    assert found.estimates.get('scale_factor') is None      # no value that would be thrown away
+    assert found.estimates.get('scale_factor') is None      # no value of a leg that is rejected
     session = Session()
     session.start(1, required)
     stated = hint(SessionView(session, required, forecast=found, faults=found.faults,
@@ -74,15 +74,15 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(exact, updates, metho
     assert forecast_leg(leg, 5.0, required, smoother=SmootherSoFar()).faults == ()
 
 
-def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(town_drive, exact):
+def test_forecast_distance_and_stops_are_near_those_required(town_drive, exact):
     white = with_settings(exact, {'gnss.correlation_time': 0.0})
     early, late = (seen.running for seen in fit_updates(town_drive, white, (95.0, 240.0)))
     assert late.distance > 1.6 * early.distance
     assert late.agility > 1.5 * early.agility
-    # what was to be driven for the sigmas that came out, and what was driven
+    # distance predicted for the resulting sigmas, and the driven one
     before = Forecast(*(ParameterForecast(None, float(sigma), None) for sigma in late.sigmas[:2]))
     found = add_running_estimate(before, early, exact)
-    # a law of one power stands for what starts, stops and turns make of it
+    # one power law approximates the effect of starts, stops and turns
     assert found.scale.remaining_m == pytest.approx(late.distance - early.distance, rel=0.4)
     assert 'stop and start' in found.yaw.manoeuvre
     assert late.agility / early.agility == pytest.approx(
@@ -90,7 +90,7 @@ def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(town_drive, 
 
 
 def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
-    """Return an forecast made of a running estimate with other figures."""
+    """Return a forecast from a running estimate with other sigmas."""
     method = seen.running.method
     found = dict(method.estimates)
     if not known:
@@ -102,8 +102,8 @@ def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
     return add_running_estimate(before, running, Config())
 
 
-def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(updates):
-    # agility 120 by a sigma twice the asked: three times as much more, 30 for each stop and start
+def test_the_yaw_requires_stops_and_starts_until_it_is_within_the_limit(updates):
+    # agility 120 at a sigma of twice the limit: three times as much more, 30 per stop and start
     found = of_sigmas(updates[-1], yaw=0.02)
     assert found.yaw.manoeuvre == 'for the yaw: stop and start 12 times, or make as many turns'
     assert found.yaw.remaining_m == pytest.approx(1500.0)
@@ -122,13 +122,13 @@ def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(updates):
     assert (good.yaw.manoeuvre, good.yaw.remaining_m, good.complete) == ('', 0.0, True)
 
 
-def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(updates):
+def test_the_hint_states_the_value_what_is_missing_and_its_age(updates):
     session = Session()
     session.start(1, Config())
     known = {'distance_m': 300.0, 'max_speed': 10.0}
     far = replace(of_sigmas(updates[-1], scale=2e-3, yaw=0.02), distance_m=300.0)
     text = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
-    # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
+    # twice the limit: 500 m more for white errors, 1500 m for slow ones, here some of both
     assert (' m/pulse ± 2000 ppm so far; drive 710 m more to reach the limit of 1000 ppm; yaw '
             in text)
     assert text.endswith('; for the yaw: stop and start 12 times, or make as many turns')

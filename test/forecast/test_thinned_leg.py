@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The cells that a leg is thinned to while it is recorded: turns, counts and speeds."""
+"""The cells of a thinned leg during the recording: turns, counts and speeds."""
 
 from dataclasses import fields
 
@@ -36,22 +36,22 @@ def fed(form, slot, rows, chop):
     return cells
 
 
-def test_work_does_not_grow_with_the_leg_and_no_turn_is_lost():
+def test_the_number_of_cells_is_limited_and_no_turn_is_lost():
     t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
     rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
     leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
     assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
-    # the cells are 1.6 s wide by then: a trapezoid misses at most a cell at either end
+    # the cells are 1.6 s wide then: a trapezoid misses at most a cell at each end
     turned = running_integral(seconds(leg, leg.imu), leg.imu.w_i[:, 2])[-1]
     assert turned == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
     assert (np.diff(leg.imu.stamp_ns) > 0).all()
 
 
-def test_vibration_is_no_turn():
+def test_vibration_is_not_a_turn():
     t = np.arange(0.0, 300.0, 0.005)
     leg = fed(None, 'imu', imu_rows(t, np.sin(2 * np.pi * 10.03 * t)), 1000).leg(SECOND)
-    # 10.03 Hz seen every 0.1 s is a slow wave: picked rows would turn by 1 / (pi 0.03) = 10 rad;
-    # of a cell's mean sinc(1.003) = 0.3 % is left
+    # 10.03 Hz sampled every 0.1 s is a slow wave: single rows turn by 1 / (pi 0.03) = 10 rad;
+    # in the mean of a cell sinc(1.003) = 0.3 % remains
     assert abs(np.cumsum(leg.imu.w_i[:, 2] * 0.1)).max() < 0.1
 
 
@@ -60,7 +60,7 @@ def test_vibration_is_no_turn():
     (OdometerForm('cumulative', 2**64, 'm/pulse'), lambda n: 2**63 - 700 + 15 * np.arange(
         n, dtype=np.uint64)),
     (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15))])
-def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
+def test_counts_do_not_roll_over_for_any_block_size(form, sent):
     t = np.arange(0.0, 10.0, 0.01)
     value = sent(len(t)).astype(np.uint64).view(np.int64)
     legs = [fed(form, 'odometer', odometer_rows(t, value), chop).leg(SECOND)
@@ -74,11 +74,11 @@ def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
             assert (getattr(rows, f.name) == getattr(legs[0].odometer, f.name)).all()
 
 
-def test_speeds_are_averaged_and_rows_without_a_figure_left_out():
+def test_speeds_are_averaged_without_rows_that_are_not_numbers():
     form = OdometerForm('rate', 0, '1')
     t = np.arange(0.0, 10.0, 0.01)
     value = 10.0 + np.sin(2 * np.pi * 10 * t)
     value[500] = np.nan
     rows = fed(form, 'odometer', odometer_rows(t, value), 33).leg(SECOND).odometer
-    # one row of ten less moves the mean of that cell by at most 1 / 9
+    # one row of ten less changes the mean of that cell by at most 1 / 9
     assert rows.value == pytest.approx(np.full(len(rows.value), 10.0), abs=0.12)
