@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all tests share: real drives, and a ROS domain that no other process is in."""
+"""Fixtures of all tests: real drives, and a ROS domain that no other process uses."""
 
 import os
 from pathlib import Path
@@ -28,15 +28,15 @@ def _own_domain():
     raise RuntimeError('all ROS domains are taken by other test runs')
 
 
-# no test is timed: a busy machine fails none
+# no deadline: a test does not fail on a busy computer
 hypothesis.settings.register_profile('untimed', deadline=None)
 hypothesis.settings.load_profile('untimed')
 # at import, since rclpy and every process started by a test read them once
 DOMAIN, _lock = _own_domain()
 os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it would win
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')      # as the commands have it: the same digits
+os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it takes precedence
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')      # as in the commands: the same digits
 
 
 def pytest_collection_modifyitems(items):
@@ -45,13 +45,13 @@ def pytest_collection_modifyitems(items):
         marks = {'live': item.path.parent.name == 'live', 'data': 'data_dir' in item.fixturenames}
         for mark in (name for name, there in marks.items() if there):
             item.add_marker(mark)
-    # else a worker ends with a long file while another has nothing left to do
+    # otherwise one worker ends with a long file while the other is idle
     items.sort(key=lambda item: ('live' not in item.keywords, 'slow' not in item.keywords))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Of --dist loadfile: the node's tests are one file, as two at a time disturb each other."""
+    """Treat tests of the node as one file with --dist loadfile: they disturb each other."""
     if config.option.dist != 'loadfile':
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -65,19 +65,19 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_runtest_setup(item):
-    """Let the node's tests, which run in real time, go before what computes on other workers."""
+    """Give tests of the node, which run in real time, priority over those of other workers."""
     if 'PYTEST_XDIST_WORKER' in os.environ and 'live' not in item.keywords:
         os.setpriority(os.PRIO_PROCESS, 0, 5)
 
 
 def pytest_report_header() -> list[str]:
-    """Say at the top what the tests of real drives will find."""
+    """Return a header line with the recordings that tests of real drives find."""
     found = DATA if DATA.is_dir() else f'MISSING at {DATA}: tests of real drives are skipped'
     return [f'ROS domain: {DOMAIN}', f'real drives: {found}']
 
 
 class Recordings:
-    """The folder of real recordings; a test that asks for one that is not there is skipped."""
+    """The folder of real recordings; a test of a missing one is skipped."""
 
     def __truediv__(self, name: str) -> Path:
         first = DATA / Path(name).parts[0]
@@ -86,13 +86,13 @@ class Recordings:
         return DATA / name
 
     def rglob(self, pattern: str):
-        """Return the files of all recordings that are there."""
+        """Return the files of all available recordings."""
         return DATA.rglob(pattern)
 
 
 @pytest.fixture(scope='session')
 def data_dir() -> Recordings:
-    """Return the folder of real recordings, or skip and say so."""
+    """Return the folder of real recordings, or skip with a message."""
     if not DATA.is_dir():
         pytest.skip(f'NO REAL DATA at {DATA}: set ODOCAL_DATA to the folder of recordings')
     return Recordings()

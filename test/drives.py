@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated drives for tests: made once, changed by copies; settings that fit them."""
+"""Simulated drives for tests: made once, changed as copies; and their settings."""
 
 from dataclasses import fields, replace
 from functools import wraps
@@ -26,7 +26,7 @@ TOWN = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed'
 
 def cached(function):
     """
-    Return a function that computes once for equal arguments, however they are written.
+    Return a function that computes once for equal arguments in any notation.
 
     To functools.cache, a default that is written out, or another order, is another argument.
     """
@@ -54,7 +54,7 @@ def settings(made, heading_sigma=1e-3, **changes):
     """
     Return the settings of a drive with its true heading, and changes as group__name.
 
-    The method is the quick one, two_point, unless another is asked for.
+    The method is the quick one, two_point, by default.
     """
     o = made.options
     known = {
@@ -126,7 +126,7 @@ def shifted(leg, **marks):
 
 
 def planned(motion, options):
-    """Return the drive of a simulated motion as one that is planned."""
+    """Return the drive of a simulated motion as a planned one."""
     t = np.arange(0.0, motion.duration + 1e-9, 0.1)
     return drive_from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
                             latitude=options.latitude, longitude=options.longitude,
@@ -144,7 +144,7 @@ def everything_said(result):
 
 
 def errors_in_sigmas(result, truth):
-    """Return (estimate - truth) / sigma of scale, yaw and pitch, those that are given."""
+    """Return (estimate - truth) / sigma of scale, yaw and pitch, if they are estimated."""
     e = result.methods['two_point'].estimates
     true = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
             'pitch_mounting_angle': truth.pitch}
@@ -152,7 +152,7 @@ def errors_in_sigmas(result, truth):
 
 
 def off(found, made, *names):
-    """Return the largest error over sigma of the estimates named, of the scale if none is."""
+    """Return the largest error over sigma of the named estimates, by default of the scale."""
     truth, estimates = made.truth, getattr(found, 'estimates', found)
     true = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
             'pitch_mounting_angle': truth.pitch, 'track_width': made.options.track_width,
@@ -168,7 +168,7 @@ def rejecting(result):
 
 
 def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
-    """Return rows with arrivals as a line has them that stops now and then, and which it held."""
+    """Return rows that arrive over a line with interruptions, and which rows are delayed."""
     t = (samples.stamp_ns - samples.stamp_ns[0]) * 1e-9
     free = np.where(t % every_s < how_long_s, t - t % every_s + how_long_s, t)
     for k in range(1, len(free)):        # one after the other
@@ -188,7 +188,7 @@ def thinned(leg, stop_s=float('inf'), begin_s=float('-inf'), into=None):
 
 
 def turned(imu, at_ns, turn):
-    """Return samples of an IMU that is turned by rad within a second, as its gyro measures."""
+    """Return samples of an IMU that is rotated by rad within a second, also in its gyro."""
     since = np.clip((imu.stamp_ns - at_ns) * 1e-9, 0.0, 1.0)
     angle = np.outer(since**2 * (3 - 2 * since), turn)
     w, f = (np.einsum('kji,kj->ki', exp_so3(angle), x) for x in (imu.w_i, imu.f_i))

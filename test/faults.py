@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A disk that refuses: one step, or every step from one on."""
+"""A disk with errors: in one step, or in every step from one on."""
 
 import ctypes
 import errno
@@ -15,8 +15,8 @@ class Refusing:
     """
     Counts the steps of ``atomic_files.disk`` and refuses some.
 
-    at : the first that is refused, 0 for none.   for_ever : so are those after it.   error : what
-    it raises, else an OSError with the code.
+    at : the first that is refused, 0 for none.   for_ever : also those after it.   error : the
+    exception, by default an OSError with the code.
     """
 
     def __init__(self, at: int, code: int = errno.ENOSPC, for_ever: bool = False,
@@ -32,14 +32,14 @@ class Refusing:
         return step(*values)
 
     def put_in(self, monkeypatch) -> 'Refusing':
-        """Take the place of the disk."""
+        """Replace the disk."""
         for module in (atomic_files, segments):
             monkeypatch.setattr(module, 'disk', self)
         return self
 
 
 def obey_permissions() -> None:
-    """Give up root's right to write where nobody may (this thread, and those it starts)."""
+    """Drop the right of root to write read-only files (this thread and those it starts)."""
     drop = ~((1 << 1) | (1 << 2)) & 0xffffffff      # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
     libc = ctypes.CDLL(None, use_errno=True)
     head, sets = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()

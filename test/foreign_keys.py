@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Names that other systems give to what they load, and where each name was read.
+Names of parameters in other systems, and the source of each name.
 
-Facts only, noted by hand from the source named, apart from the code that writes the files.
+Facts only, copied manually from the source, independent of the code that writes the files.
 """
 
 AUTOWARE_VELOCITY = {    # autoware.universe, sensing/vehicle_velocity_converter, README
@@ -27,14 +27,14 @@ OMNI_WHEEL_DRIVE = {'wheel_offset', 'robot_radius', 'wheel_radius'}
 TWIST_COVARIANCE = 'twist_covariance_diagonal'
 # VINS-Fusion forks with wheels (VIW-Fusion), estimator/parameters.cpp; m/s per sqrt(Hz)
 WHEEL_INERTIAL = 'wheel_velocity_noise_sigma'
-DEVICES = {              # how the line begins that the system is to be given
+DEVICES = {              # begin of the line that the system receives
     'u-blox': 'CFG-SFODO-FACTOR = ',          # ZED-F9R application note UBX-22035176, page 22
     'SBG': 'gain: ',                          # sbg_ros2_driver, config/example; sbgEComCmdOdo.h
     'OxTS': 'Pulses per metre = ',            # RT3000 manual, NAVconfig, wheel speed input
     'NovAtel': 'SETWHEELPARAMETERS ',         # novatel_span_driver; OEM7 SPAN manual v14, page 119
     'ArduPilot': 'WENC_RADIUS '}              # AP_WheelEncoder.cpp
 UBLOX_FACTOR_ID = '0x40070007'                # u-blox_config_keys.h of SparkFun; ublox_dgnss
-# what docs/recipes.md and config/ekf_odocal.yaml set: node -> parameters
+# parameters in docs/recipes.md and config/ekf_odocal.yaml: node -> parameters
 RECIPES = {
     # robot_localization, params/ekf.yaml
     'ekf_filter_node': {'frequency', 'sensor_timeout', 'two_d_mode', 'publish_tf', 'odom_frame',

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pages for people: their commands, as a person would type them."""
+"""The pages for users: their commands, as a user types them."""
 
 from pathlib import Path
 import re
@@ -32,7 +32,7 @@ def blocks(page: str) -> list[list[str]]:
 
 
 def commands(page: str) -> list[str]:
-    """Return the lines of blocks, and what stands between backquotes: odocal or ros2 and more."""
+    """Return the lines of blocks, and text in backquotes that begins with odocal or ros2."""
     return [line for block in blocks(page) for line in block] + re.findall(
         r'`((?:odocal|ros2 \w+) [^`]+)`', page)
 
@@ -42,7 +42,7 @@ def yaml_blocks(page: str) -> list[str]:
 
 
 def all_commands(first: str) -> list[tuple[str, str]]:
-    """Return (page, command) of all commands that begin with a word, each once."""
+    """Return unique (page, command) of all commands that begin with a word."""
     found = [(page.relative_to(ROOT).as_posix(), line) for page in PAGES
              for line in commands(page.read_text(encoding='utf-8'))
              if line.split()[:1] == [first]]

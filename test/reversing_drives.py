@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drives with reversing in them, made by hand; and counters that do not tell the direction."""
+"""Drives with reversing; and counters and speeds without direction."""
 
 from dataclasses import replace
 import math
@@ -14,7 +14,7 @@ from odocal_ros.sim.profile import hold, ramp, turn
 
 
 def there_and_back(back, seconds):
-    """Return a route: straight on, back at ``back`` m/s, for ``seconds`` at that, on again."""
+    """Return a route: forwards, in reverse at ``back`` m/s for ``seconds``, forwards."""
     def route(duration, rng):
         pieces = (hold(30) + _run(10, 12, 30, 5) + _run(4, -back, seconds, 5)
                   + _run(10, 12, 60, 20))
@@ -23,7 +23,7 @@ def there_and_back(back, seconds):
 
 
 def three_point_turn(duration, rng):
-    """Return a route with turns, two of them about in three moves."""
+    """Return a route with turns, two of them three-point turns."""
     stretches = [(hold(30), hold(30))]
     for up, top, before, turning, angle, after, stop in (
             (8, 11, 10, 8, 80, 20, 6), (3, -2, 2, 6, 35, 2, 4), (8, 10, 15, 9, -70, 15, 6),
@@ -35,7 +35,7 @@ def three_point_turn(duration, rng):
 
 
 def made(route, **choices):
-    """Return a drive of a route, as simulate does of a named one."""
+    """Return the simulated drive of a route."""
     name = 'by_hand'
     routes.ROUTES[name] = route
     options.DEFAULTS[name] = {'duration': 300.0, 'imu_grade': 'industrial'}
@@ -47,7 +47,7 @@ def made(route, **choices):
 
 
 def without_direction(leg):
-    """Return a leg whose counters, one or two, or speeds, tell no direction."""
+    """Return a leg whose counters, one or two, or speeds have no direction."""
     def one(samples):
         value = samples.value
         if leg.form.quantity == 'rate':

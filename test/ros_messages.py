@@ -23,7 +23,7 @@ def cdr(message, little_endian=True):
 
 
 def deserializer(msgtype):
-    """Return the function that readers want, for one type."""
+    """Return the function for one type that readers use."""
     return lambda raw: store().deserialize_cdr(raw, msgtype)
 
 
@@ -45,7 +45,7 @@ def quaternion(x=0.0, y=0.0, z=0.0, w=1.0):
 
 
 def imu(stamp_ns, w=(0, 0, 0), f=(0, 0, 9.81), q=(0, 0, 0, 1), covariance=None, frame='imu_link'):
-    """Return a sensor_msgs/Imu; covariance None: no orientation, as REP-145 has it."""
+    """Return a sensor_msgs/Imu; covariance None: no orientation, by REP-145."""
     none = np.zeros(9)
     first = np.array([-1.0] + [0.0] * 8) if covariance is None else np.array(covariance, float)
     return stamped(

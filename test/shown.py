@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the shipped layouts of RViz, Foxglove and PlotJuggler name: topics, keys, services."""
+"""Topics, keys and services in the layouts of RViz, Foxglove and PlotJuggler."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ def rviz_displays() -> list[dict]:
 
 
 def foxglove(name: str = 'odocal_foxglove.json') -> dict:
-    """Return a Foxglove layout, that of the node unless named."""
+    """Return a Foxglove layout, by default that of the node."""
     return json.loads((CONFIG / name).read_text(encoding='utf-8'))
 
 
@@ -39,7 +39,7 @@ def plotjuggler() -> ElementTree.Element:
 
 
 def curves() -> list[str]:
-    """Return the names of PlotJuggler's curves: topic, then fields, by slashes."""
+    """Return the names of PlotJuggler curves: topic, then fields, separated by slashes."""
     return [curve.get('name') for curve in plotjuggler().iter('curve')]
 
 
@@ -50,7 +50,7 @@ def status_keys() -> set[str]:
 
 
 def status_names() -> set[tuple[str, str]]:
-    """Return (hardware_id, name) of the statuses that the layouts pick out."""
+    """Return (hardware_id, name) of the statuses that the layouts select."""
     panels = foxglove()['configById']
     picked = {(p['selectedHardwareId'], p['selectedName']) for p in panels.values()
               if 'selectedName' in p}
@@ -59,7 +59,7 @@ def status_names() -> set[tuple[str, str]]:
 
 
 def published() -> dict[str, str]:
-    """Return topic -> type of what the layouts show of the node."""
+    """Return topic -> type of the node's topics in the layouts."""
     path, array = 'nav_msgs/msg/Path', 'diagnostic_msgs/msg/DiagnosticArray'
     topics = {'/' + d['Topic']['Value']: path for d in rviz_displays() if 'Topic' in d}
     for panel in foxglove()['configById'].values():
@@ -74,7 +74,7 @@ def published() -> dict[str, str]:
 
 
 def of_inputs() -> set[tuple[str, tuple[str, ...]]]:
-    """Return (topic, fields) that the layouts draw of the node's inputs."""
+    """Return (topic, fields) of the node's inputs in the layouts."""
     found = {(m.split('.')[0], tuple(m.split('.')[1:])) for m in foxglove_paths()
              if not KEY.search(m)}
     for name in curves():

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""ament's own linters, where they are, and the pages as a site: what others make of them."""
+"""The linters of ament, if installed, and the documentation built as a site."""
 
 from importlib import import_module
 from pathlib import Path

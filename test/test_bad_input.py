@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bad input through the whole pipeline: nothing raises, each fault has its sentence and its remedy.
+Bad input in the whole pipeline: nothing raises, each fault has its message and its remedy.
 
-Every test ends in ``sound``: what is given holds within its sigma, what is rejected says why.
+Every test ends in ``sound``: values are within their sigmas, a rejected leg has a reason.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from odocal_ros.reasons import Code
 
 
 def run(leg, made, **changes):
-    """Calibrate and combine with the settings of a drive; whatever comes must be sound."""
+    """Calibrate and combine with the settings of a drive; check that the result is sound."""
     config = settings(made, **changes)
     result = calibrate(leg, config)
     whole = combine([result], config)
@@ -42,7 +42,7 @@ def run(leg, made, **changes):
 
 
 def sound(result, truth, sigmas=5.0):
-    """Check that a result that is given holds."""
+    """Check that values are within their sigmas."""
     assert result.verdict.value != 'rejected', drives.everything_said(result)
     z = drives.errors_in_sigmas(result, truth)
     assert all(abs(x) < sigmas for x in z.values()), z
@@ -98,7 +98,7 @@ def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text,
     assert rejecting(result) == {code}
 
 
-def test_two_counters_on_one_topic_are_a_named_cause(made, leg):
+def test_two_counters_on_one_topic_are_reported_as_the_cause(made, leg):
     half_ns = int(np.diff(leg.odometer.stamp_ns).min()) // 2
     two = spoilt(leg, 'odometer', value=lambda a: a + 10**6, stamp_ns=lambda a: a + half_ns,
                  received_ns=lambda a: a + half_ns)
@@ -113,22 +113,22 @@ def test_two_counters_on_one_topic_are_a_named_cause(made, leg):
     *(partial(kept, slot=slot, rows=slice(first, first + n))
       for slot, first in (('imu', 5000), ('odometer', 700), ('fix', 700)) for n in (1, 2, 3)),
     *(partial(drives.shifted, start=by, stop=by) for by in (-3600.0, 3600.0))])
-def test_a_handful_of_rows_or_marks_outside_the_data_are_rejected(made, leg, spoil):
+def test_a_few_rows_or_marks_outside_the_data_are_rejected(made, leg, spoil):
     assert rejecting(run(spoil(leg), made)[0])
 
 
-def test_ten_seconds_without_imu(made, leg):
+def test_a_leg_with_ten_seconds_without_imu_is_reported(made, leg):
     result, said = run(without(leg, 'imu', 40, 50), made)
     assert said[Code.IMU_GAP].endswith('for 10.04 s at t = 39.98 s (1 gap; the limit is 0.5 s)')
-    # straight on, nothing was lost: the values are kept and hold
+    # straight ahead no turn is lost: the values are kept and correct
     assert max(map(abs, drives.errors_in_sigmas(result, made.truth).values())) < 5
-    # a gap long before the leg is none of its business
+    # a gap long before the leg has no effect
     result, said = run(without(leg, 'imu', -55, -50), made)
     assert Code.IMU_GAP not in said
     sound(result, made.truth)
 
 
-def test_an_imu_that_starts_late_or_ends_early(made, leg):
+def test_an_imu_that_starts_late_or_ends_early_is_reported(made, leg):
     assert 'at t = 49.98 s' in run(without(leg, 'imu', 50.0), made)[1][Code.IMU_GAP]
     assert Code.IMU_GAP in rejecting(run(without(leg, 'imu', -10.0), made)[0])
     assert 'no IMU data for 20.0' in run(without(leg, 'imu', end=20.0), made)[1][Code.IMU_GAP]
@@ -139,21 +139,21 @@ def test_an_imu_that_starts_late_or_ends_early(made, leg):
     ({'begin': 50}, 'ends 90.0 s before the stop mark'),
     ({'begin': 80}, 'ends 60.0 s before the stop mark'),
     ({'begin': 35, 'end': 45}, 'odometer gap of 10.')])
-def test_rows_that_the_odometer_lacks_cost_no_leg(made, leg, gone, text):
+def test_missing_odometer_rows_do_not_reject_the_leg(made, leg, gone, text):
     result, said = run(without(leg, 'odometer', **gone), made)
     assert text in said[Code.TOPIC_GAP]
-    assert Code.BAD_ROWS_DROPPED not in said       # nor are later fixes far off the track
+    assert Code.BAD_ROWS_DROPPED not in said       # and later fixes are not far from the track
     assert not result.evidence.excluded
     sound(result, made.truth)
 
 
 @pytest.mark.parametrize('kind', ['increment', 'rate'])
-def test_a_gap_of_increments_or_speeds_widens_the_sigma(made, leg, kind):
+def test_a_gap_of_increments_or_speeds_increases_the_sigma(made, leg, kind):
     if kind == 'rate':
         made = drives.drive(**drives.STRAIGHT, odometer='speed')
     leg = made.leg() if kind == 'rate' else drives.with_increments(leg)
     whole, _ = run(leg, made)
-    result, said = run(without(leg, 'odometer', 20, 30), made)  # across the end of speeding up
+    result, said = run(without(leg, 'odometer', 20, 30), made)  # at the end of the acceleration
     assert Code.TOPIC_GAP in said
     sound(result, made.truth)
     sigma = [r.methods['two_point'].estimates['scale_factor'].sigma for r in (whole, result)]
@@ -161,7 +161,7 @@ def test_a_gap_of_increments_or_speeds_widens_the_sigma(made, leg, kind):
 
 
 @pytest.mark.parametrize('heading_sigma', [1e-3, None])
-def test_a_counter_that_counts_down(made, leg, heading_sigma):
+def test_a_counter_that_counts_down_is_reported(made, leg, heading_sigma):
     down = spoilt(leg, 'odometer', value=lambda a: -a)
     result, _ = run(down, made, heading_sigma=heading_sigma)
     assert Code.ODOMETER_REVERSED in rejecting(result)
@@ -174,7 +174,7 @@ def test_a_counter_that_counts_down(made, leg, heading_sigma):
 @pytest.mark.parametrize(('drive', 'spoil', 'setting', 'value'), [
     ('made', partial(spoilt, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale', 9.80665),
     ('town', partial(spoilt, slot='imu', w_i=np.degrees), 'imu.gyro_scale', 0.017453292519943295)])
-def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil, setting, value):
+def test_units_other_than_si_are_reported_with_a_setting(request, drive, spoil, setting, value):
     made = request.getfixturevalue(drive)
     leg = spoil(made.leg())
     result, said = run(leg, made)
@@ -184,18 +184,18 @@ def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil
     sound(run(leg, made, **{setting: value})[0], made.truth)
 
 
-def test_degrees_on_a_straight_road_are_told_by_the_noise_at_rest(made, leg):
+def test_degrees_on_a_straight_road_are_found_from_the_noise_at_rest(made, leg):
     leg = spoilt(leg, 'imu', w_i=np.degrees)
     result, said = run(leg, made)
     assert 'so its unit is probably deg/s' in said[Code.IMU_WORSE_THAN_GRADE]
     assert 'imu.gyro_scale' in Code.IMU_WORSE_THAN_GRADE.remedy
     assert result.verdict.value == 'caution'
-    # the bias at rest is used, not that of a grade so clearly wrong: 50 sigmas else
+    # the bias at rest is used, not that of a wrong grade, which gives 50 sigmas
     sound(result, made.truth, sigmas=6)
     sound(run(leg, made, imu__gyro_scale=np.pi / 180)[0], made.truth)
 
 
-def test_a_z_down_imu_is_read_as_what_it_is(town):
+def test_an_imu_with_z_down_is_detected_and_used(town):
     def down(a):
         return a * [1.0, -1.0, -1.0]
     result, said = run(spoilt(town.leg(), 'imu', w_i=down, f_i=down), town)
@@ -206,39 +206,39 @@ def test_a_z_down_imu_is_read_as_what_it_is(town):
     e, c = (r.methods['two_point'].estimates for r in (result, clean))
     for name in e:
         assert e[name].value == pytest.approx(c[name].value, rel=1e-9)
-    # the whole rotation, roll of half a turn and all, is what goes out
+    # the published rotation includes the roll of 180 deg
     rpy = combine([result], settings(town)).imu_rotation_rpy
     assert abs(rpy[0]) == pytest.approx(np.pi, abs=0.05)
     assert rpy[2] == pytest.approx(town.truth.yaw, abs=0.01)
 
 
-def test_a_gyro_with_the_wrong_sign_is_named(town):
+def test_a_gyro_with_the_wrong_sign_is_reported(town):
     _, said = run(spoilt(town.leg(), 'imu', w_i=lambda a: a * [1.0, 1.0, -1.0]), town)
     assert set(said) == {Code.GYRO_SIGN}, 'one cause, and nothing that follows from it'
 
 
-def test_a_quarter_turn_is_told_with_the_setting_that_undoes_it(town):
+def test_a_rotation_by_90_deg_is_reported_with_the_setting_for_it(town):
     result, _ = run(spoilt(town.leg(), 'imu', w_i=sideways, f_i=sideways), town)
     (reason,) = (r for r in result.reasons if r.code is Code.IMU_AXES)
     rpy = json.loads(re.search(r"--set 'imu.mounting_rpy=(\[.*?\])'", reason.remedy)[1])
     np.testing.assert_allclose(matrix_from_rpy(rpy), [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-8)
-    # refused, it still knows how far it was: knots on fixes cut corners by some per cent
+    # a rejected leg has a distance: a path by fixes cuts corners by some per cent
     assert result.distance == pytest.approx(town.truth.distance, rel=0.05)
 
 
-def test_a_stray_fix_is_no_way_of_a_leg_that_is_refused(town):
+def test_outlier_fixes_do_not_change_the_distance_of_a_rejected_leg(town):
     leg = spoilt(town.leg(), 'imu', f_i=lambda a: a[:, [2, 1, 0]])       # on its side
     plain, _ = run(leg, town)
 
-    def stray(latitude):
+    def with_outliers(latitude):
         latitude[[400, 401, 900]] += np.deg2rad([4.0, 4.0, -0.01])      # 445 km, 1.1 km
-    result, said = run(spoilt(leg, 'fix', latitude=stray), town)
+    result, said = run(spoilt(leg, 'fix', latitude=with_outliers), town)
     assert Code.IMU_AXES in said
     assert result.distance == pytest.approx(plain.distance, rel=0.01)
 
 
-def test_an_odometer_that_stops_counting_on_the_way(made, leg):
-    """What a wheel loses as it slides for some metres is slip; more is a counter that stands."""
+def test_an_odometer_that_stops_counting_rejects_the_leg(made, leg):
+    """A loss of some metres is slip of a sliding wheel; more is a counter that stops."""
     t = seconds(leg, leg.odometer)
 
     def stands(begin, end):
@@ -254,18 +254,18 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
     assert Code.ODOMETER_STILL not in stands(40.0, 41.0)[1]
 
 
-def test_fixes_that_stray_while_the_vehicle_waits_are_no_motion(made, leg):
+def test_fix_errors_at_a_standstill_are_not_motion(made, leg):
     t = seconds(leg, leg.fix)
     end = t[-1]
     for knots, north in (([100, 100.1], [0, 200]), ([91, 97, 100, 104], [0, 200, 200, 0]),
-                         ([end - 40, end], [0, 60])):       # parked among walls
+                         ([end - 40, end], [0, 60])):       # parked between walls
         off = np.interp(t, knots, north) * np.deg2rad(1 / 111e3)
-        strayed = replace(leg.fix, latitude=leg.fix.latitude + off)
-        assert Code.ODOMETER_STILL not in run(replace(leg, fix=strayed), made)[1]
+        moved = replace(leg.fix, latitude=leg.fix.latitude + off)
+        assert Code.ODOMETER_STILL not in run(replace(leg, fix=moved), made)[1]
 
 
 def begun_moving(leg):
-    """Return a leg of which nothing was recorded before its start mark, which is on the way."""
+    """Return a leg without rows before its start mark, which is in motion."""
     leg = drives.shifted(leg, start=30.0)
     for slot in ('imu', 'odometer', 'fix'):
         leg = without(leg, slot, end=0.0)
@@ -276,15 +276,15 @@ def begun_moving(leg):
     (begun_moving, {}, Code.NO_STANDSTILL, 'no standstill before the start mark'),
     (lambda leg: leg, {'odometer__nominal_scale': 1.0}, Code.SCALE_FAR_FROM_NOMINAL,
      '-97.9 % from the nominal value 1')])
-def test_what_is_said_with_caution_holds(made, leg, spoil, options, code, text):
+def test_values_with_a_caution_are_within_their_sigmas(made, leg, spoil, options, code, text):
     result, said = run(spoil(leg), made, **options)
     assert text in said[code]
     assert result.verdict.value == 'caution'
     sound(result, made.truth)
 
 
-def test_fixes_only_outside_the_drive(made, leg):
-    # standing at both ends: the middle is not needed, but nothing checks the drive then
+def test_fixes_at_both_standstills_only_are_sufficient(made, leg):
+    # standstills at both ends: fixes between are not needed, but then nothing checks the drive
     sound(run(without(leg, 'fix', 0, 85), made)[0], made.truth)
     for gone in ({'begin': 0}, {'end': 85}):
         result, said = run(without(leg, 'fix', **gone), made)
@@ -292,7 +292,7 @@ def test_fixes_only_outside_the_drive(made, leg):
         assert rejecting(result)
 
 
-@pytest.mark.parametrize('at', [250, 300, 310, 500, 700])    # one at the very start mark, too
-def test_one_wild_fix_costs_nothing(made, leg, at):
+@pytest.mark.parametrize('at', [250, 300, 310, 500, 700])    # one exactly at the start mark
+def test_one_outlier_fix_does_not_change_the_result(made, leg, at):
     wild = spoilt(leg, 'fix', latitude=(at, leg.fix.latitude[at] + 0.05), height=(at, 9000.0))
     sound(run(wild, made)[0], made.truth)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Who may import whom: the border is a folder, and this test."""
+"""Imports between packages: the allowed ones, and the order of the packages."""
 
 import ast
 from functools import cache
@@ -20,7 +20,7 @@ PACKAGE = Path(odocal_ros.__file__).parent
 HEAVY = ('rclpy', 'rosbags', 'yaml', 'matplotlib', 'scipy', 'pyproj', 'tqdm')
 ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
        'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
-# the rooms in the order of the data, and what each uses of those above it; all: errors, reasons
+# packages in the order of the data, and those above that each uses; all: errors, reasons
 ROOMS = {
     'safe_io': '', 'data': '',
     'settings': 'data safe_io',
@@ -99,17 +99,17 @@ def test_a_method_that_does_not_run_is_not_imported():
 
 
 def test_help_and_usage_errors_import_not_even_numpy():
-    told = [[], ['--help'], ['--version'], ['nothing'], ['replay'], ['inspect'], ['compare'],
-            *([command, option] for command in COMMANDS for option in ('--help', '--nothing'))]
+    commands = [[], ['--help'], ['--version'], ['nothing'], ['replay'], ['inspect'], ['compare'],
+                *([command, option] for command in COMMANDS for option in ('--help', '--nothing'))]
     probe = (f'import sys; from odocal_ros.offline.cli import main\n'
-             f'for argv in {told}:\n'
+             f'for argv in {commands}:\n'
              f'    try: main(argv)\n    except SystemExit: pass\n'
              f'    found = [m for m in {("numpy", *HEAVY)} if m in sys.modules]\n'
              f'    assert not found, (argv, found)\n')
     subprocess.run([sys.executable, '-c', probe], stdout=subprocess.DEVNULL, check=True)
 
 
-def test_ros_rosbags_and_the_reproductions_are_imported_where_they_belong():
+def test_ros_rosbags_and_reproductions_are_imported_only_where_allowed():
     users = {_part(p) for p in _modules() for name in _imports(p) if name.split('.')[0] in ROS}
     assert users == {'live'}
     assert not {name for path in _modules() for name in _imports(path)
@@ -131,32 +131,32 @@ def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
 
 
 @pytest.mark.parametrize('room', ROOMS)
-def test_a_room_uses_what_the_table_says(room):
+def test_a_package_uses_only_those_in_the_table(room):
     used = {own for p in _modules() if _part(p) == room for own in _own_parts(p)}
     assert used - COMMON - {room} == set(ROOMS[room].split())
 
 
-def test_the_smoother_is_asked_by_its_face_while_a_leg_runs():
+def test_live_and_forecast_use_only_public_names_of_the_estimator():
     face = {f'odocal_ros.estimator.{name}' for name in estimator.__all__}
-    # of a drive that nobody drives yet
+    # forecasts of planned drives
     planned = ('ideal_samples', 'planned_indoor', 'planned_methods')
-    asked = {name for path in _modules() if _part(path) in ('live', 'forecast')
+    used = {name for path in _modules() if _part(path) in ('live', 'forecast')
              and path.stem not in planned
              for name in _imports(path) if name.startswith('odocal_ros.estimator')}
-    assert asked
-    assert asked <= face
+    assert used
+    assert used <= face
 
 
-def test_the_rooms_stand_in_order_and_nothing_else_lies_beside_them():
+def test_the_table_has_all_packages_in_order():
     order = list(ROOMS)
-    for room, used in ROOMS.items():      # so that there is no way back
+    for room, used in ROOMS.items():      # no circular imports
         assert all(order.index(other) < order.index(room) for other in used.split()), room
     assert {_part(p) for p in _modules()} == set(ROOMS) | COMMON | {'__init__', '__main__'}
     for common in COMMON:
         assert not _own_parts(PACKAGE / f'{common}.py')
 
 
-def test_the_pure_parts_ask_no_clock_and_open_nothing():
+def test_pure_packages_use_no_clock_and_no_file():
     pure = [p for p in _modules() if _part(p) in (
         'nav', 'screening', 'calib', 'estimator', 'pipeline', 'forecast', 'apply')
             and p.stem != 'leg_so_far']      # it measures how long its own passes take

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The converter of comma2k19, on folders laid out as its page says: simulated, and made back."""
+"""The converter of comma2k19, on simulated folders with the documented layout."""
 
 import json
 
@@ -22,7 +22,7 @@ FRAMES = 20.0                        # Hz
 
 
 def put(folder, name, **arrays):
-    """Write arrays as that data set has them: numpy's format, no ending."""
+    """Write arrays as in the data set: in the format of numpy, without a file extension."""
     (folder / name).mkdir(parents=True, exist_ok=True)
     for part, rows in arrays.items():
         with (folder / name / part).open('wb') as file:
@@ -56,7 +56,7 @@ def drive():
 
 @pytest.fixture(scope='module')
 def segment(drive, tmp_path_factory):
-    """Return the folder of that drive, as the page of comma2k19 has it."""
+    """Return the folder of that drive, with the layout on the page of comma2k19."""
     folder = tmp_path_factory.mktemp('comma') / 'b0c9|2018-08-02--08-34-47' / '40'
     log = folder / 'processed_log'
     begin_ns = drive.options.start_ns
@@ -66,7 +66,7 @@ def segment(drive, tmp_path_factory):
     t = boot(drive.imu.stamp_ns)
     put(log, 'IMU/gyro', t=t, value=drive.imu.w_i)
     put(log, 'IMU/gyro_uncalibrated', t=t, value=drive.imu.w_i + 0.067)
-    # the accelerometer has times of its own, a third of a step earlier, and one less
+    # the accelerometer has its own times, a third of a step earlier, and one row less
     own = t[1:] - 0.006
     put(log, 'IMU/accelerometer', t=own, value=np.stack([
         np.interp(own, t, column) for column in drive.imu.f_i.T], -1))
@@ -91,15 +91,15 @@ def made(segment, tmp_path_factory):
     return out
 
 
-def test_the_bag_holds_what_the_folder_held(made, drive):
+def test_the_bag_contains_the_data_of_the_folder(made, drive):
     topics = {'imu': '/imu/data', 'odometer': '/vehicle/twist', 'fix': '/fix'}
     bag = read_bag(made / 'bag', topics)
     imu, odometer, fix = (bag.samples(slot) for slot in topics)
-    # UTC in float64 seconds, as the data set has it, is good to 0.25 us
+    # UTC in float64 seconds, as in the data set, has a resolution of 0.25 us
     for got, sent in ((imu, drive.imu), (odometer, drive.odometer), (fix, drive.fix)):
         assert np.abs(got.stamp_ns - sent.stamp_ns).max() < 1000
     np.testing.assert_array_equal(imu.w_i, drive.imu.w_i)
-    inner = slice(1, -1)      # linear between neighbours: as near as they are to each other
+    inner = slice(1, -1)      # linear between adjacent rows: within their difference
     jumps = np.abs(np.diff(drive.imu.f_i, axis=0))
     near = np.maximum(jumps[1:], jumps[:-1]) + 1e-9
     assert np.all(np.abs(imu.f_i - drive.imu.f_i)[inner] <= near)
@@ -118,7 +118,7 @@ def test_the_bag_holds_what_the_folder_held(made, drive):
     np.testing.assert_allclose(wheels.samples('odometer_right').value, 1.01 * drive.odometer.value)
 
 
-def test_its_calibration_stands_beside_its_truth(made, drive, tmp_path, capsys):
+def test_the_calibration_agrees_with_the_truth(made, drive, tmp_path, capsys):
     truth = yaml.safe_load((made / 'truth.yaml').read_text())
     assert truth['scale']['value'] == pytest.approx(SCALE, abs=3 * truth['scale']['sigma'])
     assert truth['scale']['sigma'] < 2e-3
@@ -158,14 +158,14 @@ def test_the_reference_is_the_pose(made, drive):
     (lambda log: (log / 'GNSS/live_gnss_ublox').rename(log / 'GNSS/other'), 'no fixes'),
     (lambda log: put(log.parent, 'global_pose', frame_times=np.arange(3.0)), 'not of one length'),
 ], ids=range(8))
-def test_a_folder_that_is_otherwise_gets_one_sentence(segment, tmp_path, capsys, spoil, says):
+def test_a_folder_with_another_layout_is_refused(segment, tmp_path, capsys, spoil, says):
     import re
     import shutil
     mine = tmp_path / '40'
     shutil.copytree(segment, mine)
     spoil(mine / 'processed_log')
     assert comma2k19_bag.main([str(mine), '--out', str(tmp_path / 'out')]) == 2
-    told = capsys.readouterr().err
-    assert re.search(says, told)
-    assert len(told.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert re.search(says, printed)
+    assert len(printed.splitlines()) == 1
     assert not (tmp_path / 'out' / 'bag').exists()

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One name, one number: a threshold's name says of what it is, so it stands in one module.
+A constant has one name in one module; the name of a threshold states what it limits.
 
-Beside it, or above its group, stands where the number is from, in a word of settings/levels.py.
+A comment next to it, or above its group, states its origin by a word of settings/levels.py.
 """
 
 import ast
@@ -17,7 +17,7 @@ import odocal_ros
 PACKAGE = Path(odocal_ros.__file__).parent
 ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'estimator', 'pipeline', 'forecast',
          'apply', 'live')
-# where a vector's unknowns lie: two vectors may hold the same quantity
+# indices of unknowns in a vector: two vectors may contain the same quantity
 LAYOUTS = ('estimator/state.py', 'apply/errors.py')
 
 
@@ -27,7 +27,7 @@ MARK = re.compile(r'(?:^|[,;:.] )(?:physical|statistical|judgement|format|defini
 
 
 def _assignments(tree):
-    """Yield the top-level assignments of a number, or of some; dicts are tables of their own."""
+    """Yield the top-level assignments of one or more numbers; dicts are separate tables."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(
                 isinstance(x, ast.Constant) and type(x.value) in (int, float)
@@ -36,14 +36,14 @@ def _assignments(tree):
 
 
 def _numbers(tree):
-    """Yield the names that a module gives to a number, or to some of them, at its top level."""
+    """Yield the top-level names of one or more numbers in a module."""
     for node in _assignments(tree):
         for target in node.targets:
             yield from (x.id for x in ast.walk(target) if isinstance(x, ast.Name))
 
 
 def _unmarked(text):
-    """Return the lines whose number has no mark beside it, or in the comment above its group."""
+    """Return the lines with a number without an origin mark in the comments of it or its group."""
     lines, tree = text.splitlines(), ast.parse(text)
     begin = {node.end_lineno: node.lineno for node in tree.body if isinstance(node, ast.Assign)}
     lacks = []
@@ -61,7 +61,7 @@ def _unmarked(text):
     return lacks
 
 
-def test_no_two_modules_give_one_name_to_two_numbers():
+def test_no_two_modules_use_one_name_for_two_numbers():
     homes = defaultdict(list)
     for room in ROOMS:
         for path in (PACKAGE / room).rglob('*.py'):
@@ -73,7 +73,7 @@ def test_no_two_modules_give_one_name_to_two_numbers():
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
 
 
-def test_each_number_says_where_it_is_from():
+def test_each_number_has_its_origin_in_a_comment():
     second = Path(__file__).parents[1] / 'reproductions' / 'odocal_reproductions'
     lacks = {path.as_posix(): _unmarked(path.read_text(encoding='utf-8'))
              for package in (PACKAGE, second) for path in package.rglob('*.py')}

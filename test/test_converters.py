@@ -22,7 +22,7 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 
 
 def frame(number, **signals):
-    """Return the 8 bytes of each row of signals, by the layout of the data set."""
+    """Return the 8 bytes of each row of signals, in the layout of the data set."""
     bits = 0
     for name, value in signals.items():
         first, width, factor, offset = SIGNALS[number][name]
@@ -63,7 +63,7 @@ def session():
                                     longitude=[9.86, 9.9, -71.0], accuracy=[1, 1, 7]))])
 
 
-def test_signals_are_those_of_the_layout(session):
+def test_signals_have_the_layout_of_the_data_set(session):
     imu, twist, pulses, speed, fix = (topic.pack(slice(None))
                                       for topic in canedge_bag.topics(*session))
     np.testing.assert_array_equal(imu['linear_acceleration'][:2],
@@ -79,7 +79,7 @@ def test_signals_are_those_of_the_layout(session):
                                [[0.5, 0.5, 9], [24.5, 24.5, 9]])
 
 
-def test_the_recorded_drive_comes_back(data_dir):
+def test_a_drive_converted_to_frames_and_back_is_unchanged(data_dir):
     """The bag of the recording as frames, and these as a bag: the same messages."""
     stored, messages = {}, {}
     with AnyReader([data_dir / 'canedge_car_165' / 'bag']) as bag:
@@ -110,7 +110,7 @@ def test_the_recorded_drive_comes_back(data_dir):
         np.testing.assert_array_equal(topic.time_ns, stamp[topic.name])
         expected = np.frombuffer(bytearray().join(raw for _, raw in stored[topic.name]),
                                  found.dtype)
-        # degrees were radians between
+        # radians and degrees in between
         for name in POSITION_FIELDS if topic.name == '/fix' else ():
             np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-12)
             expected[name] = found[name]
@@ -144,7 +144,7 @@ def recording(data_dir, tmp_path_factory):
     return path, source
 
 
-def test_the_recording_of_the_husky_comes_back(recording, tmp_path):
+def test_the_recording_of_the_husky_is_converted_without_loss(recording, tmp_path):
     path, source = recording
     assert husky_bag.main([str(path), '--out', str(tmp_path)]) == 0
     with AnyReader([source]) as bag, AnyReader([tmp_path / 'bag']) as converted:
@@ -159,7 +159,7 @@ def test_the_recording_of_the_husky_comes_back(recording, tmp_path):
 
 
 def same(topic, found, expected):
-    """Compare what a calibration uses of two messages."""
+    """Compare the fields of two messages that a calibration uses."""
     if topic == '/odometer/pulses_derived':
         assert abs(found.data - expected.data) <= 1          # a rounding
     elif topic == '/vehicle/twist':
@@ -176,7 +176,7 @@ def same(topic, found, expected):
                                             for one in (found, expected)))
 
 
-def test_a_file_that_is_not_the_recording_is_refused(tmp_path, capsys):
+def test_a_file_other_than_the_recording_is_refused(tmp_path, capsys):
     (tmp_path / 'other.bag').write_bytes(b'nothing')
     assert husky_bag.main([str(tmp_path / 'other.bag'), '--out', str(tmp_path / 'out')]) == 2
     assert 'husky_bag: ' in capsys.readouterr().err

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rows of a damaged recording, and methods that fail: each costs itself, never the leg."""
+"""Damaged rows and methods that fail: only they are excluded, never the leg."""
 
 from dataclasses import replace
 from functools import partial
@@ -44,7 +44,7 @@ def with_speeds(leg, speeds):
 
 
 def garbage(rng, first, last, column):
-    """Overwrite rows with random bits, as a block that unpacks wrongly has them."""
+    """Overwrite rows with random bits, like a block that is unpacked wrongly."""
     raw = rng.integers(0, 256, column[first:last].nbytes, np.uint8)
     column[first:last] = raw.view(np.float64).reshape(column[first:last].shape)
 
@@ -62,8 +62,8 @@ def test_a_block_of_garbage_is_never_accepted(made, config, seed, share):
     assert Code.ROWS_DAMAGED in everything_said(result)
 
 
-def test_mild_neighbours_go_with_their_clump(made, config):
-    """One row of twenty shows; the others are off by what a sensor might say."""
+def test_rows_near_impossible_ones_are_excluded_with_them(made, config):
+    """One row of twenty is impossible; the others are wrong by possible values."""
     rng = np.random.default_rng(5)
 
     def wrong(column):
@@ -74,7 +74,7 @@ def test_mild_neighbours_go_with_their_clump(made, config):
     assert result.verdict is not Verdict.ACCEPTED
 
 
-def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
+def test_occasional_nan_of_a_driver_is_not_damage(made):
     leg = spoilt(made.leg(), 'imu', w_i=(slice(None, None, 50), np.nan))
     said = everything_said(calibrate(leg, settings(made)))
     assert Code.BAD_ROWS_DROPPED in said
@@ -82,16 +82,16 @@ def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
 
 
 @pytest.mark.parametrize(('rows', 'accepted'), [(4, True), (8, False)])
-def test_several_wild_rows_are_a_caution_wherever_they_stand(made, config, rows, accepted):
-    """Eight far apart stood beside wrong ones that nothing showed: a yaw 17 sigmas off."""
+def test_several_impossible_rows_give_a_caution_at_any_place(made, config, rows, accepted):
+    """Eight far apart were next to undetected wrong ones: a yaw error of 17 sigmas."""
     at = np.linspace(500, len(made.imu.stamp_ns) - 500, rows).astype(int)
     result = calibrate(spoilt(made.leg(), 'imu', w_i=(at, 1e200)), config)
     assert (Code.ROWS_DAMAGED not in everything_said(result)) == accepted
     assert (result.verdict is Verdict.ACCEPTED) == accepted
 
 
-def test_wild_rows_and_rows_off_by_little_are_a_clump_together(made):
-    """A gyro of 0.8 rad/s in one row at rest lay between two that showed: a yaw 25 sigmas off."""
+def test_impossible_and_slightly_wrong_rows_are_one_group(made):
+    """A rate of 0.8 rad/s in a row at rest was between two impossible ones: 25 sigmas of yaw."""
     leg = made.leg()
     at = int(np.searchsorted(leg.imu.stamp_ns, leg.start_ns)) - 600
 
@@ -103,7 +103,7 @@ def test_wild_rows_and_rows_off_by_little_are_a_clump_together(made):
     assert result.verdict is not Verdict.ACCEPTED
 
 
-def test_what_a_clump_is():
+def test_groups_of_impossible_rows():
     wild = np.zeros(1000, bool)
     assert not near_impossible_groups(wild).any()
     wild[[100, 400, 800]] = True
@@ -114,7 +114,7 @@ def test_what_a_clump_is():
 
 
 @pytest.mark.parametrize('yaw', [0, 2])
-def test_exact_zeros_that_were_rotated_twice_are_no_damage(made, yaw):
+def test_exact_zeros_that_are_rotated_twice_are_not_damage(made, yaw):
     C, C_again = (matrix_from_rpy(np.pi / 2 * np.array(n)) for n in ((1, 1, yaw), (1, 1, 2)))
 
     def upright(column):
@@ -133,7 +133,7 @@ def test_a_filtered_speed_that_fades_at_rest_is_zero(made):
 
 
 @pytest.mark.parametrize('value', [5e-324, -1e-310, 1e-200])
-def test_subnormal_odometer(made, value):
+def test_subnormal_odometer_values_are_used(made, value):
     leg = with_speeds(made.leg(), np.full(len(made.odometer.stamp_ns), value))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
@@ -155,7 +155,7 @@ BAD_COVARIANCES = [
     np.diag([1e-300, 1e-300, 1.0]), np.diag([1e300, 1.0, 1.0]), np.full((3, 3), 5e-324)]
 
 
-def test_covariances_that_are_none(made, config, whole):
+def test_invalid_covariances_are_not_used(made, config, whole):
     def some(covariance):
         covariance[::len(covariance) // 8][:8] = BAD_COVARIANCES
     result = calibrate(spoilt(made.leg(), 'fix', covariance_n=some), config)
@@ -166,7 +166,7 @@ def test_covariances_that_are_none(made, config, whole):
 
 
 @pytest.mark.parametrize('broken', ['two_point', 'smoother'])
-def test_a_fault_in_a_method_costs_that_method(made, config, whole, monkeypatch, broken):
+def test_an_exception_in_a_method_excludes_that_method(made, config, whole, monkeypatch, broken):
     def breaks(prepared, passed):
         raise np.linalg.LinAlgError('Singular\nmatrix')
     monkeypatch.setitem(leg_methods.METHODS, broken, breaks)
@@ -179,7 +179,7 @@ def test_a_fault_in_a_method_costs_that_method(made, config, whole, monkeypatch,
     assert 'Traceback' in trace
     other, = {'two_point', 'smoother'} - {broken}
     assert result.methods[other].estimates == whole.methods[other].estimates
-    # two legs of it, too: the combination knows what is missing
+    # also with two legs: the combination has the missing method
     later = replace(result, start_ns=result.stop_ns, stop_ns=2 * result.stop_ns - result.start_ns)
     both = combine([result, later], config)
     assert both.estimates['scale_factor'].method == other

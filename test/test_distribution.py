@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sdist and wheel are complete; the files for conda and containers name all that is needed."""
+"""Sdist and wheel are complete; files for conda and containers name all requirements."""
 
 import email
 import json
@@ -27,7 +27,7 @@ XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 
 
 def repository_files():
-    """Return what git knows, as names."""
+    """Return the names of the files in git."""
     listed = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip('NO GIT REPOSITORY HERE: nothing to compare the sdist with')
@@ -44,7 +44,7 @@ def run(*words, cwd):
 
 @pytest.fixture(scope='module')
 def distributions(tmp_path_factory):
-    """Build an sdist of the files git knows, and a wheel of that sdist; return both."""
+    """Build an sdist of the files in git, and a wheel of that sdist; return both."""
     pytest.importorskip('setuptools', reason='NO SETUPTOOLS HERE: no sdist can be built')
     work = tmp_path_factory.mktemp('distribution')
     for name in repository_files():
@@ -61,14 +61,14 @@ def distributions(tmp_path_factory):
     return sdist, work / f'odocal_ros-{VERSION}-py3-none-any.whl'
 
 
-def test_the_sdist_holds_what_the_repository_holds(distributions):
+def test_the_sdist_contains_the_files_of_the_repository(distributions):
     with tarfile.open(distributions[0]) as archive:
         held = {m.name.partition('/')[2] for m in archive.getmembers() if m.isfile()}
     made = {name for name in held if '.egg-info/' in name} | {'PKG-INFO', 'setup.cfg'}
     assert held - made == repository_files() - {'setup.cfg'}
 
 
-def test_the_wheel_holds_the_package_and_its_files(distributions):
+def test_the_wheel_contains_the_package_and_its_files(distributions):
     with zipfile.ZipFile(distributions[1]) as wheel:
         held = set(wheel.namelist())
         about = email.message_from_bytes(wheel.read(f'odocal_ros-{VERSION}.dist-info/METADATA'))
@@ -124,7 +124,7 @@ def test_conda_files_name_what_setup_requires():
     needed = {line.split()[0] for line in recipe['requirements']['run']}
     keys = {e.text for e in XML.findall('exec_depend')}
     ros = {f'ros-jazzy-{key.replace("_", "-")}' for key in keys if not key.startswith('python3-')}
-    optional = {'rosbags'}       # of PyPI alone
+    optional = {'rosbags'}       # on PyPI only
     assert needed == required() - optional | ros | {'python', 'rich'}
     assert recipe['context']['version'] == VERSION
     pixi = tomllib.loads((ROOT / 'pixi.toml').read_text())
@@ -134,7 +134,7 @@ def test_conda_files_name_what_setup_requires():
     assert set(pixi['environments']['default']) <= set(pixi['feature'])
 
 
-def test_the_container_is_of_files_that_exist():
+def test_the_container_uses_files_that_exist():
     text = (ROOT / 'Dockerfile').read_text()
     targets = re.findall(r'^FROM \S+ AS (\w+)$', text, re.MULTILINE)
     assert targets == ['offline', 'ros']

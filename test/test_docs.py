@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every command in README and docs is run, here or where the table of the others says."""
+"""Every command in README and docs is run, here or where the table states."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from odocal_ros.settings.config_file import read_config_file
 
 pytestmark = pytest.mark.slow
 
-# what begins otherwise than with odocal or ros2, and what runs it instead of this file
+# commands other than odocal and ros2, and what runs them instead of this file
 ELSEWHERE = {
     './tools/try-it': 'installs for a minute: run by hand and by the README of a release',
     './tools/test': '.ci/run runs it',
@@ -31,9 +31,9 @@ ELSEWHERE = {
     '.venv/bin/mypy': '.ci/run runs it',
     'export': 'the TLS of a Dask cluster: test/fleet',
     '.venv/bin/python': 'test_comma2k19.py runs that module'}
-# pages whose commands go on from each other
+# pages whose commands depend on earlier ones
 FLEET, INDOOR = 'docs/first_fleet.md', 'docs/indoor.md'
-RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed
+RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block with printed text
 KNOWN = {'odocal', 'ros2', *ELSEWHERE}
 STRAIGHT = {'scenario': 'straight', 'duration': 180.0, 'fix_noise': 'rtk'}
 OPTIONS = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic'}
@@ -44,7 +44,7 @@ def page_of(name):
     return (ROOT / name).read_text(encoding='utf-8')
 
 
-def test_each_block_is_of_commands_that_somebody_runs():
+def test_each_block_has_known_commands():
     seen = set()
     for page in PAGES:
         for block in blocks(page.read_text(encoding='utf-8')):
@@ -63,7 +63,7 @@ def put_bag(path, made, names=DEFAULTS):
 
 
 def printed(words, capfd, code=0):
-    """Return what a command prints that ends with a code."""
+    """Return the printed text of a command that ends with a code."""
     capfd.readouterr()
     ended = cli.main(words)
     out, err = capfd.readouterr()
@@ -73,7 +73,7 @@ def printed(words, capfd, code=0):
 
 @pytest.fixture(autouse=True)
 def undrawn(request, monkeypatch):
-    """Draw the report for the README alone: that is half the time of a replay."""
+    """Draw the report for the README only: it takes half the time of a replay."""
     if 'README.md' not in request.node.name:
         monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: ('', ''))
 
@@ -91,7 +91,7 @@ def results(tmp_path_factory):
 
 
 def meant_to_be_typed(line):
-    """Tell a command line from a mention (odocal compare A B ...), which test_readme.py parses."""
+    """Return whether a text is a command line, not a mention (odocal compare A B ...)."""
     words = shlex.split(line)
     return len(words) > 2 and not any(word.isupper() or word == '...' for word in words)
 
@@ -100,7 +100,7 @@ def meant_to_be_typed(line):
     (page, line) for page, line in all_commands('odocal')
     if meant_to_be_typed(line) and page not in (FLEET, INDOOR)],
     ids=lambda text: text[:60])
-def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd, results):
+def test_odocal_commands_give_stated_results(page, line, tmp_path, monkeypatch, capfd, results):
     words = shlex.split(line)[1:]
     monkeypatch.chdir(tmp_path)
     for text in yaml_blocks(page_of(page)):
@@ -119,8 +119,8 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         scale = content['result']['scale_factor']
         truth = drive(**STRAIGHT).truth.scale
         assert abs(scale['value'] - truth) < 4 * scale['sigma']
-        told = page_of('docs/report.md').partition('contains everything')[2].split('[files.md]')[0]
-        assert set(re.findall(r'`(\w+)`', told)) <= set(content)
+        keys = page_of('docs/report.md').partition('contains everything')[2].split('[files.md]')[0]
+        assert set(re.findall(r'`(\w+)`', keys)) <= set(content)
     elif words[0] == 'simulate':
         assert {p.name for p in tmp_path.iterdir()} >= {'drive', 'truth.yaml'}
     elif words[0] == 'plan':
@@ -134,7 +134,7 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         assert out
 
 
-def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch, capfd):
+def test_the_fleet_tutorial_gives_the_results_on_the_page(tmp_path, monkeypatch, capfd):
     pytest.importorskip('distributed')
     monkeypatch.chdir(tmp_path)
     page = page_of(FLEET)
@@ -142,19 +142,19 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
         shlex.split(line)[1:] for page, line in all_commands('odocal') if page == FLEET)
     assert cli.main(made) == 0
     assert '\n'.join((tmp_path / 'fleet' / 'manifest.csv').read_text().splitlines()[:2]) in page
-    # test/fleet looks at the reports: drawing them is most of the time
+    # test/fleet tests the reports: drawing them takes most of the time
     out = printed([*calibrated, '--reports', 'none'], capfd, code=1)
     worth = r'^  (\w+): (accepted|rejected); (.*) ([-\d]+)$'
-    told = re.findall(worth, page, re.MULTILINE)
-    assert re.findall(worth, out, re.MULTILINE) == told
+    listed = re.findall(worth, page, re.MULTILINE)
+    assert re.findall(worth, out, re.MULTILINE) == listed
     truth = yaml.safe_load((tmp_path / 'fleet' / 'truth.yaml').read_text())['vehicles']
     assert {(v['vehicle'], change['by'][:10]) for v in truth for change in v['changes']} == {
-        (name, when) for name, *_, when in told}
+        (name, when) for name, *_, when in listed}
     program, = (text for language, text in fenced(page) if language == 'python')
     exec('\n'.join(program), {})
     out, _ = capfd.readouterr()
     assert re.findall(r'^(\w+_\d{3}) ', out, re.MULTILINE) == [
-        name for name, verdict, *_ in told if verdict == 'accepted']
+        name for name, verdict, *_ in listed if verdict == 'accepted']
     assert cli.main(replayed) == 0
     out = printed([*accepted, '--reports', 'none'], capfd, code=1)
     rows = {row['vehicle']: row for row in map(
@@ -165,7 +165,7 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
     assert f'shuttle_001 is {100 * off:.2f} % above' in page
 
 
-def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch, capfd):
+def test_the_indoor_tutorial_prints_the_text_on_the_page(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     lines = [shlex.split(line)[1:] for page, line in all_commands('odocal') if page == INDOOR]
     assert [words[0] for words in lines] == ['simulate', 'inspect', 'replay'] + [
@@ -193,20 +193,20 @@ def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch
             in page_of(INDOOR))
 
 
-def test_the_figures_of_the_page_are_those_that_are_drawn():
+def test_the_page_lists_the_figures_of_the_report():
     table = page_of('docs/report.md').partition('| figure |')[2].partition('\n\n')[0]
-    told = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
+    listed = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
     source = ''.join((ROOT / 'odocal_ros' / 'output' / name).read_text()
                      for name in ('plots.py', 'scale_plots.py'))
     drawn = re.findall(r"return '([^']+)', text", source)
-    assert told == drawn
+    assert listed == drawn
     assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()
 
 
 def test_each_source_of_a_budget_is_explained():
     page = page_of('docs/report.md')
     cells = re.findall(r'^\| ([\w, -]+) \|', page, re.MULTILINE)
-    told = {name for cell in cells for name in cell.split(', ')} | {'gyro bias y', 'gyro bias z'}
+    listed = {name for cell in cells for name in cell.split(', ')} | {'gyro bias y', 'gyro bias z'}
     assert '*Errors of single legs*' in page
     made = drive(scenario='town', duration=200.0, two_wheels=True, imu_grade='industrial')
     more = {'method': 'all', 'odometer.left': 'topic', 'odometer.right': 'topic'}
@@ -214,10 +214,10 @@ def test_each_source_of_a_budget_is_explained():
     budgets = {name: method.details.get('budget') for name, method in leg.methods.items()}
     assert all(budgets.values()), budgets
     found = {source_label(source) for budget in budgets.values() for source in budget}
-    assert found <= told, f'say in docs/report.md what they are: {found - told}'
+    assert found <= listed, f'say in docs/report.md what they are: {found - listed}'
 
 
-def test_settings_files_on_the_pages_are_taken(tmp_path):
+def test_settings_files_on_the_pages_are_valid(tmp_path):
     texts = [text for page in PAGES for text in yaml_blocks(page.read_text(encoding='utf-8'))
              if 'ros__parameters' in text]
     assert texts
@@ -226,7 +226,7 @@ def test_settings_files_on_the_pages_are_taken(tmp_path):
         assert len(read_config_file(tmp_path / 'mine.yaml')) > 3
 
 
-def test_files_for_common_vehicles_are_taken():
+def test_files_for_common_vehicles_are_valid():
     files = sorted((ROOT / 'config').glob('vehicle_*.yaml'))
     assert len(files) == 3
     for path in files:
@@ -236,7 +236,7 @@ def test_files_for_common_vehicles_are_taken():
             found), path.name
 
 
-def test_a_plan_says_what_the_page_quotes(capfd):
+def test_a_plan_prints_the_text_on_the_page(capfd):
     words = [shlex.split(line)[1:] for page, line in all_commands('odocal')
              if page == 'docs/first_calibration.md' and ' plan ' in line]
     plans = [json.loads(printed([*command, '--json'], capfd)) for command in words]

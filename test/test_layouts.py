@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The layouts for RViz, Foxglove and PlotJuggler: whole, and of names that those programs know."""
+"""The layouts for RViz, Foxglove and PlotJuggler: complete, with names of those programs."""
 
 import re
 
@@ -10,7 +10,7 @@ import shown
 
 from odocal_ros.settings.config import SETTINGS
 
-# from rviz_default_plugins/plugins_description.xml of Jazzy, those that could be meant here
+# from rviz_default_plugins/plugins_description.xml of Jazzy, those of interest here
 RVIZ = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_common/Selection', 'rviz_common/Time',
         *(f'rviz_default_plugins/{name}' for name in (
             'Axes', 'Grid', 'Path', 'TF', 'MoveCamera', 'Measure', 'FocusCamera', 'Select',
@@ -39,7 +39,7 @@ def leaves(layout):
     return leaves(layout['first']) + leaves(layout['second'])
 
 
-def test_rviz_names_classes_that_rviz_has():
+def test_rviz_layout_uses_classes_of_rviz():
     classes = [c for c in all_values(shown.rviz(), 'Class') if c]
     assert len(classes) > 8
     assert set(classes) <= RVIZ
@@ -62,7 +62,7 @@ def test_rviz_shows_both_paths_in_their_own_frame_latched():
 
 @pytest.mark.parametrize(('name', 'panels'), [
     ('odocal_foxglove.json', PANELS), ('odocal_result_foxglove.json', {'map', 'Plot'})])
-def test_foxglove_places_every_panel_once_and_knows_its_type(name, panels):
+def test_foxglove_has_every_panel_once_with_a_known_type(name, panels):
     layout = shown.foxglove(name)
     placed = leaves(layout['layout'])
     for panel in layout['configById'].values():
@@ -72,7 +72,7 @@ def test_foxglove_places_every_panel_once_and_knows_its_type(name, panels):
     assert {name.partition('!')[0] for name in placed} == panels
 
 
-def test_foxglove_draws_paths_status_and_curves():
+def test_foxglove_shows_paths_status_and_curves():
     panels = shown.foxglove()['configById']
     assert panels['3D!paths']['followTf'] == SETTINGS['frames.local'].default
     assert all(topic['type'] == 'line' for topic in panels['3D!paths']['topics'].values())
@@ -82,7 +82,7 @@ def test_foxglove_draws_paths_status_and_curves():
         assert shown.KEY.search(path) or re.fullmatch(r'/[a-z/]+(\.[a-z_]+)+', path), path
 
 
-def test_plotjuggler_has_its_parts_and_subscribes_what_it_draws():
+def test_plotjuggler_is_complete_and_subscribes_to_its_curves():
     root = shown.plotjuggler()
     assert root.tag == 'root'
     for splitter in root.iter('DockSplitter'):
@@ -94,7 +94,7 @@ def test_plotjuggler_has_its_parts_and_subscribes_what_it_draws():
         assert set(plugin.find('selected_topics').get('value').split(';')) == wanted
 
 
-def test_all_topics_are_those_of_the_node():
+def test_all_topics_in_the_layouts_are_of_the_node():
     assert set(shown.published()) == OUTPUTS
     assert {topic for topic, _ in shown.of_inputs()} <= INPUTS
     assert shown.status_names() == {('odocal', 'calibrator: calibration')}

@@ -71,7 +71,7 @@ def test_factors_and_places_are_within_their_sigmas(options):
     for wheel in wheels:
         e, beside = found[f'scale_factor_{wheel.name}'], method.details['wheels'][wheel.name]
         assert abs(e.value - wheel.scale) < SIGMAS * e.sigma
-        # without the error of the scale factor, which all have; 1 ppm as for two wheels
+        # without the common error of the scale factor; 1 ppm as for two wheels
         assert abs(beside['ratio'] * one.truth.scale / wheel.scale - 1) < SIGMAS * np.hypot(
             beside['ratio_sigma'], 1e-6)
         # 0.1 mm: of a single wheel between left and right y_sigma is some micrometres
@@ -148,21 +148,21 @@ def test_an_axle_with_a_dead_wheel_is_left_out_with_a_caution(steers, dead):
 
 @pytest.mark.parametrize('dead', [(2,), (2, 3), (0, 1), (0, 3)], ids=str)
 def test_without_an_axle_that_is_known_not_to_steer_the_leg_is_rejected(dead):
-    """Of the rear axle nothing is left, or both front wheels: nobody knows what steers."""
+    """No wheel of the rear axle counts, or both front wheels: the steered axle is unknown."""
     one = made()
     _, found = screen(with_dead(one, dead), config(one))
     assert Code.WHEEL_DEAD in codes(found)
     assert Code.WHEEL_LEFT_OUT not in codes(found)
 
 
-def test_a_single_wheel_that_is_dead_is_found():
+def test_a_single_dead_wheel_is_found():
     one = made(wheels=3)
     _, found = screen(with_dead(one, (2,)), config(one))
     assert codes(found)[Code.WHEEL_DEAD].startswith(
         'front did not count: the travel is 0 % of that of the wheel that travels most')
 
 
-def test_a_slip_of_one_of_four_wheels_is_named_and_the_factors_hold():
+def test_slip_of_one_of_four_wheels_is_reported_and_factors_are_correct():
     one = made(front_steers=False, odometer_rate=50.0)
     t = (one.wheels[1].stamp_ns - one.truth.start_ns) * 1e-9
     spun = np.clip((t - 100.0) / 1.0, 0.0, 1.0) * 1.0 / one.truth.scale       # 1 m
@@ -193,16 +193,16 @@ def departing(**ratios):
     return codes(reasons).get(Code.WHEEL_DEPARTS, '')
 
 
-def test_the_wheel_that_departs_is_named():
+def test_the_wheel_that_deviates_is_reported():
     text = departing(fl=1.0, fr=0.98, rl=1.002, rr=1.001)
     assert text.startswith('the factor of wheel fr is 2.10 % smaller than that of the others '
                            '(limit 1 %). Likely cause: ')
     assert departing(fl=1.0, fr=0.995, rl=1.002, rr=1.001) == ''
-    # two axles with wheels of their own: none departs
+    # two axles with different wheels: none deviates
     assert departing(fl=1.03, fr=1.031, rl=1.0, rr=1.001) == ''
 
 
-def test_wheels_go_in_pairs():
+def test_wheels_are_grouped_in_pairs():
     assert pair_wheels(('a', 'b', 'c', 'd', 'e')) == [('a', 'b'), ('c', 'd'), ('e',)]
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An IMU that sends turn rates only: the scale comes by gyro, counter and fixes, and no angle."""
+"""An IMU with turn rates only: a scale from gyro, counter and fixes, and no angle."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 
 
 def without_force(made, value=0.0, planar=False):
-    """Return the leg of a drive whose IMU sends no force, and about one axis only if planar."""
+    """Return the leg of a drive whose IMU sends no force, and one turn rate only if planar."""
     leg = made.leg()
     w_i = leg.imu.w_i * ([0.0, 0.0, 1.0] if planar else 1.0)
     return replace(leg, imu=replace(leg.imu, w_i=w_i, f_i=np.full_like(leg.imu.f_i, value)))
@@ -26,7 +26,7 @@ def without_force(made, value=0.0, planar=False):
 
 @cached
 def calibrated(how='zero', **options):
-    """Return a drive, its settings and what its leg without force gives."""
+    """Return a drive, its settings and the result of its leg without force."""
     made = drive(**TOWN | options)
     config = settings(made, heading_sigma=None, method='auto')
     leg = without_force(made, np.nan if how == 'nan' else 0.0, how == 'yaw rate alone')
@@ -36,7 +36,7 @@ def calibrated(how='zero', **options):
 def scale_alone(made, calibration):
     """Check that a calibration with a caution has the scale, within its sigma, and no angle."""
     scale = calibration.estimates['scale_factor']
-    # 240 ppm of fixes of 1.5 m, 500 ppm of hills unseen
+    # 240 ppm from fixes of 1.5 m, 500 ppm from hills that are not measured
     assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.003 * made.truth.scale
     assert all(calibration.estimates[name].value is None for name in ANGLES)
     assert calibration.verdict is Verdict.CAUTION
@@ -51,7 +51,7 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
     said = everything_said(result)
     assert Code.NO_IMU not in said
     assert 'need an accelerometer' in said[Code.NO_ACCELEROMETER]
-    # nothing that only an accelerometer sees is made up
+    # no value that requires an accelerometer
     assert not {Code.WHEEL_SLIP, Code.REVERSING_UNSIGNED, Code.IMU_AXES,
                 Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH} & set(said)
     method = result.methods['smoother']
@@ -92,7 +92,7 @@ def test_hills_are_in_the_sigma():
 
 @pytest.mark.parametrize('seed', [2, 4])
 def test_ten_minutes_by_a_gyro_alone_are_solved(seed):
-    """Information on tilt and height is small beside that of the counts: it is not lost."""
+    """Information on tilt and height is small compared with the counts, and is not lost."""
     made = drive(scenario='town', seed=seed, two_wheels=True, duration=600.0)
     config = settings(made, heading_sigma=None, method='smoother', imu__grade='consumer')
     method = calibrate(without_force(made), config).methods['smoother']
@@ -100,7 +100,7 @@ def test_ten_minutes_by_a_gyro_alone_are_solved(seed):
     assert off(method, made, 'scale_factor', 'scale_factor_left', 'scale_factor_right') < 3
 
 
-def test_a_heading_from_outside_gives_the_yaw_all_the_same():
+def test_an_external_heading_gives_the_yaw_without_an_accelerometer():
     made = drive(**TOWN)
     config = settings(made, heading_sigma=2e-3, method='auto')
     found = combine([calibrate(without_force(made), config)], config).estimates
@@ -108,8 +108,8 @@ def test_a_heading_from_outside_gives_the_yaw_all_the_same():
     assert abs(yaw.value - made.truth.yaw) < 3 * yaw.sigma < 0.02
 
 
-def test_a_leg_without_force_tells_another_no_angle():
-    """Its angles are held as set: they are no observation, however small their sigmas."""
+def test_a_leg_without_force_adds_no_angle_to_another_leg():
+    """Its angles are the configured ones: not observations, also with small sigmas."""
     one, config, first = calibrated()
     _, _, without = calibrated(seed=8, start_ns=one.options.start_ns + 10**13)
     with_one = calibrate(one.leg(), config)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The package as pip and colcon install it: what is declared, and what starts."""
+"""The package as installed by pip and colcon: declared requirements and commands."""
 
 import ast
 from functools import cache
@@ -26,16 +26,16 @@ ROOT = Path(__file__).resolve().parent.parent
 PARTS = ('package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml', 'README.md', 'LICENSE',
          'resource', 'config', 'launch', 'odocal_ros')
 XML = ElementTree.parse(ROOT / 'package.xml').getroot()
-# import name: what package.xml and setup.py call it
+# import name: its names in package.xml and setup.py
 KEYS = {name: (f'python3-{name}', name) for name in (
     'numpy', 'jinja2', 'matplotlib', 'pyproj', 'rich', 'scipy', 'tqdm')} | {
         'yaml': ('python3-yaml', 'PyYAML'), 'rosbags': ('rosbags', 'rosbags')}
-EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that brings it
-TABLES = {'pandas', 'pyarrow'}      # of the extra tables: who wants them is told what to install
-# of the extra for fleets, which pip alone brings: a vehicle's computer has no use for it
+EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that installs it
+TABLES = {'pandas', 'pyarrow'}      # extra tables: an error states what to install
+# of the extra for fleets, by pip only: not needed on the computer of a vehicle
 FLEET = {'dask', 'distributed', 'fsspec'} | TABLES
 WITH_DISTRIBUTED = {'psutil'}
-# what lacks them says what to install: rosdep has no key of the first, and not everywhere of rich
+# an error states how to install them: rosdep has no key of the first, not everywhere of rich
 BY_PIP = {'rosbags', 'rich', 'rerun'}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
@@ -53,7 +53,7 @@ def imported():
     return names - set(sys.stdlib_module_names) - {'odocal_ros'} - WITH_ROSBAGS - TABLES
 
 
-def test_one_version_everywhere():
+def test_all_files_have_the_same_version():
     version = odocal_ros.__version__
     assert XML.findtext('version') == version
     changes = (ROOT / 'CHANGELOG.rst').read_text()
@@ -66,7 +66,7 @@ def test_one_version_everywhere():
     assert cited['version'] == version
 
 
-def test_each_source_file_says_whose_it_is_and_under_what_licence():
+def test_each_source_file_has_a_copyright_and_a_licence():
     own, = SPDX.file_headers
     words = own.format(copyright='Copyright 2026 odocal_ros maintainers')
     head = '\n'.join(f'# {line}' for line in words.splitlines())
@@ -80,7 +80,7 @@ def test_each_source_file_says_whose_it_is_and_under_what_licence():
             and head not in path.read_text(encoding='utf-8')[:1000]] == []
 
 
-def test_the_changelog_is_as_bloom_reads_it():
+def test_the_changelog_has_the_format_of_bloom():
     changelog = pytest.importorskip('catkin_pkg.changelog', reason='no catkin_pkg here')
     found = changelog.get_changelog_from_path(str(ROOT), 'odocal_ros')
     newest, date, content = next(found.foreach_version())
@@ -89,7 +89,7 @@ def test_the_changelog_is_as_bloom_reads_it():
     assert len(content[0].bullets) > 10
 
 
-def test_package_xml_names_all_that_is_imported():
+def test_package_xml_names_all_imported_packages():
     declared = {e.text for e in XML.findall('exec_depend')}
     wanted = {KEYS[name][0] if name in KEYS else name
               for name in imported() - FLEET - WITH_DISTRIBUTED - BY_PIP}
@@ -99,17 +99,17 @@ def test_package_xml_names_all_that_is_imported():
     assert XML.findtext('export/build_type') == 'ament_python'
 
 
-def test_the_quality_declaration_tells_of_each_key_how_it_was_checked():
+def test_the_quality_declaration_lists_each_dependency_with_its_check():
     page = (ROOT / 'QUALITY_DECLARATION.md').read_text()
     table = page.partition('| key | Debian')[2].partition('\n\n')[0]
     rows = [line.split('|') for line in table.splitlines()[2:]]
-    told = [key for row in rows for key in re.findall(r'`(\w[\w-]*)`', row[1])]
-    assert sorted(told) == sorted(e.text for kind in ('depend', 'exec_depend', 'test_depend')
+    listed = [key for row in rows for key in re.findall(r'`(\w[\w-]*)`', row[1])]
+    assert sorted(listed) == sorted(e.text for kind in ('depend', 'exec_depend', 'test_depend')
                                   for e in XML.findall(kind))
     assert all(row[2].strip() and row[3].strip() for row in rows)
 
 
-def test_setup_requires_all_that_is_imported_but_ros():
+def test_setup_requires_all_imported_packages_except_ros():
     setup = (ROOT / 'setup.py').read_text()
     block = setup.partition('install_requires=[')[2].partition(']')[0]
     required = set(re.findall(r"'([A-Za-z0-9]+)", block))
@@ -138,7 +138,7 @@ def copy_of_the_package(target: Path) -> Path:
 
 
 def clean_environment(**more) -> dict[str, str]:
-    """Return the environment without what ties it to this interpreter or checkout."""
+    """Return the environment without variables of this interpreter or checkout."""
     drop = ('PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
     return {k: v for k, v in os.environ.items()
             if k not in drop and not k.startswith(('_ROS_', 'COLCON_'))} | more
@@ -194,7 +194,7 @@ def environment_of(installed) -> dict[str, str]:
     return clean_environment(PYTHONPATH=str(site))
 
 
-def test_colcon_puts_the_commands_where_ros2_run_looks(installed):
+def test_colcon_installs_the_commands_for_ros2_run(installed):
     assert {p.name for p in (installed / 'lib' / 'odocal_ros').iterdir()} == {
         'calibrator', 'drive_pattern', 'odocal', 'odometry'}
     share = installed / 'share'
@@ -207,7 +207,7 @@ def test_colcon_puts_the_commands_where_ros2_run_looks(installed):
     assert 'replay' in out
 
 
-def test_the_node_that_colcon_installed_starts_and_ends(installed):
+def test_the_node_installed_by_colcon_starts_and_ends(installed):
     rclpy = pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
     from std_srvs.srv import Trigger
     space = f'package_{uuid.uuid4().hex}'

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pages keep their word: commands parse, names exist, tables and recipes are right."""
+"""The pages are correct: commands parse, names exist, tables and recipes are right."""
 
 import math
 import re
@@ -24,12 +24,12 @@ PAGE = (ROOT / 'docs' / 'recipes.md').read_text(encoding='utf-8')
 
 
 @pytest.mark.parametrize('path', [*settings_page.pages()], ids=lambda path: path.name)
-def test_pages_made_from_the_code_are_fresh(path):
+def test_generated_pages_are_up_to_date(path):
     assert path.read_text(encoding='utf-8') == settings_page.pages()[path], (
         'stale: run python -m tools.settings_page --write')
 
 
-def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
+def test_an_outdated_page_is_reported_and_written_again(tmp_path, monkeypatch, capsys):
     (tmp_path / 'config').mkdir()
     (tmp_path / 'docs').mkdir()
     whole = (ROOT / 'docs' / 'settings.md').read_text()
@@ -48,14 +48,14 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
     assert settings_page.main() == 0
 
 
-def test_each_setting_has_its_row():
+def test_each_setting_has_a_row():
     page = (ROOT / 'docs' / 'settings.md').read_text()
     rows = re.findall(r'^\| `([\w.]+)` \| [\w\[\]]+(?: \(ro\))? \| (.*?) \|', page, re.MULTILINE)
     assert [name for name, _ in rows] == list(SETTINGS)
     assert dict(rows)['leg.min_distance'] == '100.0'
 
 
-def test_the_readme_is_short_and_in_its_order():
+def test_the_readme_is_short_and_has_its_sections_in_order():
     lines = README.splitlines()
     assert len(lines) <= 120
     order = ['pictures/watch.svg', '## Install', 'pip install .', 'uvx ', 'docker build',
@@ -78,7 +78,7 @@ def test_odocal_commands_parse():
     for line in lines:
         words = shlex.split(line)[1:]
         assert words[0] in cli.COMMANDS, line
-        if len(words) == 1:      # a mention, no command line
+        if len(words) == 1:      # a mention, not a command line
             continue
         args = cli._parser(words[0]).parse_args(words)
         assert args.command == words[0], line
@@ -120,7 +120,7 @@ def test_settings_and_reasons_named_in_the_text_exist():
             assert name in SETTINGS, f'{page.name}: {name}'
 
 
-def test_the_node_offers_what_the_page_lists():
+def test_the_node_has_the_topics_and_services_on_the_page():
     pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
     from odocal_ros.data.inputs import TOPICS
     from odocal_ros.live import node
@@ -143,7 +143,7 @@ def blocks():
     return ros, plain
 
 
-def test_each_parameter_is_one_that_was_read_in_the_source():
+def test_each_parameter_exists_in_the_other_system():
     ros, plain = blocks()
     ours = yaml.safe_load((ROOT / 'config' / 'ekf_odocal.yaml').read_text())
     ros.append({name.rpartition('/')[2]: block for name, block in ours.items()})
@@ -166,7 +166,7 @@ def test_a_twist_config_has_the_fifteen_states():
 
 
 def test_the_radius_gives_the_travel_of_the_factor():
-    """By ArduPilot's own line: distance = 2 pi counts / CPR * radius."""
+    """By the equation of ArduPilot: distance = 2 pi counts / CPR * radius."""
     _, (settings,) = blocks()
     travel = 2 * math.pi / float(settings['WENC_CPR']) * float(settings['WENC_RADIUS'])
     assert abs(travel - 0.0213) < 1e-7
@@ -184,7 +184,7 @@ def _cited(text, letter):
 
 
 @pytest.mark.parametrize('letter', 'STW')
-def test_equations_of_the_method_are_in_order_and_cited_and_no_others_are(letter):
+def test_equations_of_the_method_are_in_order_and_all_citations_exist(letter):
     assert list(range(1, len(TAGS[letter]) + 1)) == TAGS[letter]
     assert len(TAGS[letter]) > MOST[letter]
     code = set()

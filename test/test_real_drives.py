@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table of real drives: made here of a simulated one, with its truth as the reference."""
+"""The table of real drives: made from a simulated one, with its truth as the reference."""
 
 import sys
 
@@ -33,7 +33,7 @@ def data(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_page_gets_a_row_for_each_odometer(data, monkeypatch):
+def test_the_page_has_a_row_for_each_odometer(data, monkeypatch):
     page = data / 'page.md'
     page.write_text(f'before\n{real_drives.BEGIN}old\n{real_drives.END}after\n')
     (data / 'pictures').mkdir()
@@ -51,5 +51,5 @@ def test_the_page_gets_a_row_for_each_odometer(data, monkeypatch):
     assert 'odometer: /ticks, because' in gallery
     assert 'scale factor' in gallery
     assert 'corrected' in (data / 'pictures' / 'a_drive.svg').read_text()
-    assert abs(float(rows[0][4])) < 4           # sigmas, of the counter beside its own truth
+    assert abs(float(rows[0][4])) < 4           # sigmas, of the counter against its truth
     assert all(row[-2] in ('accepted', 'caution') for row in rows)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiments of docs/conventions.md on a simulated vehicle: the numbers grow as told."""
+"""The experiments of docs/conventions.md on a simulated vehicle: signs are as stated."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -47,30 +47,30 @@ def found(**options):
 
 
 def test_each_experiment_of_the_page_is_done_here():
-    told = [int(n) for n in re.findall(r'^\| (\d+) \|', PAGE, re.MULTILINE)]
+    listed = [int(n) for n in re.findall(r'^\| (\d+) \|', PAGE, re.MULTILINE)]
     here = {int(n) for name in globals() for n in re.findall(r'_experiments?_(\d+)', name)}
     here |= {int(n) for name in globals() for n in re.findall(r'_and_(\d+)', name)}
-    assert told == list(range(1, len(told) + 1))
-    assert set(told) == here
+    assert listed == list(range(1, len(listed) + 1))
+    assert set(listed) == here
 
 
 def test_experiment_1_gravity_shows_upwards():
     assert at_rest(drive(**STRAIGHT))[2] == pytest.approx(9.8, abs=0.05)
 
 
-def test_experiment_2_a_left_turn_is_above_zero():
+def test_experiment_2_a_left_turn_is_positive():
     made = drive(**TURN)
     rows = turning(made, made.imu)
     assert np.median(made.imu.w_i[rows, 2]) > 0.1
 
 
-def test_experiment_3_pulling_away_is_above_zero():
+def test_experiment_3_acceleration_from_rest_is_positive():
     made = drive(**STRAIGHT, yaw=0.0, pitch=0.0)
     t = seconds(made, made.imu)
     assert made.imu.f_i[(t > 65) & (t < 80), 0].min() > 0.1
 
 
-def test_experiment_4_the_left_side_lifted_grows():
+def test_experiment_4_lifting_the_left_side_increases_the_value():
     level, lifted = (at_rest(drive(**STRAIGHT, roll=np.deg2rad(a))) for a in (0.0, 5.0))
     assert lifted[1] - level[1] == pytest.approx(9.8 * np.sin(np.deg2rad(5)), abs=0.02)
 
@@ -84,12 +84,12 @@ def test_experiments_5_and_6_a_turn_of_the_wheel():
     assert counts[-1] - counts[0] == pytest.approx(turns * pulses, abs=2)
 
 
-def test_experiment_7_the_outer_wheel_goes_farther():
+def test_experiment_7_the_outer_wheel_travels_farther():
     made = drive(**TURN, two_wheels=True, wheel_difference=0.0)
-    way = [np.ptp(w.value[turning(made, w)]) for w in (made.odometer, made.odometer_right)]
-    assert way[1] > way[0]
+    path = [np.ptp(w.value[turning(made, w)]) for w in (made.odometer, made.odometer_right)]
+    assert path[1] > path[0]
     # the track width times half a turn
-    assert (way[1] - way[0]) * made.truth.scale == pytest.approx(1.6 * np.pi, rel=0.02)
+    assert (path[1] - path[0]) * made.truth.scale == pytest.approx(1.6 * np.pi, rel=0.02)
 
 
 @pytest.mark.parametrize(('heading', 'grows'), [(np.pi / 2, 'longitude'), (0.0, 'latitude')])
@@ -113,7 +113,7 @@ def test_experiments_9_and_10_compass_and_yaw():
 
 
 def test_experiment_10_the_offset_is_added_to_the_topic():
-    # a topic that points a quarter turn to the left of the IMU's x axis needs that taken off
+    # a topic that points 90 deg to the left of the IMU x axis needs that subtracted
     made = drive(**STRAIGHT, heading_sigma=1e-4)
     q = made.heading.q_ni
     turned = np.stack([q[:, 0] - q[:, 1], q[:, 0] + q[:, 1], q[:, 2] + q[:, 3],
@@ -134,7 +134,7 @@ def test_experiments_11_and_12_the_mounting_angles(angle):
     assert after.value - before.value == pytest.approx(np.deg2rad(2.0), abs=5e-4)
 
 
-def test_experiment_12_the_front_tipped_down_shows_less_than_nothing():
+def test_experiment_12_the_front_tilted_down_is_negative():
     assert at_rest(drive(**STRAIGHT, yaw=0.0, pitch=np.deg2rad(3.0)))[0] == pytest.approx(
         -9.8 * np.sin(np.deg2rad(3.0)), abs=0.01)
 
@@ -144,7 +144,7 @@ def test_experiment_13_larger_tyres():
     assert after.value / before.value == pytest.approx(1.05, abs=2e-4)
 
 
-def test_experiment_14_late_stamps_are_brought_back():
+def test_experiment_14_late_stamps_are_corrected():
     def first_metre(made, **changes):
         inputs, _ = screen(made.leg(), settings(made, **changes))
         return np.interp(1.0, inputs.travel.s * made.truth.scale, inputs.travel.t)

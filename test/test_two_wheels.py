@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two wheels that do not count alike: spans, kinds, rates and gaps of their own."""
+"""Two wheels with different counters: spans, types, rates and gaps of each."""
 
 from dataclasses import replace
 
@@ -41,19 +41,19 @@ def with_right(made, change, **more):
 
 @pytest.mark.parametrize('span', [65536, 4096, 256, 10_000, 9000])
 @pytest.mark.parametrize('signed', [False, True])
-def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signed):
+def test_a_hidden_span_is_found_and_unwrapped_exactly(made, clean, span, signed):
     half = span // 2 * signed
     leg = with_right(made, lambda a: (a + half) % span - half)
     inputs, found = screen(leg, settings(made))
     reason, = (r for r in found if r.code is Code.WHEEL_COUNTERS_DIFFER)
     assert f"right wheel's counter rolls over at {span}," in reason.text
     assert f'have this modulus, set odometer.wrap to {span}.' in reason.remedy
-    # bridging would lose counts; here none is
+    # bridging would lose counts; none is lost here
     assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
     assert not len(inputs.uncertain_t)
 
 
-def test_the_wheel_and_the_first_time_are_named(made):
+def test_a_hidden_span_is_reported_with_wheel_and_first_time(made):
     leg = spoilt(made.leg(), 'odometer', value=lambda a: a % 32768)
     rolled = np.flatnonzero(np.diff(leg.odometer.value) < 0)
     _, said = screened(leg, made)
@@ -63,13 +63,13 @@ def test_the_wheel_and_the_first_time_are_named(made):
     assert f'{len(rolled)} jump' in text
 
 
-def test_both_wheels_of_one_hidden_span_are_both_undone(made, clean):
+def test_a_hidden_span_of_both_wheels_is_unwrapped_in_both(made, clean):
     leg = spoilt(with_right(made, lambda a: a % 4096), 'odometer', value=lambda a: a % 4096)
     inputs, _ = screened(leg, made)
     assert np.array_equal(inputs.travel.s, clean.travel.s)
 
 
-def test_a_span_of_no_round_number_is_taken_with_its_doubt(made, clean):
+def test_a_span_that_is_not_a_power_of_two_has_an_uncertainty(made, clean):
     inputs, said = screened(with_right(made, lambda a: a % 4321), made)
     assert 'about' in said[Code.WHEEL_COUNTERS_DIFFER]
     off = inputs.travels[1].s[-1] - clean.travels[1].s[-1]
@@ -78,7 +78,7 @@ def test_a_span_of_no_round_number_is_taken_with_its_doubt(made, clean):
     assert abs(off / 2) < 3 * doubt
 
 
-def test_damaged_counts_are_no_span(made):
+def test_damaged_counts_are_not_a_span(made):
     count = take(made.odometer, slice(1000))
     value = 10 * np.arange(1000)
     for row in (200, 400, 600):
@@ -93,7 +93,7 @@ def test_damaged_counts_are_no_span(made):
 
 @pytest.mark.parametrize(('span', 'found'), [(256, True), (260, False), (2**16, True)])
 @pytest.mark.parametrize('per_row', [0.5, 1.0])
-def test_one_rollover_between_dense_rows_is_undone(made, span, found, per_row):
+def test_one_rollover_between_dense_rows_is_unwrapped(made, span, found, per_row):
     total = span - 100 + np.floor(per_row * np.arange(300)).astype(np.int64)
     count = changed(take(made.odometer, slice(300)), value=lambda _: total % span)
     step = np.diff(count.value.astype(float))
@@ -102,7 +102,7 @@ def test_one_rollover_between_dense_rows_is_undone(made, span, found, per_row):
     assert np.array_equal(np.diff(same.value), np.diff(total)) == found
 
 
-def test_angles_wrapped_at_a_turn_are_unrolled():
+def test_angles_wrapped_at_a_turn_are_unwrapped():
     made = drive(**ROUTE | {'odometer': 'angle', 'odometer_rate': 50.0})
     inputs, said = screened(with_right(made, lambda a: np.angle(np.exp(1j * a))), made)
     clean, _ = screened(made.leg(), made)
@@ -111,7 +111,7 @@ def test_angles_wrapped_at_a_turn_are_unrolled():
     assert_allclose(inputs.travels[1].s, clean.travels[1].s, atol=1e-6)
 
 
-def test_a_reset_is_no_rollover_and_the_wheel_is_named(made):
+def test_a_reset_is_not_a_rollover_and_is_reported_with_the_wheel(made):
     def reset(a):
         a[3000:] -= a[3000]
 
@@ -138,7 +138,7 @@ def test_a_count_and_a_speed_have_no_mean(made):
     assert_allclose(inputs.travel.s[-1], np.diff(made.odometer.value).sum())
 
 
-def test_a_right_wheel_that_never_speaks_is_dead(made):
+def test_a_right_wheel_without_messages_is_dead(made):
     silent = without(made.leg(), 'odometer_right')
     _, said = screened(silent, made, odometer__left='topic', odometer__right='topic')
     assert 'right wheel has no message' in said[Code.WHEEL_DEAD]
@@ -152,7 +152,7 @@ def test_a_right_wheel_that_sends_no_number_is_dead(made):
     assert len(inputs.travel.t)
 
 
-def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made, clean):
+def test_wheels_with_other_rates_and_ends_are_used_where_both_have_rows(made, clean):
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
     # a row stamped early by 7 ms: as a wheel read 7 ms late
     leg = spoilt(kept(made.leg(), 'odometer_right', slice(101, 5001, 2)), 'odometer_right',
@@ -167,7 +167,7 @@ def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made, clean)
     assert np.abs(inputs.travel.s - want).max() < bound
 
 
-def test_a_gap_of_the_right_wheel_is_said_though_the_mean_has_none(made, clean):
+def test_a_gap_of_the_right_wheel_only_is_reported(made, clean):
     some = np.r_[0:2000, 2060:len(made.odometer_right.value)]
     inputs, said = screened(kept(made.leg(), 'odometer_right', some), made)
     assert said[Code.TOPIC_GAP].startswith('right odometer gap of 3.05 s')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A small zoo: the errors of twelve drawn vehicles, in sigmas, are those that are stored here."""
+"""A small zoo: errors over sigmas of twelve drawn vehicles equal the values stored here."""
 
 from drives import configured
 import pytest
@@ -13,7 +13,7 @@ from odocal_ros.sim.scenarios import simulate
 pytestmark = [pytest.mark.core, pytest.mark.slow]
 FIRST_SEED = 70_000_000     # as benchmarks/zoo.py, whose drives are longer
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
-# a fit ends when a pass moves it by less than 0.03 sigma; versions of numpy differ by some passes
+# a fit ends when a pass changes it by less than 0.03 sigma; numpy versions differ by some passes
 TOLERANCE = 0.1
 ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
     ('town', 'consumer', 'caution', (-0.79, 0.05, 0.77)),
