@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bench for the node: its process, a client beside it, and waits that end with the event."""
+"""Test bench of the node: its process, a client, and functions that wait for an event."""
 
 import contextlib
 import os
@@ -21,9 +21,9 @@ PATIENCE = 60.0   # s, for one event; only a failing test waits so long
 
 class NodeProcess:
     """
-    The node as a process of its own; what it prints is kept. The calibrator draws no report.
+    The node in its own process; its output is kept. The calibrator draws no report.
 
-    before : Python that runs before the node does.   module : of live/ that holds the node.
+    before : Python code that runs before the node.   module : module of live/ with the node.
     """
 
     def __init__(self, *args: str, env: dict | None = None, before: str = '',
@@ -55,7 +55,7 @@ class NodeProcess:
         return self.wait()
 
     def wait(self) -> int:
-        """Return the exit code once it has ended by itself."""
+        """Wait for the end of the process and return the exit code."""
         try:
             code = self.process.wait(PATIENCE)
         finally:
@@ -66,7 +66,7 @@ class NodeProcess:
 
 
 def wait_for(condition, what: str, patience: float = PATIENCE):
-    """Return what ``condition`` gives as soon as it is true; fail saying what did not come."""
+    """Return the result of ``condition`` as soon as it is true; fail after the timeout."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         result = condition()
@@ -83,13 +83,13 @@ def given(settings: dict[str, object]) -> list[str]:
 
 
 def as_dict(status) -> dict:
-    """Return a DiagnosticStatus with its values by key."""
+    """Return a DiagnosticStatus as a dict with its values by key."""
     return {'level': status.level, 'name': status.name, 'message': status.message,
             **{kv.key: kv.value for kv in status.values}}
 
 
 class Client:
-    """A node in the test's process that talks to the calibrator and keeps what it publishes."""
+    """A node in the process of the test that calls the calibrator and keeps its messages."""
 
     def __init__(self, name: str = 'calibrator') -> None:
         import rclpy
@@ -146,7 +146,7 @@ class Client:
         """Return the first status from now on (the newest included) that has these values."""
         first = max(0, len(self.statuses) - 1)
 
-        def found():     # in all that came: a state may be over before it is looked at
+        def found():     # in all received: a state may end before it is tested
             return next((status for status in self.statuses[first:] if all(
                 status.get(k) == v for k, v in required.items())), None)
         try:
@@ -179,7 +179,7 @@ class Client:
         return answer
 
     def start(self):
-        """Start a leg as soon as the node has heard what was just sent; return the answer."""
+        """Start a leg as soon as the node has received the sent messages; return the answer."""
         def begun():
             answer = self.call('start_leg')
             return answer if answer.success else None
@@ -210,6 +210,6 @@ class Client:
 
 
 def answer_of(future):
-    """Return the answer of a service called."""
+    """Wait for the answer of a service call and return it."""
     wait_for(future.done, 'the answer of the service')
     return future.result()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fixtures of the node's tests: nodes and clients that end."""
+"""Fixtures of the tests of the node: nodes and clients that end with the test."""
 
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -12,7 +12,7 @@ from bench import Client, given, NodeProcess
 import pytest
 
 HAVE_ROS = find_spec('rclpy') is not None
-# what needs a real node, by itself or by a helper; the pure parts of live/ are tested everywhere
+# tests that need a real node, also through a helper; the others are run everywhere
 NEEDS_ROS = re.compile(r'^ *(import|from) (rclpy|bench|kills|player|wire)\b', re.MULTILINE)
 collect_ignore = [] if HAVE_ROS else [
     path.name for path in Path(__file__).parent.glob('test_*.py')
@@ -20,14 +20,14 @@ collect_ignore = [] if HAVE_ROS else [
 
 
 def pytest_report_header():
-    """Say loudly that the node was not tested."""
+    """Report that the node was not tested."""
     return None if HAVE_ROS else ('LIVE NODE NOT TESTED: no rclpy here; source ROS 2 Jazzy or pip '
                                   'install odocal_ros[ros]')
 
 
 @pytest.fixture
 def start(tmp_path):
-    """Return a function that starts the node with settings as a process; all end."""
+    """Return a function that starts a node process with settings; end all of them."""
     started = []
 
     def run(settings: dict | None = None, *words: str, **kwargs) -> NodeProcess:
@@ -42,7 +42,7 @@ def start(tmp_path):
 
 @pytest.fixture
 def connect():
-    """Return a function that connects a client; all end with the test."""
+    """Return a function that connects a client; close all clients."""
     with ExitStack() as ends:
         def run(name: str = 'calibrator') -> Client:
             client = Client(name)

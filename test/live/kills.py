@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Kill the node in the middle of a leg and look what its journal has left of it."""
+"""Kill the node during a leg and read what its journal contains."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SCALE = 1.02      # true
 SPEED = 10.0      # times real time: 380 messages a second
-BEFORE_S, START_S, LAST_S = 30.0, 60.0, 170.0    # of the drive: played from, marked, played to
+BEFORE_S, START_S, LAST_S = 30.0, 60.0, 170.0    # of the drive: start of playing, start mark, end
 NUMBERS = ('--set', 'output.formats=[params]')   # no report is drawn
 
 
@@ -39,28 +39,28 @@ def killed(driven, moment_s: float, folder: Path) -> SimpleNamespace:
         with leg.playing(START_S, LAST_S, SPEED):
             status = client.until(state='recording')
             time.sleep(max(0.0, moment_s - (time.monotonic() - marked)))
-            # a busy machine: by then the node must have heard of most of it
+            # on a busy machine: wait until the node has received most of the leg
             wait_for(lambda: duration_in_status(client) >= moment_s - 1.0, 'the leg in the status')
-            told_s, end_ns = duration_in_status(client), time.time_ns()
+            leg_s, end_ns = duration_in_status(client), time.time_ns()
             leg.node.process.kill()
             leg.node.wait()
             moment_s = time.monotonic() - marked
     journal, = (folder / 'journal').iterdir()
-    return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
+    return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), leg_s)
 
 
 def duration_in_status(client) -> float:
-    """Return how long the leg is by the newest status, in s as it is played."""
+    """Return the duration of the leg in the newest status, s of wall time."""
     return float(client.status['duration_s']) / SPEED
 
 
 def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
-            told_s: float = 0.0) -> SimpleNamespace:
+            leg_s: float = 0.0) -> SimpleNamespace:
     """
-    Return what is left in a journal: files, marks as replay finds them, and what replay gives.
+    Return the content of a journal: files, marks found by replay, and the result of replay.
 
-    moment_s : wall time from the mark to the kill.   end_ns : of the kill.   start_ns : the mark,
-    as the node had published it.   told_s : how long the leg was by the last status, as played.
+    moment_s : wall time from the mark to the kill.   end_ns : time of the kill.   start_ns : start
+    mark in the status.   leg_s : duration of the leg in the last status, s of wall time.
     """
     with open_bag(journal) as bag:
         rows = [(time_ns, stamp_of(m)) for time_ns, m in bag.messages('/imu/data')]
@@ -69,10 +69,10 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
         marks, files = marked_legs(bag), len(bag.files)
     code, result, stderr = replayed(journal, *NUMBERS)
     return SimpleNamespace(
-        moment_s=moment_s, told_s=told_s, files=files, marks=marks, start_ns=start_ns, code=code,
+        moment_s=moment_s, leg_s=leg_s, files=files, marks=marks, start_ns=start_ns, code=code,
         text=stderr, results=[result] if result else [], legs=result['legs'] if result else [],
-        # wall time that is lost, and by how much the journal is shorter than the status states
-        lost_s=(end_ns - newest_ns) * 1e-9, short_s=told_s - kept_s)
+        # lost wall time, and by how much the journal is shorter than the leg in the status
+        lost_s=(end_ns - newest_ns) * 1e-9, short_s=leg_s - kept_s)
 
 
 def stamps_of(journal: Path, topic: str) -> list[int]:
@@ -82,7 +82,7 @@ def stamps_of(journal: Path, topic: str) -> list[int]:
 
 
 def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
-    """Return exit code, calibration.json and what ``odocal replay JOURNAL more`` says."""
+    """Return exit code, calibration.json and stderr of ``odocal replay JOURNAL more``."""
     out, stderr = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(stderr):
         code = main(['replay', str(journal), *more, '--json', '--force', '--output',
@@ -93,10 +93,10 @@ def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
 def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
                     **settings) -> SimpleNamespace:
     """
-    Kill a node ``moment_s`` after a call of ~/stop_leg, or ~/save after that (stage).
+    Kill a node ``moment_s`` after a call of ~/stop_leg, or of ~/save after it (stage).
 
-    Returns calibration.json of each whole result, folders with half of one, whether latest points
-    at a whole one or is not there, and code, calibration.json and words of the journal's replay.
+    Return calibration.json of each complete result, folders with an incomplete one, whether latest
+    is missing or points at a complete one, and the output of ``replayed`` for the journal.
     """
     with playing_to(driven, {'output.directory': folder} | settings, 3 * SPEED) as leg:
         leg.record(BEFORE_S, START_S, LAST_S)
@@ -122,7 +122,7 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
 
 
 def same_result(live: dict, offline: dict, *more: str) -> None:
-    """Assert that two results are the same in every digit, and more of their parts."""
+    """Assert that two results are the same in every digit; more : further keys to compare."""
     for key in ('result', 'verdict', 'reasons', 'methods', 'check', *more):
         assert live[key] == offline[key], key
 
@@ -139,14 +139,14 @@ def check_replay(live: dict, journal: Path) -> str:
 
 
 def wrong(left: SimpleNamespace) -> list[float]:
-    """Return the scales that were not rejected and miss the truth by more than 5 sigmas."""
+    """Return the scale factors that were not rejected and are wrong by more than 5 sigmas."""
     scales = [one['result']['scale_factor'] for one in left.results
               if one['verdict'] != 'rejected']
     return [scale['value'] for scale in scales if scale['value'] and not within(scale, SCALE, 5)]
 
 
 def whole_content(folder: Path) -> dict | None:
-    """Return calibration.json where all that stands beside it is of the same calibration."""
+    """Return calibration.json if all other files are of the same calibration, else None."""
     try:
         content = json.loads((folder / 'calibration.json').read_text())
     except FileNotFoundError:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drives played to a node: serialised messages by their stamps, N times real time."""
+"""Drives played to a node: serialised messages in order of stamps, N times real time."""
 
 import contextlib
 from dataclasses import dataclass, replace
@@ -107,7 +107,7 @@ class Player:
     @classmethod
     def connected(cls, client: Client, types: dict[str, str], names: dict[str, str] | None = None
               ) -> 'Player':
-        """Return a player to whose topics somebody has subscribed."""
+        """Return a player when its topics have subscribers."""
         player = cls(client.node, types, names)
         wait_for(player.matched, 'subscriptions of the node')
         return player
@@ -117,7 +117,7 @@ class Player:
 
     @contextlib.contextmanager
     def playing(self, messages: list[Sent], speed: float):
-        """Publish in a thread for as long as the block lasts."""
+        """Publish in a thread during the block."""
         self._stop.clear()
         thread = threading.Thread(target=self.play, args=(messages, speed), daemon=True)
         thread.start()
@@ -161,7 +161,7 @@ class Drive:
 
     @cached_property
     def player(self) -> Player:
-        """Return the player, to whose topics somebody has subscribed."""
+        """Return the player when its topics have subscribers."""
         return Player.connected(self.client, self.types, self.names)
 
     def part(self, first_s: float, last_s: float) -> list[Sent]:
@@ -171,7 +171,7 @@ class Drive:
         self.player.play(self.part(first_s, last_s), speed or self.speed)
 
     def playing(self, first_s: float, last_s: float, speed: float | None = None):
-        """Play in a thread for as long as the block lasts."""
+        """Play in a thread during the block."""
         return self.player.playing(self.part(first_s, last_s), speed or self.speed)
 
     def record(self, first_s: float, start_s: float, stop_s: float = 0.0) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs without an operator: the node begins, ends, combines and saves them, and goes on later."""
+"""Automatic legs: the node starts, ends, combines and saves them, and continues a day later."""
 
 from dataclasses import replace
 import json
@@ -17,11 +17,11 @@ import ros_bags
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SETTINGS = {'leg.automatic': 'true', 'leg.automatic_minutes': '4.0'}
-# at 30 times real time a busy machine loses more than a leg may miss, best effort
+# with best effort, a busy machine at 30 times real time loses too many messages for a leg
 RELIABLE = {f'qos_overrides./{topic}.subscription.reliability': 'reliable'
             for topic in ('imu/data', 'odometer', 'fix')}
-CHANGE = -0.009            # of the scale, while the vehicle stands
-STOP = 189.0               # s: standstill after more than half of the minutes
+CHANGE = -0.009            # of the scale, during the standstill
+STOP = 189.0               # s: standstill after more than half of leg.automatic_minutes
 DAY = 86400 * 10**9
 
 
@@ -32,7 +32,7 @@ def town(**options):
 
 
 def softer(drive, since_ns=0):
-    """Return a drive whose tyres have lost air by then: a smaller wheel turns more."""
+    """Return a drive with less tyre pressure from since_ns on: a smaller wheel turns more."""
     odometer = drive.odometer
     value = odometer.value / (1 + CHANGE * (odometer.stamp_ns > since_ns))
     return replace(drive, wheels=(replace(odometer, value=value),))
@@ -40,7 +40,7 @@ def softer(drive, since_ns=0):
 
 @pytest.fixture(scope='module')
 def drive():
-    """Drive through a town: two legs, between which the tyres lose air; goes on a day later."""
+    """Simulate two legs in a town, between which the tyres lose air, and a drive a day later."""
     whole = town()
     types, sent = messages_of(softer(whole, whole.imu.stamp_ns[0] + round(STOP * 1e9)))
     later = messages_of(softer(town(start_ns=whole.options.start_ns + DAY, seed=2)))
@@ -70,7 +70,7 @@ def _first(found, node, client):
 
 
 def _saved(folder, legs):
-    """Return what a result folder holds, None where it has not so many legs."""
+    """Return calibration.json of a result folder, None if its number of legs differs."""
     if not folder:
         return None
     found = json.loads((Path(folder) / 'calibration.json').read_text())
@@ -87,18 +87,18 @@ def _a_day_later(found, node, client):
     wait_for(lambda: float(client.status['distance_m']) > 500.0, 'half a kilometre')
     found.stop = client.result(client.ask('stop_leg'))
     found.later = client.until(legs='1')
-    client.until(state='recording', automatic='leg')       # and goes on
+    client.until(state='recording', automatic='leg')       # the next leg
     found.carried = wait_for(lambda: _saved(client.status['saved'], 1), 'the save')['carried']
     found.again = node
 
 
 def near(status, true):
-    """Return whether the scale of a status is the true one."""
+    """Return whether the scale of a status agrees with the true one."""
     value, sigma = (float(status[f'scale_factor{end}']) for end in ('', '_sigma'))
     return within({'value': value, 'sigma': sigma}, true)
 
 
-def test_legs_begin_and_end_by_themselves(seen, drive):
+def test_legs_start_and_end_automatically_at_standstills(seen, drive):
     first_ns = drive.sent[0].stamp_ns
 
     def seconds(status):
@@ -112,7 +112,7 @@ def test_legs_begin_and_end_by_themselves(seen, drive):
     assert '~/start_leg' not in seen.node.text
 
 
-def test_how_far_a_leg_is_computed_is_said(seen):
+def test_the_status_shows_the_progress_of_the_computation(seen):
     shares = [float(status['computing_percent']) for status in seen.computing]
     assert shares == sorted(shares)
     assert shares[-1] < 100
@@ -123,7 +123,7 @@ def test_how_far_a_leg_is_computed_is_said(seen):
     assert seen.next['computing_percent'] == '0.0'
 
 
-def test_a_change_of_the_scale_is_said_and_followed(seen, drive):
+def test_a_change_of_the_scale_is_reported_and_adopted(seen, drive):
     assert seen.one['level'] == b'\0'
     assert seen.two['level'] == b'\1'
     assert seen.two['reasons'].split(',')[0] == 'SCALE_CHANGED'
@@ -134,10 +134,10 @@ def test_a_change_of_the_scale_is_said_and_followed(seen, drive):
     assert near(seen.two, drive.scale * (1 + CHANGE))
 
 
-def test_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_path):
+def test_replay_of_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_path):
     topics = {slot: {'imu': '/imu/data'}.get(slot, f'/{slot}') for slot in drive.types}
     (tmp_path / 'bags').mkdir()
-    # as far as the node had heard when its second leg ended
+    # up to the last message that the node had received when its second leg ended
     recording = ros_bags.write(
         tmp_path / 'bags' / 'one', [(topics[one.slot], one.stamp_ns, one.raw)
                                     for one in part(drive.sent, 0, 364)],
@@ -150,7 +150,7 @@ def test_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_
     same_result(written, offline, 'carried')
 
 
-def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
+def test_the_node_continues_from_the_saved_result_on_the_next_day(seen, drive):
     assert 'continues ' in seen.again.text
     assert seen.later['carried_legs'] == '2'
     assert seen.carried['legs'] == 3
@@ -160,7 +160,7 @@ def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
     assert near(seen.later, drive.scale * (1 + CHANGE))
 
 
-def test_the_operator_goes_before(seen):
+def test_commands_of_the_operator_take_precedence_over_automatic_legs(seen):
     assert seen.start.success
     assert seen.start.message.startswith('recording leg 2 since')
     assert int(seen.operators['leg_id']) == 2

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs with a gap, a jump of time or two IMUs on a topic: reports at once, and the results."""
+"""Legs with a gap, a jump of time or two IMUs on a topic: immediate reports, and results."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,7 +24,7 @@ WORDS = "carries several IMUs (frame_id 'imu_link' and 'rmu_link'): set imu.fram
 
 @pytest.fixture(scope='module')
 def gap(tmp_path_factory):
-    """Drive a leg in which the IMU falls silent, and keep its messages."""
+    """Drive a leg with a gap in the IMU data, and keep the messages of the node."""
     drive = simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
         fix_noise='rtk', imu_grade='industrial'))
@@ -32,7 +32,7 @@ def gap(tmp_path_factory):
     first_ns = sent[0].stamp_ns
     sent = [one for one in sent if one.slot != 'imu'
             or not GAP[0] <= (one.stamp_ns - first_ns) * 1e-9 < GAP[1]]
-    # the status is rare otherwise: what is reported at once is visible as such
+    # with this low rate of the status, immediate reports are visible as such
     settings = {'output.directory': tmp_path_factory.mktemp('results'), 'publish.rate': 0.2}
     with playing_to((types, sent), settings) as leg:
         client = leg.client
@@ -51,13 +51,13 @@ def gap(tmp_path_factory):
                                undone=client.call('undo_leg'), **vars(seen))
 
 
-def test_a_gap_is_said_at_once_and_what_was_good_enough_stays_so(gap):
+def test_a_gap_is_reported_immediately_and_a_sufficient_scale_stays_sufficient(gap):
     assert gap.status_with_gap['level'] == b'\1'
     assert 'no IMU data for 3.02 s at t = ' in gap.status_with_gap['hint']
     assert 'the leg is cut there' in gap.status_with_gap['hint']
     assert 'cancel_leg' not in gap.status_with_gap['hint']
     warned, = [line for line in gap.node.lines if 'WARN' in line and 'LEG_CUT' in line]
-    assert '3.02 s' not in gap.silent['hint']     # it is silent still; 0.95 s on an idle machine
+    assert '3.02 s' not in gap.silent['hint']     # the gap continues; 0.95 s on an idle machine
     for status_with_gap in (gap.silent, gap.status_with_gap):
         assert status_with_gap['scale_ok'] == 'yes'
         value, sigma = (float(status_with_gap[f'estimate_scale_factor{end}'])
@@ -65,7 +65,7 @@ def test_a_gap_is_said_at_once_and_what_was_good_enough_stays_so(gap):
         assert within({'value': value, 'sigma': sigma}, gap.truth.scale)
 
 
-def test_its_parts_make_the_result_also_of_a_replay(gap):
+def test_node_and_replay_calibrate_a_leg_with_a_gap_from_its_sections(gap):
     assert gap.stop.success
     assert gap.stop.message.startswith('leg 1 in 2 sections, ')
     assert gap.status['legs'] == '1'
@@ -75,20 +75,20 @@ def test_its_parts_make_the_result_also_of_a_replay(gap):
     assert 'LEG_CUT' in {r['code'] for r in gap.live['reasons']}
     assert gap.undone.message == 'leg 1 is undone; no leg is left'
     marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in ends_of(gap.status)]
-    # undone since: it must be requested by its marks
+    # the leg is undone: replay needs its marks
     _, offline, _ = replayed(gap.journal, '--leg', ':'.join(marks), *NUMBERS)
     same_result(gap.live, offline)
 
 
 @pytest.mark.parametrize('journal', [True, False])
-def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(play_to, journal):
+def test_a_leg_cancelled_by_a_time_jump_is_reported_and_replayed(play_to, journal):
     drive = straight(heading=0.7)
     leg = play_to(messages_of(drive), {
         'alignment.heading_source': 'fixed', 'alignment.heading': drive.truth.heading,
         'journal.max_bytes': 10**9 * journal}, 30.0)
     leg.record(30, 60, 115)
     client, mark_ns = leg.client, int(leg.client.status['leg_start_ns'])
-    # a busy machine takes its time to hear what was sent before the jump
+    # a busy machine receives late what was sent before the jump
     wait_for(lambda: float(client.status['duration_s']) > 54.0, 'the last of the leg')
     leg.play(100, 101)
     client.until(leg_event='cancelled')
@@ -107,14 +107,14 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(play
         folder = Path(folder)
         wait_for((folder / 'metadata.yaml').exists, 'the joined journal')
         times = stamps_of(folder, '/imu/data')
-        assert times == sorted(times)           # nothing of the time after the jump
+        assert times == sorted(times)           # no message from after the jump
         code, result, _ = replayed(folder)
-        assert (code, result) == (2, None)      # it was cancelled: not without a request
+        assert (code, result) == (2, None)      # cancelled: replayed only on request
         code, result, stderr = replayed(folder, option, mark)
         assert code == 0, stderr
         one, = result['legs']
         assert abs(one['start_ns'] - mark_ns) < 1000
-        # 54 s of 55 were heard before the jump, and a journal may lack the last second
+        # 54 s of 55 were received before the jump, and a journal may lack the last second
         assert 53e9 < one['stop_ns'] - mark_ns < 56e9
         assert within(result['result']['scale_factor'], drive.truth.scale, 5)
     assert answer.message in leg.node.text
@@ -124,7 +124,7 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(play
 
 
 @pytest.mark.parametrize('start_ns', [60 * 10**9, 1_700_000_000_123_456_789])
-def test_the_command_marks_the_leg_to_the_microsecond_on_any_clock(start_ns):
+def test_the_replay_command_gives_the_start_mark_to_a_microsecond_on_any_clock(start_ns):
     *_, leg = shlex.split(replay_command("/a b/it's", start_ns))
     span = parse_leg(leg)
     assert span.stop_ns is None
@@ -132,7 +132,7 @@ def test_the_command_marks_the_leg_to_the_microsecond_on_any_clock(start_ns):
     assert 0 <= start_ns - span.start_ns < 1000
 
 
-def test_two_imus_on_a_topic_are_said_by_both_nodes_and_reject_the_leg(tmp_path):
+def test_two_imus_on_a_topic_are_reported_by_both_nodes_and_reject_the_leg(tmp_path):
     types, sent = messages_of(straight(imu_grade='industrial'))
     other = {one.stamp_ns for one in [one for one in sent if one.slot == 'imu'][1::2]}
     sent = [Sent(one.stamp_ns, one.slot,

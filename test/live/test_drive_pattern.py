@@ -26,7 +26,7 @@ STEP_S = 0.02
 
 
 class Robot:
-    """A unicycle in a thread; it stands while nobody has sent a command for 0.5 s."""
+    """A unicycle in a thread; it stands if the last command is older than 0.5 s."""
 
     def __init__(self, client: Client, kind: type = Twist) -> None:
         self.pose = [0.0, 0.0, 0.0]
@@ -66,7 +66,7 @@ class Robot:
 
     @contextlib.contextmanager
     def bumped(self):
-        """Press the bumper as long as the block lasts."""
+        """Press the bumper during the block."""
         wait_for(self._bumper.get_subscription_count, 'the node at the bumper')
         self._bumper.publish(Bool(data=True))
         yield
@@ -79,7 +79,7 @@ class Robot:
 
 @contextlib.contextmanager
 def ready(kind=Twist, before=lambda client: None, **settings):
-    """Yield node, client and robot; all end.   before : called before the node starts."""
+    """Yield node, client and robot; end all.   before : called before the node starts."""
     with contextlib.ExitStack() as ends:
         client = Client('drive_pattern')
         ends.callback(client.close)
@@ -94,7 +94,7 @@ def ready(kind=Twist, before=lambda client: None, **settings):
 
 @contextlib.contextmanager
 def driven(kind=Twist, **settings):
-    """Yield node, client and robot, which drives; all end."""
+    """Yield node, client and moving robot; end all."""
     with ready(kind, **settings) as (node, client, robot):
         wait_for(lambda: client.call('start').success, 'a start')
         wait_for(lambda: (robot.commands or [(0.0, 0.0)])[-1] != (0.0, 0.0), 'a command')
@@ -102,7 +102,7 @@ def driven(kind=Twist, **settings):
 
 
 def stopped(node, robot, why, within_s):
-    """Check that the node stops the robot in time, by several zeros, and then is silent."""
+    """Check that the node stops the robot in time by several zero commands, then sends none."""
     began = time.monotonic()
     wait_for(lambda: f'stopped: {why}' in node.text, f'the stop by {why}')
     assert time.monotonic() - began < within_s
@@ -116,7 +116,7 @@ def stopped(node, robot, why, within_s):
 
 def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
     with driven() as (node, client, robot):
-        assert not client.call('start').success     # it is driven already
+        assert not client.call('start').success     # the pattern is running
         stopped(node, robot, 'the pattern is complete', 60)
         x, y = zip(*robot.track, strict=True)
         # late commands: 0.1 s at 1 m/s
@@ -126,7 +126,7 @@ def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
         assert max(abs(rate) for _, rate in robot.commands) <= 3.0
 
 
-# the cause, how it is made, and whether a start is refused for it
+# cause of a stop: how to produce it, and whether it refuses a start
 CAUSES = {
     'no pose for 0.5 s': (lambda robot: patch.object(robot, 'blind', True), True),
     'the bumper is pressed': (Robot.bumped, True),
@@ -136,7 +136,7 @@ CAUSES = {
         lambda robot: patch.object(robot, 'frozen', True), False)}
 
 
-def test_each_cause_stops_and_a_start_goes_on():
+def test_each_cause_stops_the_robot_and_a_new_start_continues():
     with driven() as (node, client, robot):
         for why, (cause, refused) in CAUSES.items():
             with cause(robot):
@@ -148,7 +148,7 @@ def test_each_cause_stops_and_a_start_goes_on():
             wait_for(lambda: client.call('start').success, f'a start after {why}')
 
 
-def test_the_service_and_a_timeout_stop():
+def test_the_service_and_a_timeout_stop_the_robot():
     with driven(kind=TwistStamped, stamped='true', timeout=5.0) as (node, client, robot):
         assert client.call('stop').message == 'stopped'
         stopped(node, robot, '~/stop', 5)
@@ -167,7 +167,7 @@ def test_a_node_that_ends_stops_the_robot(number):
 
 
 @pytest.mark.parametrize(('commands_left', 'zeros'), [(3, 1 + FINAL_STOP_COMMANDS), (0, 0)])
-def test_a_node_that_ends_while_it_stops_repeats_zeros(monkeypatch, commands_left, zeros):
+def test_a_node_that_ends_during_a_stop_repeats_zero_commands(monkeypatch, commands_left, zeros):
     node, sent = object.__new__(DrivePattern), []
     node._context = SimpleNamespace(ok=lambda: True)
     node._route, node._stop_commands_left = (), commands_left
@@ -177,7 +177,7 @@ def test_a_node_that_ends_while_it_stops_repeats_zeros(monkeypatch, commands_lef
     assert sent == [(0.0, 0.0)] * zeros
 
 
-def test_another_publisher_of_commands_is_refused():
+def test_a_start_is_refused_if_another_node_publishes_commands():
     def other(client):
         client.node.create_publisher(Twist, 'cmd_vel', 1)
     with ready(before=other) as (_, client, robot):
@@ -191,7 +191,7 @@ def test_another_publisher_of_commands_is_refused():
     ({'speed': 0.2}, 'rectangle has 0 values; required'),
     ({'speed': 0.2, 'rectangle': '[0.0, 0.0, 1.0, 1.0]'}, 'the pattern has 0.00 m, required'),
     ({'speed': 9.0}, 'speed')])
-def test_what_must_be_set(settings, message):
+def test_missing_or_unusable_settings_are_an_error_at_start_up(settings, message):
     node = NodeProcess(*given(settings or {'pattern': 'square'}), module='drive_pattern')
     assert node.wait() == 1
     assert message in node.text

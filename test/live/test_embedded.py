@@ -23,7 +23,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 @pytest.fixture
 def embedded(tmp_path):
-    """Spin the node and a stranger in one executor of a context of our own."""
+    """Spin the node and another node in one executor of a separate context."""
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.parameter import Parameter
@@ -54,26 +54,26 @@ def embedded(tmp_path):
     context.try_shutdown()
 
 
-def test_name_overrides_and_remaps_pass_through(embedded):
+def test_name_overrides_and_remaps_are_passed_to_the_node(embedded):
     _, client = embedded
     assert client.get('leg.min_distance') == [20.0]
     wait_for(lambda: '/gps/fix' in client.status['missing'], 'the remapped topic')
     wait_for(lambda: 'second: imu' in client.health, "diagnostics under the node's name")
 
 
-def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
+def test_messages_wait_in_the_queue_and_have_the_times_of_their_senders(embedded):
     node, client = embedded
     imu = Input(node, 'imu', ('sensor_msgs/msg/Imu',))
     waiting = imu.waiting
     assert not waiting.gate.can_execute(imu)   # the executor is not woken for each message
     info = {'received_timestamp': 9, 'publication_sequence_number': 1}
     waiting._receive(b'first', info | {'source_timestamp': 5})
-    waiting._receive(b'second', info | {'source_timestamp': 0})  # a middleware that does not tell
+    waiting._receive(b'second', info | {'source_timestamp': 0})  # a middleware without it
     assert imu.take() == ([b'first', b'second'], [5, 9])
     assert imu.take() == ([], [])
 
 
-def test_without_take_message_the_executor_carries_all(embedded):
+def test_without_take_message_the_executor_delivers_all_messages(embedded):
     node, client = embedded
     waiting = WaitingMessages(node)
     waiting.subscribe(String, 'words', QoSProfile(depth=10))
@@ -99,7 +99,7 @@ def test_without_take_message_the_executor_carries_all(embedded):
     node.destroy_subscription(kept)
 
 
-def test_turns_are_long_unless_somebody_waits(embedded):
+def test_the_timer_period_is_long_unless_a_job_is_waited_for(embedded):
     node, client = embedded
     wait_for(lambda: node._timer.timer_period_ns == round(TICK_S * 1e9), 'long turns')
     gate = threading.Event()
@@ -110,7 +110,7 @@ def test_turns_are_long_unless_somebody_waits(embedded):
     wait_for(lambda: node._timer.timer_period_ns == round(TICK_S * 1e9), 'long turns again')
 
 
-def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):
+def test_an_error_of_the_computation_is_answered_and_the_leg_is_kept(embedded, monkeypatch):
     node, client = embedded
     leg = Drive(node, client, messages_of(simulate(SimOptions(
         duration=180.0, imu_rate=20.0, odometer_rate=10.0, odometer='speed', fix_noise='rtk'))),
@@ -130,13 +130,13 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert 'not enough for this leg' in status['message']
     assert not client.call('start_leg').success
     monkeypatch.undo()
-    # a fault after the numbers are there is an answer, too, and the node lives
+    # an error after the computation is answered, too, and the node continues
     monkeypatch.setattr(answers, 'result_answer', explode)
     assert 'MemoryError: not enough for this leg' in client.result(client.ask('stop_leg')).message
     client.until(state='calibrated', leg_id='1', legs='1')
     monkeypatch.undo()
     assert 'scale factor' in client.call('stop_leg').message
-    # of two legs undone at once none is left, though the first undoing is still combined
+    # two undo calls remove both legs, although the first is still being combined
     assert client.call('start_leg').success
     leg.play(82, 100)
     leg.ended(100)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Health of an input, and what is seen while driving: figures from made-up arrivals."""
+"""Health of inputs and progress of a leg, computed from synthetic arrivals."""
 
 from dataclasses import replace
 
@@ -26,13 +26,13 @@ def rows(stamps_s, values=None, received_s=None):
 
 
 def decoded(health, block, **limits):
-    """Process a block as an input does; return its mask."""
+    """Process a block as an input does; return the mask of usable rows."""
     return np.array(health.check_stamps(block.stamp_ns.tolist(), block.received_ns, **limits),
                     bool)
 
 
 def health_of(*blocks, arrived=(), **limits):
-    """Return the health after blocks of stamps, s, and numbers that arrived after 1 s, 2 s."""
+    """Return the health after blocks of stamps, s; arrived: sequence numbers after 1 s, 2 s."""
     health = Health()
     for second, numbers in enumerate(arrived, 1):
         health.register_arrival(numbers, now_ns=second * SECOND)
@@ -41,29 +41,29 @@ def health_of(*blocks, arrived=(), **limits):
     return health
 
 
-def test_rate_is_by_stamps_and_silence_is_by_the_rate():
+def test_the_rate_follows_from_stamps_and_the_silence_limit_from_the_rate():
     blocks = [100 + (begin + np.arange(10)) * 0.02 for begin in range(0, 100, 10)]  # 50 Hz
     health = health_of(*blocks, arrived=[[None] * 100])
     assert health.rate_hz(SECOND) == pytest.approx(50.0)
-    assert health.rate_hz(3 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz is the end
+    assert health.rate_hz(3 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz
     health = health_of([0.5, 1.5, 2.5], arrived=[[None] * 3])
     assert health.is_flowing(SECOND + 4 * SECOND)       # 5 intervals of 1 s
     assert not health.is_flowing(SECOND + 6 * SECOND)
     assert not health_of([0.0], arrived=[[1]]).is_flowing(SECOND)
 
 
-def test_losses_are_counted_across_batches_and_two_publishers_are_none():
+def test_lost_messages_are_counted_across_batches_but_not_between_two_publishers():
     assert health_of(arrived=[[5, 6, 9], [10, 12]]).lost == 3       # 7, 8 and 11
     assert health_of(arrived=[[5, 900, 6, 901], [1, 2]]).lost == 0
 
 
-def test_gaps_by_limit_and_by_median():
+def test_gaps_are_counted_by_the_limit_and_by_the_median_interval():
     assert health_of([1.0, 1.01, 1.6], max_gap_s=0.5).gaps == 1
-    # 0.54 s is more than 5 of 0.1 s, 0.45 s is not
+    # 0.54 s exceeds 5 intervals of 0.1 s, 0.45 s does not
     assert health_of(np.arange(1, 2, 0.1), [2.0, 2.45, 2.99]).gaps == 1
 
 
-def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
+def test_a_block_of_old_stamps_is_a_time_jump_but_a_single_one_is_not():
     health = health_of([10.0, 10.1], [3.0, 10.2])
     assert not health.jumped_back
     decoded(health, rows([2.0, 2.1]))
@@ -73,7 +73,7 @@ def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
     assert (health.jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
 
 
-def test_a_jump_within_a_block_is_seen_however_it_is_cut():
+def test_a_time_jump_is_found_for_any_division_into_blocks():
     stamps = [*np.arange(20.0, 21.0, 0.1), *np.arange(5.0, 6.0, 0.1)]
     for cut in range(1, len(stamps)):
         assert health_of([19.9], stamps[:cut], stamps[cut:]).jumped_back, cut
@@ -81,12 +81,12 @@ def test_a_jump_within_a_block_is_seen_however_it_is_cut():
 
 @pytest.mark.parametrize('rows_at_once', [1, 3, 20])
 @pytest.mark.parametrize('wild', [-15.0, -1e6, 40.0, 1e9])
-def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
+def test_single_wrong_stamps_are_ignored_for_any_block_size(rows_at_once, wild):
     stamps = 1e6 + np.arange(20.0, 24.0, 0.1)
     for at in range(1, 19):
         health, travel, some = Health(), OdometerProgress(COUNTER), stamps.copy()
         some[at] += wild
-        sent = rows(some, np.arange(len(some)) >= 30)       # moves by less than counts
+        sent = rows(some, np.arange(len(some)) >= 30)       # one count: a standstill
         for begin in range(0, len(some), rows_at_once):
             part = take(sent, slice(begin, begin + rows_at_once))
             sound = decoded(health, part)
@@ -96,11 +96,11 @@ def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
             assert 0 <= travel.still_s() < 4
             assert abs(health.newest_ns * 1e-9 - 1e6 - 22) < 3
         assert not health.jumped_back, at
-        assert travel.still_s() == pytest.approx(3.9, abs=0.25)     # the ends may be wild
+        assert travel.still_s() == pytest.approx(3.9, abs=0.25)     # wrong stamps at the ends
 
 
 @pytest.mark.parametrize('rows_behind', [1, 2])
-def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
+def test_an_old_stamp_after_a_pause_is_ignored(rows_behind):
     health = health_of([1000.0, 1000.1], [1000.2, 1002.0, *[1.0] * rows_behind])
     assert (health.newest_ns, health.jumped_back) == (1002 * SECOND, False)
     decoded(health, rows([1002.1, 1002.2]))
@@ -108,12 +108,12 @@ def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
 
 
 @pytest.mark.parametrize('before', [[], [10.0, 10.1]])
-def test_a_stamp_seconds_ahead_within_a_block_is_no_time(before):
+def test_a_stamp_seconds_ahead_within_a_block_is_ignored(before):
     health = health_of([*before, 20.0, 10.2, 10.3, 10.4])
     assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(10.4), False)
 
 
-def test_stamps_that_go_on_far_ahead_are_a_time():
+def test_stamps_far_ahead_are_accepted_if_the_next_ones_continue_them():
     health = health_of([10.0, 10.1])
     assert decoded(health, rows([1e5])).tolist() == [False]
     assert decoded(health, rows([1e5 + 1, 1e5 + 2])).tolist() == [False, True]
@@ -121,7 +121,7 @@ def test_stamps_that_go_on_far_ahead_are_a_time():
     assert not health.jumped_back
 
 
-def test_after_a_jump_of_time_no_stamp_is_called_zero():
+def test_after_a_time_jump_stamps_are_not_reported_as_zero():
     assert not Health().stampless
     assert health_of([0.0, 0.0]).stampless
     health = health_of([0.0, 0.0], [5.0, 5.1])
@@ -130,14 +130,14 @@ def test_after_a_jump_of_time_no_stamp_is_called_zero():
 
 
 def travelled(*blocks, form=COUNTER, scale=0.02):
-    """Return the travel after blocks of (times, s, and values)."""
+    """Return the odometer progress after blocks of (times, s, and values)."""
     travel = OdometerProgress(form)
     for times, values in blocks:
         travel.feed(rows(times, np.array(values)), scale)
     return travel
 
 
-def test_distance_survives_a_rollover_and_a_reset_is_none():
+def test_the_distance_is_right_across_a_rollover_and_a_reset_adds_none():
     counts = [65000, 65300, 64, 364, 664] # 300 counts each, over 65536
     for cut in range(1, 5):
         assert travelled((range(cut), counts[:cut]), (range(cut, 5), counts[cut:])).total == 1200
@@ -147,7 +147,7 @@ def test_distance_survives_a_rollover_and_a_reset_is_none():
 
 
 @pytest.mark.parametrize(('quantity', 'unit', 'scale', 'values', 'metres'), [
-    ('increment', 'm/pulse', 0.02, [7, 10, 10], 0.4),   # the first row's belongs to before
+    ('increment', 'm/pulse', 0.02, [7, 10, 10], 0.4),   # the first is of the time before
     ('rate', '1', 1.0, [2.0, 2.0, 3.0], 5.0), ('cumulative', 'm/rad', 0.3, [1.0, 2.0, 4.0], 0.9)])
 def test_every_quantity_gives_metres(quantity, unit, scale, values, metres):
     travel = travelled((range(3), values), form=OdometerForm(quantity, 0, unit), scale=scale)
@@ -163,13 +163,13 @@ def test_a_clock_that_is_set_back_gives_no_negative_standstill():
         assert travel.rested_s(600.0) >= 0
 
 
-def test_standing_is_told_from_moving_and_a_flickering_count_is_standing():
+def test_a_standstill_is_detected_also_if_the_count_toggles_by_one():
     standing = range(6), [0, 100, 200, 200, 201, 201]
     assert travelled(standing).still_s() == pytest.approx(3.0)
     assert travelled(standing, ([6], [301])).still_s() == 0.0
 
 
-def test_the_last_standstill_counts_as_long_as_the_preroll_reaches_back_to_it():
+def test_the_last_standstill_counts_if_the_preroll_reaches_back_to_it():
     assert travelled().rested_s(600.0) == 0.0
     counts = 100 * np.concatenate([np.arange(6), np.full(10, 5), np.arange(5, 20)])
     stood = np.arange(31), counts        # stands from 5 s to 16 s, drives on to 30 s
@@ -181,7 +181,7 @@ def test_the_last_standstill_counts_as_long_as_the_preroll_reaches_back_to_it():
 
 
 def fixes(latitude, **columns):
-    """Return fixes of 0.5 m, one a second."""
+    """Return fixes with a sigma of 0.5 m, one per second."""
     n = len(latitude)
     stamps = np.arange(n) * SECOND
     return replace(FixSamples(stamps, stamps, latitude, np.full(n, 0.1), np.zeros(n),
@@ -189,7 +189,7 @@ def fixes(latitude, **columns):
                    **columns)
 
 
-def test_fix_path_counts_steps_not_noise():
+def test_the_path_length_of_the_fixes_excludes_their_noise():
     north = 1e-7 * np.array([0.0, 1.0, 0.0, 1.0, 0.0])     # 0.6 m of jitter
     drive = 0.7 + np.concatenate([north, 10e-7 * np.arange(1, 11)])  # then 63.7 m in 6.4 m steps
     path = FixPath()
@@ -201,22 +201,22 @@ def test_fix_path_counts_steps_not_noise():
 
 
 @pytest.mark.parametrize('odd', [1e200, -1e308, np.inf, np.nan, 2.0])
-def test_a_fix_from_nowhere_is_no_way(odd):
+def test_an_impossible_fix_adds_no_path_length(odd):
     path = FixPath()
     with np.errstate(all='raise'):
         path.feed(fixes(np.array([0.7, 0.7, odd, 0.7, 0.7])), 0, moving=True)
     assert (path.total, path.top) == (0.0, 0.0)
 
 
-def test_fix_noise_is_no_way_while_the_counter_stands():
-    """Half a minute of rest under fixes good to 2.5 m, then 20 s at 10 m/s, scale unknown."""
+def test_fix_noise_adds_no_path_length_while_the_counter_stands():
+    """30 s of rest with fixes of 2.5 m, then 20 s at 10 m/s; the scale is unknown."""
     rng, progress = np.random.default_rng(3), Progress()
     t = np.arange(0.0, 50.0, 0.2)
-    way = np.clip(t - 30.0, 0.0, None) * 10.0
+    x_m = np.clip(t - 30.0, 0.0, None) * 10.0
     for k in range(len(t)):
-        counts = rows(t[k:k + 1] + 1000, np.array([int(way[k] / 0.02)]))
+        counts = rows(t[k:k + 1] + 1000, np.array([int(x_m[k] / 0.02)]))
         noise = 2.5 * rng.standard_normal(2) / 6.37e6
-        fix = FixSamples(counts.stamp_ns, counts.received_ns, [0.7 + way[k] / 6.37e6 + noise[0]],
+        fix = FixSamples(counts.stamp_ns, counts.received_ns, [0.7 + x_m[k] / 6.37e6 + noise[0]],
                          [0.1 + noise[1]], [0.0], np.eye(3)[None] * 6.25, [2], [0])
         progress.feed('odometer', counts, Config(), COUNTER, float('nan'))
         progress.feed('fix', fix, Config(), COUNTER, float('nan'))
@@ -224,22 +224,22 @@ def test_fix_noise_is_no_way_while_the_counter_stands():
             assert (progress.distance_m(), progress.max_speed()) == (0.0, 0.0)
     assert progress.distance_m() == pytest.approx(200.0, rel=0.15)
     assert 9.0 < progress.max_speed() < 20.0
-    # the scale of the running estimate, once there is one
-    progress.feed('odometer', rows([1050.0], np.array([int(way[-1] / 0.02)])), Config(), COUNTER,
+    # with the scale of the running estimate
+    progress.feed('odometer', rows([1050.0], np.array([int(x_m[-1] / 0.02)])), Config(), COUNTER,
                   0.02)
-    assert progress.distance_m() == pytest.approx(way[-1], abs=0.1)
+    assert progress.distance_m() == pytest.approx(x_m[-1], abs=0.1)
     assert progress.max_speed() == pytest.approx(10.0, abs=0.1)
 
 
-def test_counts_that_come_in_a_burst_are_no_speed():
+def test_a_burst_of_counts_does_not_increase_the_maximum_speed():
     t = np.arange(0.0, 20.0, 0.02)
     late = np.where(t % 5.0 < 0.12, t - t % 5.0 + 0.12 + (t % 5.0) / 100, t) + 1000
     travel = travelled(*(([late[k]], [int(10 * t[k] / 0.02)]) for k in range(len(t))))
     assert travel.top * 0.02 == pytest.approx(10.0, rel=0.15)
 
 
-def test_a_burst_between_two_looks_is_no_clock_that_differs():
-    """A bag played 30 times as fast on a busy machine: 3 s of it come within 20 ms."""
+def test_a_burst_of_messages_is_not_reported_as_a_clock_difference():
+    """A bag played 30 times as fast on a busy machine: 3 s of it arrive within 20 ms."""
     clocks, config = Clocks(), Config()
     for i in range(20):
         arrival = 1000.0 + 0.1 * i + np.array([0.0, 0.07, 0.08])
@@ -250,7 +250,7 @@ def test_a_burst_between_two_looks_is_no_clock_that_differs():
     assert clocks.differing(config) == []
 
 
-def test_scale_for_the_hint_comes_from_what_is_known_best():
+def test_the_scale_of_the_hint_is_the_best_known_one():
     config = with_settings(Config(), {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
     angle, speed = OdometerForm('cumulative', 0, 'm/rad'), OdometerForm('rate', 0, '1')
     assert scale_so_far(Config(), COUNTER) == 0.0
@@ -271,11 +271,11 @@ def test_clocks_are_compared_between_rows_that_arrived_together():
         clocks.feed('fix', rows([(arrival[4] - 1000) * 10 + 50 - 0.3], received_s=[arrival[4]]))
         clocks.feed('odometer', rows([(arrival[4] - 1000) * 10 + 50.7], received_s=[arrival[4]]))
     assert clocks.differing(config) == [('odometer', pytest.approx(0.7, abs=1e-6))]
-    mended = with_settings(config, {'odometer.time_offset': -0.7})
-    assert clocks.differing(mended) == []
-    assert [s for s, _ in clocks.differing(with_settings(mended, {'imu.time_offset': 0.9}))] == [
+    aligned = with_settings(config, {'odometer.time_offset': -0.7})
+    assert clocks.differing(aligned) == []
+    assert [s for s, _ in clocks.differing(with_settings(aligned, {'imu.time_offset': 0.9}))] == [
         'fix', 'odometer']
-    # two sensors in step: the tick always brings the IMU's row first and the other's last
+    # two synchronous sensors: in each tick the IMU row arrives first and the other row last
     clocks = Clocks()
     for i in range(20):
         arrival = 1000.0 + 0.05 * i + np.array([0.0, 0.025])

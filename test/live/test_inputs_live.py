@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node's inputs and its times: what it waits for, takes, counts and refuses."""
+"""Inputs and clocks of the node: what it waits for, receives, counts and refuses."""
 
 import signal
 
@@ -18,7 +18,7 @@ def sent():
     return light()
 
 
-def test_waiting_says_why(start, connect):
+def test_the_hint_gives_the_reason_for_waiting(start, connect):
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Image, Imu
     start()
@@ -36,7 +36,7 @@ def test_waiting_says_why(start, connect):
     wait_for(lambda: foreign in client.status['missing'], 'the foreign type of the fix')
 
 
-def test_messages_that_cannot_be_read_are_said(start, connect):
+def test_unreadable_messages_are_counted_and_reported(start, connect):
     from std_msgs.msg import Int32MultiArray
     start({'odometer.field': 'data[3]'})
     client = connect()
@@ -52,23 +52,23 @@ def test_messages_that_cannot_be_read_are_said(start, connect):
     assert 'data[3]' in client.until(state='waiting')['missing']
 
 
-def test_an_input_that_never_spoke_is_an_error_in_the_diagnostics(play_to, sent):
+def test_an_input_without_messages_is_an_error_in_the_diagnostics(play_to, sent):
     leg = play_to(sent)
     health = leg.client.health
 
     def imu(**fields):
         return wait_for(lambda: (found := health.get('calibrator: imu', {'level': None}))
                         and found['level'] == fields['level'] and found, f'IMU with {fields}')
-    # as diagnostic_updater has it; STALE is not ours to say
+    # as in diagnostic_updater; only the aggregator sets STALE
     assert imu(level=b'\x02')['message'].startswith('no IMU on /imu/data')
     with leg.playing(0, 60, 10):
         good = imu(level=b'\x00')
     assert float(good['Actual frequency (Hz)']) == pytest.approx(20, rel=0.05)
     assert good['Events since startup'] == good['messages'] != '0'
-    imu(level=b'\x02')         # the error of silence
+    imu(level=b'\x02')         # error: no messages
 
 
-def test_namespace_and_remaps(start, connect, sent):
+def test_namespace_and_remaps_are_applied(start, connect, sent):
     node = start({'diagnostic_updater.use_fqn': True}, '-r', '__ns:=/car', '-r',
                  'imu/data:=/front/imu')
     client = connect('/car/calibrator')
@@ -78,7 +78,7 @@ def test_namespace_and_remaps(start, connect, sent):
     wait_for(lambda: '/car/calibrator: imu' in client.health, 'diagnostics with the full name')
 
 
-def test_sim_time_and_its_jump_back(play_to, sent):
+def test_a_backward_jump_of_the_simulated_time_cancels_the_leg(play_to, sent):
     leg = play_to(sent, {'use_sim_time': True})
     client, play = leg.client, with_clock(leg)
     play(0, 10)
@@ -92,12 +92,12 @@ def test_sim_time_and_its_jump_back(play_to, sent):
     assert client.until(leg_event='cancelled')['leg_id'] == '1'
     wait_for(lambda: 'leg 1 is cancelled' in leg.node.text, 'the warning')
     play(4, 6)
-    client.until(state='idle')         # and it goes on with what comes after the jump
+    client.until(state='idle')         # the node uses the messages after the jump
     assert client.call('start_leg').success
 
 
-def test_messages_that_queue_in_simulated_time_are_no_clocks_that_differ(play_to):
-    """The node stands still for a moment, as on a busy machine; simulation does not wait."""
+def test_queued_messages_in_simulated_time_are_not_a_clock_difference(play_to):
+    """The node pauses for a moment, as on a busy machine; the simulation does not wait."""
     types, messages = messages_of(simulate(SimOptions(
         duration=180.0, imu_rate=100.0, odometer_rate=10.0, odometer='speed')))
     leg = play_to((types, part(messages, 40, 90)), {'use_sim_time': True, 'publish.rate': 20.0})
@@ -114,7 +114,7 @@ def test_messages_that_queue_in_simulated_time_are_no_clocks_that_differ(play_to
     assert client.call('start_leg').success
 
 
-def test_imu_stamps_that_start_anew_cancel_the_leg(play_to, sent):
+def test_a_restart_of_the_imu_stamps_cancels_the_leg(play_to, sent):
     leg = play_to(sent)
     leg.record(10, 20)
     waiting = leg.client.ask('stop_leg')
@@ -127,7 +127,7 @@ def test_imu_stamps_that_start_anew_cancel_the_leg(play_to, sent):
     assert 'time jumped' in leg.node.text
 
 
-def test_a_forgotten_leg_is_stopped(play_to, sent):
+def test_a_leg_is_stopped_at_the_maximum_duration(play_to, sent):
     leg = play_to(sent, {'leg.max_duration': 10.0})
     leg.record(0, 5, 20)
     leg.client.until(state='rejected', leg_event='stopped')   # 10 s are too short a leg
@@ -141,20 +141,20 @@ def test_the_odometer_type_is_taken_from_its_publisher(play_to):
     drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0))
     types, sent = messages_of(drive, odometer=encode.counter('odometer', drive.odometer))
     leg = play_to((types, part(sent, 60, 120)))
-    # header stamps of last year beside arrival stamps of now: no leg can be made of these
+    # header stamps of last year, arrival stamps of today: no leg is possible
     with leg.playing(0, 60, 2):
         assert 'CLOCKS_DIFFER' in leg.client.until(state='idle', level=b'\x01')['hint']
         answer = leg.client.call('start_leg')
     assert 'odometer: std_msgs/msg/Int64 on /odometer, best effort' in leg.node.text
     assert not answer.success
     assert 'CLOCKS_DIFFER' in answer.message
-    assert 'days ahead of' in answer.message       # no setting reaches so far
+    assert 'days ahead of' in answer.message       # beyond the range of the setting
     assert 'exceeds the range of time_offset' in answer.message
     assert 'use_sim_time' in answer.message
 
 
 @pytest.mark.parametrize('offer', ['reliable', 'best effort'])
-def test_increments_are_asked_for_reliably_where_offered(start, connect, offer):
+def test_increments_are_subscribed_as_reliable_where_offered(start, connect, offer):
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from std_msgs.msg import Int32
     node = start({'odometer.quantity': 'increment'})
@@ -164,7 +164,7 @@ def test_increments_are_asked_for_reliably_where_offered(start, connect, offer):
     wait_for(lambda: f'Int32 on /odometer, {offer}' in node.text, f'a {offer} subscription')
 
 
-def test_1_khz_arrives_whole_and_services_answer_meanwhile(play_to):
+def test_no_message_is_lost_at_1_khz_and_services_answer(play_to):
     types, messages = messages_of(simulate(SimOptions(
         duration=180.0, imu_rate=1000.0, odometer_rate=250.0, fix_rate=25.0, odometer='speed')))
     leg = play_to((types, part(messages, 60, 63)), speed=1)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal of a real node: replayed to the last bit, killed, undone, without a disk."""
+"""The journal of a real node: identical replay, killed node, undone legs, full disk."""
 
 from pathlib import Path
 import resource
@@ -30,7 +30,7 @@ NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
 
 @pytest.fixture(scope='module')
 def session(tmp_path_factory):
-    """Drive three legs through one node: kept, cancelled, undone."""
+    """Drive three legs with one node: kept, cancelled, undone."""
     drive = straight(heading=0.7)
     settings = {'output.directory': tmp_path_factory.mktemp('journal'), 'leg.preroll': 20.0,
                 'alignment.heading_source': 'fixed', 'alignment.heading': drive.truth.heading}
@@ -42,7 +42,7 @@ def session(tmp_path_factory):
                                  and client.status['journal'], 'another journal'))
         leg.record(30, 60, 115)
         seen = leg.stopped(115)
-        # a leg that is cancelled, and one that is undone after it was joined
+        # a cancelled leg, and a leg undone after its journal was joined
         leg.record(117, 118, 122)
         client.call('cancel_leg')
         seen.cancelled = another(seen.journal)
@@ -55,14 +55,14 @@ def session(tmp_path_factory):
     return seen
 
 
-def test_a_journal_replays_to_the_last_bit_without_options(session):
+def test_the_replay_of_a_journal_is_identical_without_options(session):
     stderr = check_replay(session.live, session.journal)
     assert session.live['inputs'][0]['topics'] == {
         'imu': '/front/imu', 'odometer': '/odometer', 'fix': '/gps/fix'}
     assert 'is a journal: settings and topics come from' in stderr
 
 
-def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):
+def test_a_journal_is_one_bag_with_the_preroll_and_each_message_once(session):
     assert sorted(p.name for p in session.journal.iterdir()) == [
         f'{session.journal.name}_0.mcap', 'journal.yaml', 'metadata.yaml']
     start_ns, stop_ns = ends_of(session.status)
@@ -72,13 +72,13 @@ def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):
     assert stamps[-1] > stop_ns
 
 
-def test_options_win_over_the_settings_of_a_journal(session):
+def test_options_take_precedence_over_the_settings_of_a_journal(session):
     code, result, _ = replayed(session.journal, '--set', 'leg.min_distance=5000')
     assert code == 1
     assert result['config']['leg.min_distance'] == 5000.0
 
 
-def test_dropped_legs_are_not_replayed(session):
+def test_cancelled_and_undone_legs_are_not_replayed(session):
     for journal in (session.cancelled, session.undone):
         code, result, stderr = replayed(journal)
         assert (code, result) == (2, None)
@@ -92,22 +92,22 @@ def test_dropped_legs_are_not_replayed(session):
 
 
 @pytest.mark.parametrize('moment_s', [0.3, 1.3, 2.6])
-def test_a_killed_leg_is_replayed_from_its_mark(tmp_path, moment_s):
+def test_the_leg_of_a_killed_node_is_replayed_from_its_start_mark(tmp_path, moment_s):
     left = killed(drive(), moment_s, tmp_path)
     assert left.marks == [(left.start_ns, 0)]
-    # a second by design, of what the node had heard: how late that was is the machine's load
+    # one second by design, counted from the received messages, which a busy machine delays
     assert left.short_s < 2.0
     assert wrong(left) == []
     assert left.code in (0, 1, 2)     # 2: killed before a sample came after the mark
     if moment_s > 1:
         leg, = left.legs
         assert round(leg['start'] * 1e3) == round(left.start_ns * 1e-6)
-        assert leg['stop'] - leg['start'] > 10 * (left.told_s - 2.0)
+        assert leg['stop'] - leg['start'] > 10 * (left.leg_s - 2.0)
         assert 'the leg has no stop mark' in left.text
         assert 'STOP_MARK_MISSING' in {r['code'] for r in leg['reasons']}
 
 
-def test_pulses_without_stamps_keep_the_times_they_were_sent_at(play_to):
+def test_pulses_without_stamps_keep_the_times_of_their_sender(play_to):
     made = straight(odometer='counts', imu_grade='industrial')
 
     def stamped(by_ns):
@@ -117,9 +117,9 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(play_to):
 
     leg = play_to(stamped(0), {'leg.min_distance': 3.0}, 1)
     wait_for(leg.player.matched, 'subscriptions')
-    # stamped by now, as of a real vehicle: counts are stamped by their sender's clock, and clocks
-    # half a second apart start no leg. It drives on while services are called, however long they
-    # take
+    # stamped with the present time, as on a real vehicle: counts have the clock of their sender,
+    # and no leg starts with clocks half a second apart. The drive continues during service calls,
+    # whatever their duration
     begin_ns, (_, leg.sent) = by_now(lambda begin_ns: stamped(
         begin_ns - int(made.imu.stamp_ns[0]) - 70_000_000_000))
     client = leg.client
@@ -135,12 +135,12 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(play_to):
     check_replay(seen.live, seen.journal)
 
 
-def test_a_disk_full_for_a_while_costs_nothing_nor_does_the_end_of_the_node(play_to):
+def test_no_message_is_lost_by_a_temporarily_full_disk_or_the_end_of_the_node(play_to):
     leg = play_to(light(45, 145), speed=30.0)
     leg.record(0, 10)
     client, limit = leg.client, (resource.RLIM_INFINITY,) * 2
     journal = Path(wait_for(lambda: client.status['journal'], 'the journal'))
-    # what a full disk does, without one: no file may grow beyond some bytes
+    # simulates a full disk: no file may exceed some bytes
     resource.prlimit(leg.node.process.pid, resource.RLIMIT_FSIZE, (100, limit[1]))
     leg.play(10, 40)
     status = wait_for(lambda: client.status['journal_trouble'] and client.status, 'the warning')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal of a leg: within its limit, and whole on a disk that refuses any step."""
+"""The journal of a leg: its size limit, and a disk on which an operation fails."""
 
 import errno
 from itertools import count
@@ -73,7 +73,7 @@ def joined_soon(monkeypatch):
     monkeypatch.setattr(segments, 'FILES_JOINED', 3)
 
 
-def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):
+def test_one_failed_disk_operation_loses_no_message(tmp_path, monkeypatch):
     expected_times, without_mark = times_of(*range(CHUNKS + 1)), 0
     for step in count(1):
         with monkeypatch.context() as patch:
@@ -83,7 +83,7 @@ def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):
             break
         name = disk.steps[step - 1]
         found = times(one.folder)
-        # the added mark is missing until it is tried again
+        # the added mark is missing until the next attempt
         without_mark += found == expected_times[:-2]
         assert found in (expected_times, expected_times[:-2]), (step, name)
         one.retry()
@@ -101,7 +101,7 @@ def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('code', [errno.ENOSPC, errno.EIO, errno.EROFS])
-def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, code):
+def test_a_permanently_failing_disk_keeps_what_was_written_before(tmp_path, monkeypatch, code):
     for step in count(1):
         root = tmp_path / str(step)
         with monkeypatch.context() as patch:
@@ -112,7 +112,7 @@ def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, cod
         assert os.strerror(code) in logged[-1] or os.strerror(code) in logged[-2]
         folders = list(root.iterdir())
         if not folders:
-            continue        # nothing of it could be written, and nothing is left
+            continue        # nothing was written, and no folder is left
         found = times(folders[0])
         assert found == times_of(*range(CHUNKS + 1))[:len(found)]
         assert found
@@ -120,7 +120,7 @@ def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, cod
 
 
 @pytest.mark.parametrize('where', ['root', 'leg'])
-def test_a_folder_that_is_removed_or_read_only_is_told_and_used_again(tmp_path, where):
+def test_a_missing_folder_is_reported_and_used_again_when_it_is_back(tmp_path, where):
     root = tmp_path / 'journal'
     one = journal(root)
     one.put([chunk(0)])
@@ -137,7 +137,7 @@ def test_a_folder_that_is_removed_or_read_only_is_told_and_used_again(tmp_path, 
     assert times(one.folder) == times_of(*range(3))
 
 
-def test_two_nodes_on_one_folder_have_journals_of_their_own(tmp_path):
+def test_two_nodes_with_one_folder_write_separate_journals(tmp_path):
     both = [journal(tmp_path) for _ in range(2)]
     for k in range(CHUNKS):
         for n, one in enumerate(both):
@@ -149,7 +149,7 @@ def test_two_nodes_on_one_folder_have_journals_of_their_own(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [NAME, f'{NAME}-2']
 
 
-def test_empty_journals_do_not_pile_up(tmp_path):
+def test_old_empty_journals_are_removed(tmp_path):
     def aged(name, *files):
         (tmp_path / name).mkdir()
         for file in files:
@@ -166,7 +166,7 @@ def test_empty_journals_do_not_pile_up(tmp_path):
 
 
 def folder_of(root, name, size, age):
-    """Make a folder that looks like a journal of some bytes."""
+    """Make a folder like a journal; size in bytes, age in s."""
     folder = root / name
     folder.mkdir(parents=True)
     (folder / JOURNAL).touch()
@@ -175,7 +175,7 @@ def folder_of(root, name, size, age):
     return folder
 
 
-def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
+def test_only_the_oldest_unlocked_journals_are_removed(tmp_path):
     old, middle, new = (folder_of(tmp_path, name, 1000, age)
                         for name, age in (('c', 3), ('b', 2), ('a', 1)))
     (tmp_path / 'calibration').mkdir()
@@ -194,7 +194,7 @@ def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
     assert make_room(tmp_path / 'none', 10) == 0
 
 
-def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
+def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
     limit, taken, write_file = 1_200_000, [], segments.write_file
 
@@ -202,7 +202,7 @@ def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
         size = write_file(*args)
         taken.append(sum(folder_size(folder) for folder in journal_folders(tmp_path)))
         return size
-    monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files are there
+    monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files exist
     for leg_id in range(1, 5):
         one = journal(tmp_path, f'leg_{leg_id}', limit)
         for k in range(5):
@@ -214,7 +214,7 @@ def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
     assert [f.name for f in journal_folders(tmp_path)][-1] == 'leg_4'
 
 
-def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
+def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
     folder_of(tmp_path, 'old', 1000, 1)
     one = journal(tmp_path, limit=500_000)
@@ -225,12 +225,12 @@ def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeyp
     folder, = journal_folders(tmp_path)
     assert folder_size(folder) <= 500_000
     with open_bag(folder) as bag:
-        # for each that is written, room to join it with those that stand is kept
+        # space is reserved to join each new file with the existing ones
         assert bag.topics['/odometer'].count == 2
         assert bag.start_ns == 0
 
 
-def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monkeypatch):
+def test_unwritten_data_waits_in_memory_up_to_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(journal_leg, 'WAITING_BYTES', 350_000)
     one = journal(tmp_path)
     one.put([large(0)])
@@ -240,7 +240,7 @@ def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monke
             one.put([large(k)])
     assert 'no further attempt in this leg' in one.trouble
     assert not one._waiting
-    one.put([large(6)])                # a hole would be worse than an end
+    one.put([large(6)])                # an early end is better than a gap
     one.finish()
     with open_bag(one.folder) as bag:
         assert bag.topics['/odometer'].count == 1

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.core
 SECOND = 10**9
 
 
-def test_settings_come_back_to_the_last_bit(tmp_path):
+def test_settings_are_read_back_from_the_journal_without_any_change(tmp_path):
     config = with_settings(Config(), {
         'odometer.left': 'on', 'odometer.right': '0', 'odometer.field': 'a "b" [1e3]',
         'output.directory': '/home/jörg/a: b', 'alignment.heading': 0.1 + 0.2,
@@ -43,7 +43,7 @@ def test_settings_come_back_to_the_last_bit(tmp_path):
         got = found.settings[name]
         assert type(got) is type(value), name
         assert got == value or math.isnan(got) and math.isnan(value), name
-    assert journal_notes(tmp_path / 'some.mcap').path == found.path    # a file of it, too
+    assert journal_notes(tmp_path / 'some.mcap').path == found.path    # its file, too
     assert journal_notes(tmp_path.parent) is None
 
 
@@ -51,7 +51,7 @@ def chunk(k, size=100_000):
     return pack(1, [k * SECOND], [os.urandom(size)])
 
 
-def test_the_preroll_reaches_back_far_enough_but_keeps_static_transforms():
+def test_the_preroll_keeps_its_duration_and_all_static_transforms():
     preroll = PreRoll()
     preroll.feed('fix_static', journal_writer.ALWAYS_NS, chunk(0, 100), 10 * SECOND)
     for k in range(100):
@@ -60,23 +60,23 @@ def test_the_preroll_reaches_back_far_enough_but_keeps_static_transforms():
     starts = [c.start_ns // SECOND for c in preroll.chunks()]
     assert starts == sorted([0, *range(89, 100), *range(89, 100)])
     assert preroll.size == sum(c.size for c in preroll.chunks())
-    preroll.clear()     # time jumped back; nobody sends static transforms again
+    preroll.clear()     # time jumped back; static transforms are not sent again
     static, = preroll.chunks()
     assert preroll.size == static.size
 
 
-def test_the_preroll_is_bounded_in_bytes(monkeypatch):
+def test_the_preroll_has_a_limit_in_bytes(monkeypatch):
     monkeypatch.setattr(journal_writer, 'PREROLL_BYTES', 1_050_000)
     preroll = PreRoll()
     preroll.feed('fix', SECOND, chunk(1, 100), 600 * SECOND)
     for k in range(100):
         preroll.feed('imu', k * SECOND, chunk(k), 600 * SECOND)
     assert preroll.size <= 1_050_000
-    assert sum(c.size > 1000 for c in preroll.chunks()) == 10      # the heavy topic gives way
+    assert sum(c.size > 1000 for c in preroll.chunks()) == 10      # the largest topic is cut
     assert sum(c.size < 1000 for c in preroll.chunks()) == 1
 
 
-def test_a_replay_takes_the_topics_of_the_journal(tmp_path, capsys):
+def test_replay_uses_the_topics_of_the_journal(tmp_path, capsys):
     rows = ros_bags.drive()
     twice = [('/spare/imu', *row[1:]) for row in rows if row[0] == '/imu/data']
     bag = ros_bags.write(tmp_path / 'leg', sorted(rows + twice, key=lambda row: row[1]))
@@ -107,14 +107,14 @@ def test_fields_are_written_as_in_a_msg_file(about, base, text):
     'nav_msgs/msg/Odometry', 'diagnostic_msgs/msg/DiagnosticArray',
     'std_msgs/msg/Int32MultiArray', 'std_msgs/msg/UInt64', 'sensor_msgs/msg/BatteryState',
     'geometry_msgs/msg/TwistWithCovarianceStamped', 'shape_msgs/msg/SolidPrimitive'])
-def test_definitions_are_those_of_the_message_types(msgtype):
+def test_definitions_agree_with_the_message_types(msgtype):
     pytest.importorskip('rclpy')
     from rosbags.typesys import get_types_from_msg
     found = get_types_from_msg(definition_of(message_class(msgtype)), msgtype)
     known = make.store().fielddefs
     assert msgtype in found
     for name, (_, fields) in found.items():
-        # constants do not come through a message class, and no byte depends on them
+        # a message class has no constants, and no byte depends on them
         assert fields == known[name][1], name
 
 
@@ -122,7 +122,7 @@ def test_definitions_are_those_of_the_message_types(msgtype):
     'antigravity/msg/X', 'this/that/X', 'evil/msg/X', 'evil/run/X', '../msg/X', 'sensor_msgs/Imu',
     'sensor_msgs/msg/imu', 'sensor_msgs/msg/_Imu', 'sensor_msgs/msg/Imu\n', '', 'sys/msg/X',
     'os.path/msg/X', 'no_msgs/msg/Such'])
-def test_no_other_module_is_imported(name, tmp_path, monkeypatch):
+def test_only_modules_of_message_packages_are_imported(name, tmp_path, monkeypatch):
     (tmp_path / 'evil').mkdir()
     (tmp_path / 'evil' / '__init__.py').write_text('import sys\nsys.evil = True\n')
     (tmp_path / 'evil' / 'run.py').write_text('X = 1\n')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Launch files have names that the node has; parameters of its own are refused."""
+"""Launch files use the names of the node; changes of parameters fixed at start-up are refused."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ CASES = [
 
 
 @pytest.mark.parametrize('given', CASES, ids=lambda given: ' '.join(given) or 'as is')
-def test_both_start_the_same_nodes(given):
+def test_both_launch_files_start_the_same_nodes(given):
     declared_python, python = of_python(PYTHON, given)
     declared_xml, xml = of_xml(XML, given)
     assert declared_python == declared_xml
@@ -35,23 +35,23 @@ def test_both_start_the_same_nodes(given):
                for _, description in declared_xml.values())
     assert set(given) <= set(declared_xml)
     assert python == xml
-    # RViz first: where it is not installed launch ends, and would leave the node behind
+    # RViz first: launch ends if RViz is not installed, and would leave the node running
     assert [node.executable for node in python] == [
         'rviz2'] * (given.get('rviz') == 'true') + ['calibrator']
 
 
-def test_every_input_can_be_remapped_and_stays_where_it_is_by_itself():
+def test_every_input_can_be_remapped_and_otherwise_has_its_default_topic():
     _, (node,) = of_python(PYTHON, {})
     assert node.remappings == {topic: topic for topic in TOPICS.values()}
     _, (node,) = of_python(PYTHON, CASES[-1])
     assert set(node.remappings.values()) == set(CASES[-1].values())
-    # an empty method leaves the one of the file
+    # an empty method keeps the one of the file
     assert 'method' not in node.parameters[1]
     _, (node,) = of_python(PYTHON, {'method': 'two_point'})
     assert node.parameters[1]['method'] == 'two_point'
 
 
-def test_the_files_named_are_installed():
+def test_the_files_that_launch_names_are_installed():
     _, (rviz, node) = of_xml(XML, {'rviz': 'true'})
     setup = (ROOT / 'setup.py').read_text()
     for path in (Path(node.parameters[0]), Path(rviz.arguments[1])):
@@ -62,7 +62,7 @@ def test_the_files_named_are_installed():
 
 @pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],
                          ids=['python', 'xml'])
-def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, read, path):
+def test_the_launched_node_subscribes_to_configured_topics(start, connect, tmp_path, read, path):
     from odocal_ros.live.messages import message_class
     mine = tmp_path / 'mine.yaml'
     mine.write_text(yaml.safe_dump({'/**/calibrator': {'ros__parameters': {
@@ -84,7 +84,7 @@ def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, 
     assert client.get('method', 'use_sim_time') == ['two_point', False]
 
 
-def test_it_runs_where_launch_is_installed():
+def test_launch_accepts_the_files_where_it_is_installed():
     launch = pytest.importorskip('launch', reason='launch is not on PyPI')
     pytest.importorskip('launch_ros', reason='launch_ros is not on PyPI')
     from launch.frontend import Parser
@@ -99,7 +99,7 @@ def values_of(**values):
     return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
 
 
-def test_what_is_fixed_at_start_up_is_refused_with_the_way_to_set_it():
+def test_a_change_of_a_fixed_parameter_is_refused_with_the_command_to_set_it():
     text = change_refusal(Config(), RESULTS, values_of(odometer__type='std_msgs/msg/Int64'))
     assert text == ('odometer.type is fixed at start-up: restart the node with '
                     '"--ros-args -p odometer.type:=VALUE"')
@@ -110,8 +110,8 @@ def test_what_is_fixed_at_start_up_is_refused_with_the_way_to_set_it():
                                                       values_of(imu__lever_arm=[0.0, 0.0, 1.0]))
 
 
-def test_a_result_is_refused_unless_it_is_the_one_in_force():
-    """So ``ros2 param load`` of the file that the node wrote has nothing to refuse."""
+def test_a_result_parameter_is_refused_unless_it_has_the_present_value():
+    """``ros2 param load`` of the file that the node wrote is accepted."""
     here = RESULTS | {'result.scale_factor': 0.05}
     assert not change_refusal(Config(), here, values_of(result__scale_factor=0.05,
                                           result__yaw_mounting_angle=math.nan))
@@ -120,7 +120,7 @@ def test_a_result_is_refused_unless_it_is_the_one_in_force():
     assert '--params-file calibration.yaml' in text
 
 
-def test_a_node_that_reads_its_settings_at_start_up_refuses_all_of_them():
+def test_the_node_odometry_refuses_all_changes_after_start_up():
     refuse = refuse_after_start(ApplyConfig)
     for values in ({'levelling': False}, {'publish__rate': 5.0}, {'result__valid': True}):
         answer = refuse(values_of(**values))

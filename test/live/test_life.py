@@ -29,7 +29,7 @@ def sent():
 
 
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_node_cleanly_even_in_a_leg(play_to, sent, how):
+def test_signals_end_the_node_cleanly_even_during_a_leg(play_to, sent, how):
     leg = play_to(sent)
     leg.record(0, 5)
     assert leg.node.end(how) == 0
@@ -41,7 +41,7 @@ def test_signals_end_the_node_cleanly_even_in_a_leg(play_to, sent, how):
 
 
 @pytest.mark.core
-def test_a_signal_before_anything_ran_is_clean_too(start, connect):
+def test_a_signal_right_after_the_start_ends_the_node_cleanly(start, connect):
     node = start()
     connect().until(state='waiting')
     node.end()
@@ -53,7 +53,7 @@ def test_a_signal_before_anything_ran_is_clean_too(start, connect):
     (['--help', '--ros-args', '-p', 'imu.grade:=tactical'], 0, 'config/calibrator.yaml'),
     (['--version'], 0, f'odocal_ros {__version__}\n'),
     (['--config', 'x.yaml'], 1, 'calibrator: --config is unknown: settings are ROS')])
-def test_help_is_shown_and_what_is_no_ros_argument_is_refused(arguments, code, words):
+def test_help_is_shown_and_an_unknown_argument_is_refused(arguments, code, words):
     ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=PATIENCE,
                            env=os.environ | {'PYTHONPATH': str(ROOT)}, check=False)
     assert ended.returncode == code
@@ -92,7 +92,7 @@ EACH = ('import sys\nfrom odocal_ros.live.node import main\nfor override in sys.
         '    sys.stderr.write(f"{main([\'\', \'--ros-args\', \'-p\', override])}\\n")')
 
 
-def test_a_bad_override_is_one_line_and_exit_1():
+def test_a_bad_override_gives_one_line_and_exit_code_1():
     overrides = [override for override, _ in BAD_OVERRIDES]
     finished = subprocess.run([sys.executable, '-c', EACH, *overrides], capture_output=True,
                               text=True,
@@ -110,7 +110,7 @@ def test_a_bad_override_is_one_line_and_exit_1():
     assert node.lines == lines[:1]
 
 
-def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
+def test_valid_parameter_values_are_set_and_others_are_refused(start, connect):
     start({'reference.start': '[]', 'imu.nominal_yaw': '.nan'})
     client = connect()
     client.until(state='waiting')
@@ -118,7 +118,7 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.get('leg.min_distance') == [250.0]
     assert client.set(imu__gyro_noise=math.nan).successful
     assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
-    # as ros2 param set sends an empty list: of no type, which becomes one of booleans
+    # as ros2 param set sends an empty list: without type, read as a list of booleans
     empty = Parameter(name='reference.start', value=get_parameter_value('[]'))
     answer = answer_of(client.send(SetParameters, 'set_parameters',
                                    SetParameters.Request(parameters=[empty])))
@@ -138,7 +138,7 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.get('leg.min_distance') == [250.0]
 
 
-def test_the_shipped_file_is_taken_as_it_is_and_other_parameters_are_named(start, connect):
+def test_the_shipped_file_is_accepted_and_unknown_parameters_are_reported(start, connect):
     node = start({'leg.min_distanse': 3.0, 'somebody.elses': 1, 'imu.colour': 'red',
                   'result.gyro_bias_x': 1.0},
                  '--params-file', str(ROOT / 'config' / 'calibrator.yaml'))
@@ -158,7 +158,7 @@ def test_the_shipped_file_is_taken_as_it_is_and_other_parameters_are_named(start
         assert same, name
 
 
-def test_a_saved_result_comes_back_as_overrides(start, connect):
+def test_a_saved_result_is_restored_from_overrides(start, connect):
     start(RESULT | {'result.yaw_mounting_angle': 1, 'result.stamp': "'2026-01-02T03:04:05Z'"})
     client = connect()
     client.until(state='waiting', scale_factor='0.0213', yaw_mounting_angle_rad='1.0')
@@ -177,7 +177,7 @@ def test_a_saved_result_comes_back_as_overrides(start, connect):
     assert not client.call('stop_leg').success
 
 
-def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(play_to, sent):
+def test_a_leg_replaces_a_restored_result_and_undo_brings_it_back(play_to, sent):
     leg = play_to(sent, RESULT | SIGMA)
     client = leg.client
     client.until(restored='an unknown date', scale_ok='yes')
@@ -192,7 +192,7 @@ def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(p
     client.until(restored='an unknown date', legs='2', scale_factor='0.0213', scale_ok='yes')
 
 
-def test_two_nodes_of_one_name_say_so(start):
+def test_two_nodes_with_the_same_name_give_a_warning(start):
     nodes = [start(), start()]
     for node in nodes:
         wait_for(lambda node=node: 'another node is called /calibrator' in node.text,

@@ -16,7 +16,7 @@ import pytest
 from rclpy.serialization import serialize_message
 import ros_bags
 
-HEADING = 0.7           # rad, a heading of its own makes the yaw separable
+HEADING = 0.7           # rad; with a known heading the yaw is separable
 SETTINGS = {'alignment.heading_source': 'fixed', 'alignment.heading_sigma': 0.002}
 ESTIMATES = ['scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle']
 OF_TWO_WHEELS = ['scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width']
@@ -56,11 +56,11 @@ def _first_leg(seen, leg, client):
     seen.set_in_leg = client.set(leg__min_distance=50.0)
     leg.play(60, 115)
     seen.recording = client.until(state='recording')
-    # a look that is due comes after the last message too: it sees 50 s of the leg or more; one
-    # that cost three seconds of a busy machine is followed by a minute's pause
+    # an estimate that is due also comes after the last message, from 50 s of the leg or more;
+    # after one that takes 3 s on a busy machine, the next comes a minute later
     seen.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
                              and client.status, 'a running estimate', 4 * PATIENCE)
-    # no more is sent until the answer: what the leg holds must not depend on how busy all is
+    # nothing is sent until the answer: the data of the leg must not depend on the machine's load
     leg.play(115, 117)
     stopping = client.ask('stop_leg')
     seen.computing = client.until(state='computing')
@@ -84,7 +84,7 @@ def _results(client):
 
 
 def _second_leg(seen, leg, client):
-    leg.play(117, 118)   # a topic silent for 2 s would count as gone
+    leg.play(117, 118)   # a topic without messages for 2 s would count as missing
     client.start()
     seen.cancel = client.call('cancel_leg')
     seen.cancelled = client.until(leg_event='cancelled')
@@ -114,18 +114,18 @@ def written(session):
     return json.loads((Path(session.saved['saved']) / 'calibration.json').read_text())
 
 
-def test_the_parameters_are_the_result_that_was_saved(session, written):
+def test_the_parameters_equal_the_saved_result(session, written):
     for name in ESTIMATES:
         for end, key in (('', 'value'), ('_sigma', 'sigma')):
             live, value = session.results[f'result.{name}{end}'], written['result'][name][key]
             assert live == value or math.isnan(live) and value is None, name
     assert written['verdict'] != 'rejected'
-    assert written['result']['scale_factor']['method'] == 'smoother'       # of auto
+    assert written['result']['scale_factor']['method'] == 'smoother'       # by auto
     assert len(written['methods']['smoother']['estimates']) > 10
 
 
-def test_odocal_replay_finds_the_mark_and_agrees_in_every_digit(session, written, tmp_path):
-    """Return a bag with the inputs and outputs of the node in the first leg, as of a recorder."""
+def test_replay_finds_the_marks_and_agrees_in_every_digit(session, written, tmp_path):
+    """Record the inputs and outputs of the node during the first leg, and replay them."""
     names = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
     status, last_ns = '/calibrator/status', session.sent[-1].stamp_ns
     rows = [(names[one.slot], one.stamp_ns + 1_000_000, one.raw)
@@ -143,17 +143,17 @@ def test_odocal_replay_finds_the_mark_and_agrees_in_every_digit(session, written
     assert live | {'bag': 'leg'} == replay
 
 
-def test_the_result_is_the_truth(session, written):
+def test_the_result_agrees_with_the_truth(session, written):
     for name, true in (('scale_factor', session.drive.truth.scale),
                        ('yaw_mounting_angle', session.drive.truth.yaw)):
         assert within(written['result'][name], true), name
 
 
-def test_nothing_was_lost(session):
+def test_no_message_is_lost(session):
     all_arrived(session.client, part(session.sent, 45, 127))
 
 
-def test_before_anything_came_every_command_says_what_to_do(session):
+def test_each_command_without_data_answers_what_to_do(session):
     words = {'start_leg': 'no IMU on /imu/data: 0 publishers found', 'stop_leg': '~/start_leg',
              'cancel_leg': 'no leg is running', 'undo_leg': 'no leg to undo',
              'save': 'nothing to save'}
@@ -161,11 +161,11 @@ def test_before_anything_came_every_command_says_what_to_do(session):
         assert not session.early[name].success
         assert text in session.early[name].message, name
     assert session.early['reset'].success
-    assert session.waiting['level'] == b'\x03'  # STALE: nothing has ever come
+    assert session.waiting['level'] == b'\x03'  # STALE: no message so far
     assert 'imu/data' in session.waiting['hint']
 
 
-def test_start_and_stop_answer(session):
+def test_start_and_stop_answer_with_state_and_result(session):
     assert session.start.success
     assert session.again.success
     assert session.again.message.startswith('recording since 2025-06-15T')
@@ -177,7 +177,7 @@ def test_start_and_stop_answer(session):
     assert session.idle_stop.message.endswith(session.stop.message)
 
 
-def test_status_has_bare_numbers_and_the_times_and_rates_of_the_leg(session):
+def test_the_status_has_plain_numbers_and_times_and_rates_of_the_leg(session):
     for status in (session.waiting, session.recording, session.calibrated):
         assert status['name'] == 'calibrator: calibration'
         numbers = [float(value) for key, value in status.items() if re.search(
@@ -194,7 +194,7 @@ def test_status_has_bare_numbers_and_the_times_and_rates_of_the_leg(session):
         assert float(session.recording[f'{slot}_rate_hz']) == pytest.approx(hz, rel=off)
 
 
-def test_while_it_records_the_running_estimate_is_told(session):
+def test_the_status_shows_the_running_estimate_during_a_leg(session):
     status = session.foreseen
     assert status['state'] == 'recording'
     assert 'smoother' in status['estimate_method']
@@ -205,14 +205,14 @@ def test_while_it_records_the_running_estimate_is_told(session):
     assert scale_ppm == pytest.approx(1e6 * sigma / value, abs=5.1e-3)     # two decimals are shown
     assert (metres == 0.0) == (scale_ppm <= 1000)
     assert float(status['predicted_yaw_sigma_deg']) > 0.0
-    assert 0.0 <= float(status['estimate_age_s']) <= 55.0            # the leg is no longer
+    assert 0.0 <= float(status['estimate_age_s']) <= 55.0            # length of the leg
     assert re.search(r'scale 1\.0\d* ± [\d.]+ ppm', status['hint'])
     assert status['largest_error_source_scale']
     assert session.idle['estimate_scale_factor'] == session.waiting['estimate_age_s'] == 'nan'
     assert session.calibrated['estimate_scale_factor'] == 'nan'
 
 
-def test_nothing_is_foreseen_but_of_a_leg_that_is_recorded(session):
+def test_the_forecast_is_empty_except_during_a_leg(session):
     foreseen = [key for key in session.foreseen
                 if key.startswith(('predicted_', 'metres_to_go_', 'largest_error_source_'))]
     assert len(foreseen) == 8
@@ -221,10 +221,10 @@ def test_nothing_is_foreseen_but_of_a_leg_that_is_recorded(session):
         assert not any(status[key] for key in foreseen)
 
 
-def test_live_distance_is_near_the_computed_one(session):
+def test_the_live_distance_agrees_with_the_computed_one(session):
     live, final = (float(s['distance_m']) for s in (session.computing, session.calibrated))
-    # by the nominal scale of 1 where the true one is 1.02; speeds may have run ahead of the IMU
-    # by what a busy machine delays: 0.1 s, at 30 times 12 m/s
+    # with the nominal scale of 1, the true one is 1.02; on a busy machine speeds may arrive 0.1 s
+    # before the IMU, at 30 times 12 m/s
     assert live == pytest.approx(final / 1.02, abs=36.0)
 
 
@@ -260,13 +260,13 @@ def test_cancelled_and_undone_legs_are_marked(session):
     assert 'leg 3, ' in session.second.message
     assert session.undo.success
     assert session.after_undo['leg_id'] == '3'
-    # the stamp says when it was set; all else is as after the first leg, to the last digit
+    # the stamp is the time of the change; all else is as after the first leg, in every digit
     before, after = ({k: repr(v) for k, v in r.items() if k != 'result.stamp'}
                      for r in (session.results, session.results_after_undo))
     assert after == before
 
 
-def test_save_and_reset_and_latest_goes_with_dropped_legs(session):
+def test_save_and_reset_succeed_and_latest_follows_dropped_legs(session):
     assert session.save.success
     folders = [p for p in session.folder.iterdir() if not p.is_symlink()]
     assert len(folders) >= 2                 # autosave of each good leg, and ~/save
@@ -276,7 +276,7 @@ def test_save_and_reset_and_latest_goes_with_dropped_legs(session):
     assert (session.after_reset['leg_event'], session.after_reset['leg_id']) == ('undone', '1')
     assert session.results_after_reset['result.valid'] is False
     assert math.isnan(session.results_after_reset['result.scale_factor'])
-    # the folder saved after the first leg stands again when the later ones are undone
+    # latest is the folder of the first leg again when the later legs are undone
     assert session.back == Path(session.saved['saved']).resolve()
     assert not (session.folder / 'latest').is_symlink()
     assert saved.is_dir()     # nothing removed

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node odometry against replay, and after errors of its own."""
+"""The node odometry compared with replay, and after internal errors."""
 
 import importlib.util
 from types import SimpleNamespace
@@ -28,7 +28,7 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.settings.node_configs import OdomFrames
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: any, but one for both
+BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: the same for both
 RESULT = {'result.valid': True, 'result.scale_factor': 1.0, 'result.scale_factor_sigma': 0.001}
 # the first path that has poses ends in an error
 FAILS = """
@@ -46,7 +46,7 @@ Reckoning.poses = poses
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate two minutes of a hilly town, the IMU at a rate of which replay uses all."""
+    """Simulate two minutes in a hilly town, at an IMU rate of which replay uses each sample."""
     return simulate(SimOptions(scenario='town', duration=135.0, slope=0.03, imu_rate=50.0,
                                odometer_rate=20.0, odometer='speed', fix_noise='rtk',
                                imu_grade='tactical'))
@@ -54,7 +54,7 @@ def drive():
 
 @pytest.fixture(scope='module')
 def replayed(drive, tmp_path_factory):
-    """Calibrate on it from a given alignment, and write what odocal replay writes."""
+    """Calibrate the drive from a given alignment, and write the file that replay writes."""
     row = int(np.searchsorted(drive.imu.stamp_ns, drive.truth.start_ns)) - 5
     alignment = Alignment(
         t=(int(drive.imu.stamp_ns[row]) - drive.truth.start_ns) * 1e-9,
@@ -72,10 +72,10 @@ def replayed(drive, tmp_path_factory):
 
 
 def begin(replayed):
-    """Return the settings that begin the node where replay begins."""
+    """Return the settings with which the node starts like replay."""
     return {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
             'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False,
-            # from the very first message on: one lost would be another start
+            # a lost first message would change the start
             **{f'qos_overrides./{topic}.subscription.reliability': 'reliable'
                for topic in ('imu/data', 'odometer')}}
 
@@ -98,10 +98,10 @@ def received(drive, replayed):
         wait_for(lambda: seen.odometry and stamp_of(seen.odometry[-1]) > sent[-1].stamp_ns - 10**9,
                  f'the last pose; the node says {leg.node.text}')
         assert leg.node.end() == 0
-    return seen         # before any test: another of this name may come
+    return seen         # ended: a test may start one of this name
 
 
-def test_its_path_is_that_of_replay_as_calibrated(received, drive, replayed):
+def test_the_path_of_the_node_equals_that_of_replay(received, drive, replayed):
     assert received.node.text.count('odometry starts') == 1, received.node.text
     assert 'jumps' not in received.node.text
     rows = np.searchsorted(drive.imu.stamp_ns, [stamp_of(m) for m in received.odometry])
@@ -113,7 +113,7 @@ def test_its_path_is_that_of_replay_as_calibrated(received, drive, replayed):
     assert np.abs(path - expected_track).max() < 1e-9
 
 
-def test_messages_are_what_robot_localization_takes(received):
+def test_messages_have_the_frames_and_covariances_for_robot_localization(received):
     pose, twist = received.odometry[500], received.twists[500]
     assert (pose.header.frame_id, pose.child_frame_id) == ('odom', 'base_link')
     assert (twist.header.frame_id, twist.header.stamp) == ('base_link', pose.header.stamp)
@@ -124,7 +124,7 @@ def test_messages_are_what_robot_localization_takes(received):
         np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.trace(matrix))
 
 
-def test_without_a_calibration_it_says_what_to_give(tmp_path):
+def test_without_a_calibration_the_error_names_the_required_file(tmp_path):
     rejected = tmp_path / 'rejected.yaml'
     rejected.write_text('/**: {ros__parameters: {result: {scale_factor: 0.02, valid: false}}}')
     for more, why in (((), 'no calibration is given'),
@@ -137,7 +137,7 @@ def test_without_a_calibration_it_says_what_to_give(tmp_path):
         assert 'calibration.yaml' in line
 
 
-def test_the_launch_file_starts_it_with_both_files():
+def test_the_launch_file_starts_the_node_with_both_files():
     declared, (node,) = of_xml(ROOT / 'launch' / 'odometry.launch.xml',
                                {'calibration': '/tmp/calibration.yaml', 'imu_topic': '/a/imu'})
     assert declared['calibration'][0] == ''       # must be given
@@ -148,7 +148,7 @@ def test_the_launch_file_starts_it_with_both_files():
     assert node.remappings['imu/data'] == '/a/imu'
 
 
-def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed):
+def test_the_node_accepts_its_settings_file_and_conforms_to_the_policy(replayed):
     expected_track = allowed('/odometry')
     settings = {'odometer.left': 'topic', 'odometer.right': 'topic', 'use_sim_time': True,
                 'odometer.type': 'std_msgs/msg/Int64'}
@@ -161,7 +161,7 @@ def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(repl
         assert leg.node.end() == 0
 
 
-def test_the_ekf_of_robot_localization_listens_to_what_is_sent():
+def test_the_ekf_configuration_uses_the_published_twist():
     import yaml
     ekf = yaml.safe_load((ROOT / 'config' / 'ekf_odocal.yaml').read_text())[
         '/**/ekf_filter_node']['ros__parameters']
@@ -175,7 +175,7 @@ def test_the_ekf_of_robot_localization_listens_to_what_is_sent():
     assert {name for name, on in fused.items() if on} == {'vx', 'vy', 'vyaw'}
 
 
-def test_tf_without_its_message_says_what_to_install():
+def test_publish_tf_without_tf2_msgs_names_the_package_to_install():
     if importlib.util.find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed')
     node = NodeProcess(*given(RESULT | {'publish_tf': True}), module='odometry')
@@ -185,7 +185,7 @@ def test_tf_without_its_message_says_what_to_install():
         'ros-jazzy-tf2-msgs, or set publish_tf to false']
 
 
-def test_the_transform_is_the_pose():
+def test_the_transform_equals_the_pose():
     numbers = np.array([1.0, -2.0, 0.5, 0.1, 0.2, 0.3, 0.9, *[0.0] * 78])
     pose = Pose(1_234_567_890_123, numbers.tobytes())
     out = transform_of(pose, OdomFrames(base='car', odom='map'))
@@ -197,7 +197,7 @@ def test_the_transform_is_the_pose():
 
 
 @pytest.mark.parametrize('simulated', [False, True])
-def test_it_goes_on_after_an_error_of_its_own(simulated):
+def test_the_node_continues_after_an_internal_error(simulated):
     types, messages = messages_of(simulate(SimOptions(
         scenario='out_and_back', duration=240.0, imu_rate=50.0, odometer_rate=20.0,
         odometer='speed')), fix=None)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Overload, lateness, a flood of parameters, hostile messages: counted, and the node goes on."""
+"""Overload, late messages, many parameter requests, hostile messages: the node continues."""
 
 import contextlib
 from dataclasses import replace
@@ -40,12 +40,12 @@ pytestmark = pytest.mark.slow
 SPEED = 15.0
 FEW = 100      # messages that the queue of the odometer holds
 REQUESTS = 20
-CLEAN, SOME, HALF = 2, 3, 5     # seeds: how much of a round is hostile
+CLEAN, SOME, HALF = 2, 3, 5     # seeds, for the share of hostile messages
 
 
 @contextlib.contextmanager
 def is_busy():
-    """Keep each core at work."""
+    """Keep each core busy."""
     loops = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
              for _ in range(os.cpu_count())]
     try:
@@ -58,7 +58,7 @@ def is_busy():
 
 @pytest.fixture(scope='module')
 def leg(tmp_path_factory):
-    """Drive a leg with a loop on each core; in its midst the node is stopped for 0.7 s."""
+    """Drive a leg with a loop on each core; during the leg the node is stopped for 0.7 s."""
     settings = {'output.directory': tmp_path_factory.mktemp('out'),
                 'qos_overrides./odometer.subscription.depth': FEW}
     with playing_to(messages_of(straight()), settings, SPEED) as leg, is_busy() as loops:
@@ -81,19 +81,19 @@ def leg(tmp_path_factory):
         return SimpleNamespace(sent=leg.sent, loss_status=loss_status, **vars(seen))
 
 
-def test_what_the_queue_lost_is_counted_and_said(leg):
+def test_messages_lost_by_the_queue_are_counted_and_reported(leg):
     start_ns, stop_ns = ends_of(leg.status)
     kept = sum(start_ns < ns <= stop_ns for ns in stamps_of(leg.journal, '/odometer'))
     sent = sum(start_ns < one.stamp_ns <= stop_ns for one in leg.sent if one.slot == 'odometer')
     assert kept < 0.95 * sent
     lost, = re.findall(r'(\d+) messages of /odometer lost', leg.status['message'])
     assert int(lost) == sent - kept
-    # while the node is stopped the socket overflows as well: of other topics
+    # while the node is stopped, the socket also loses messages of other topics
     assert int(leg.status['messages_lost']) >= int(lost)
     assert 'messages of /odometer lost' in leg.loss_status['message']
 
 
-def test_the_result_is_that_of_a_replay(leg):
+def test_the_result_after_an_overload_equals_that_of_replay(leg):
     offline = replayed(leg.journal, *NUMBERS)[1]
     same_result(leg.live, offline)
     assert [(one['start_ns'], one['stop_ns']) for one in leg.live['legs']] == [
@@ -101,7 +101,7 @@ def test_the_result_is_that_of_a_replay(leg):
 
 
 def flood(client):
-    """Ask to set all parameters to odd values, again and again; return the futures."""
+    """Send many requests to set all parameters to odd values; return the futures."""
     call = client.send(ListParameters, 'list_parameters', ListParameters.Request())
     wait_for(call.done, 'the names of the parameters')
     names, futures = call.result().result.names, []
@@ -116,7 +116,7 @@ def flood(client):
     return futures
 
 
-def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(play_to):
+def test_a_leg_survives_many_parameter_requests_and_a_restart_of_the_sender(play_to):
     leg = play_to(messages_of(straight()), speed=SPEED)
     leg.record(45, 60)
     with leg.playing(60, 95):
@@ -131,7 +131,7 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(play_t
     assert len(leg.node.lines) < 20
     for publisher in leg.player.publishers.values():
         leg.client.node.destroy_publisher(publisher)
-    del leg.player      # another is made
+    del leg.player      # a new one is made
     leg.play(95, 115)
     assert 'scale factor 1.0' in leg.ended(115).message
     assert leg.node.process.poll() is None
@@ -145,14 +145,14 @@ def wire(tmp_path_factory):
 
 
 def test_a_drive_without_a_hostile_message_is_accepted(wire):
-    """Else the fuzz shows nothing."""
+    """Otherwise the fuzz test has no meaning."""
     seen = wire.round(CLEAN)
     assert (seen.hostile, seen.wrong) == (0, [])
     assert seen.accepted
 
 
 @pytest.mark.parametrize('seed', [SOME, HALF])
-def test_the_node_lives_answers_and_accepts_nothing_false(wire, seed):
+def test_the_node_survives_hostile_messages_and_accepts_no_wrong_result(wire, seed):
     seen = wire.round(seed)
     assert seen.hostile
     assert seen.calls >= 2
@@ -166,7 +166,7 @@ HELD_EVERY_S, HELD_S = 7.0, 0.12
 TYPES = {'imu': 'sensor_msgs/msg/Imu', 'fix': 'sensor_msgs/msg/NavSatFix'} | dict.fromkeys(
     ('free', 'held', 'slip'), 'std_msgs/msg/Int64')
 LEGS = {'free': (False, False), 'held': (True, False), 'slip': (True, True)}
-# a core at work for 0.1 s of each 0.4 s: threads wait for it, and are woken late
+# a core busy for 0.1 s of each 0.4 s: waiting threads wake up late
 BUSY = ('import os, time; os.nice(5)\n'
         'while True:\n'
         '    until = time.monotonic() + 0.1\n'
@@ -175,7 +175,7 @@ BUSY = ('import os, time; os.nice(5)\n'
 
 
 def messages(drive, begin_ns):
-    """Return the messages of IMU, fixes and a counter for each leg, by when they go out."""
+    """Return the messages of IMU, fixes and a counter for each leg, in order of sending."""
     by_ns = begin_ns - drive.imu.stamp_ns[0]
     topics = {'imu': encode.imu('imu', moved(drive.imu, by_ns)),
               'fix': encode.fix('fix', moved(drive.fix, by_ns))}
@@ -198,7 +198,7 @@ def play(player, sent, begin_ns, first_s, last_s):
             player.publishers[one.slot].publish(one.raw)
 
 
-def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
+def test_late_counts_are_not_slip_and_slip_is_found(tmp_path):
     drive = simulate(SimOptions(
         scenario='town', duration=135.0, imu_rate=50.0, odometer_rate=50.0, fix_noise='rtk',
         imu_grade='industrial', seed=8))
@@ -216,7 +216,7 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
             name: f'/{name}/ticks' for name in LEGS})
         first_ns, sent = by_now(lambda ns: messages(drive, ns - round(FIRST_S * 1e9)))
         begin_ns = first_ns - round(FIRST_S * 1e9)
-        # a little nicer than the test: else it is the player that cannot keep up
+        # lower priority than the test: otherwise the player is too slow
         load = subprocess.Popen([sys.executable, '-c', BUSY])
         ends.callback(load.wait)
         ends.callback(load.kill)
@@ -234,7 +234,7 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
         assert answers[name].message.startswith('accepted'), answers[name].message
         assert 'WHEEL_SLIP' not in reasons[name]
     assert 'ODOMETER_LATE' in reasons['held']
-    for name in LEGS:     # each with a folder and a journal of its own
+    for name in LEGS:     # each has its own folder and journal
         own = tmp_path / 'odocal' / name / 'calibrator'
         assert len(list((own / 'journal').iterdir())) == 1
         content = json.loads((own / 'latest' / 'calibration.json').read_text())

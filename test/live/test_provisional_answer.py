@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg whose fit takes long: ~/stop_leg answers with the running estimate; the result follows."""
+"""A leg with a long fit: ~/stop_leg answers with the running estimate, and the result follows."""
 
 from contextlib import ExitStack
 import math
@@ -22,7 +22,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 STOP_S = 140                         # of the drive
 MOST_S = 5.0                         # of an answer, as docs/node.md promises
-# until a file is there, the first leg's fit makes three passes and the next leg's none
+# until a file exists, the fit of the first leg makes three passes and that of the next none
 HELD = """
 import os, time
 from odocal_ros.live import worker
@@ -36,7 +36,7 @@ def held(*args):
         tell(stage)
         if stage.passes == 3:
             wait()
-    if args[3]:      # the legs kept
+    if args[3]:      # not the first leg
         wait()
     return compute(*samples, report)
 worker.compute = held
@@ -54,7 +54,7 @@ def seen(tmp_path_factory):
     with ExitStack() as ends:
         leg = ends.enter_context(playing_to(messages_of(drive), {'output.directory': folder},
                                             before=HELD.format(str(gate))))
-        ends.callback(gate.touch)      # the node's end waits for what its worker was given
+        ends.callback(gate.touch)      # the node ends after the jobs of its worker
         leg.record(10, 25, STOP_S)
         wait_for(lambda: leg.client.status['estimate_yaw_mounting_angle_rad'] != 'nan',
                  'a running estimate', 4 * PATIENCE)
@@ -96,14 +96,14 @@ def _answered(leg, stop_s=0.0):
     return SimpleNamespace(answer=answer_of(call), seconds=time.monotonic() - begin)
 
 
-def test_the_answer_does_not_wait_for_a_fit_that_takes_long(seen):
+def test_the_answer_does_not_wait_for_a_long_fit(seen):
     for one in (seen.first, seen.again, seen.short):
         assert STOP_ANSWER_S <= one.seconds < MOST_S
         assert one.answer.success
         assert one.answer.message.startswith('provisional: leg ')
 
 
-def test_it_holds_the_running_estimate_as_the_status_had_it(seen):
+def test_the_answer_has_the_running_estimate_of_the_status(seen):
     value, sigma = (float(seen.computing[f'estimate_scale_factor{end}']) for end in ('', '_sigma'))
     text = seen.first.answer.message
     assert f'the running estimate is scale factor {with_sigma(value, sigma)},' in text
@@ -113,7 +113,7 @@ def test_it_holds_the_running_estimate_as_the_status_had_it(seen):
     assert 's before the end' in text
 
 
-def test_nothing_in_it_can_be_taken_for_the_result(seen):
+def test_the_answer_cannot_be_mistaken_for_the_result(seen):
     text = seen.first.answer.message
     for word in ('accepted', 'caution', 'rejected', 'OK:'):
         assert word not in text
@@ -124,7 +124,7 @@ def test_nothing_in_it_can_be_taken_for_the_result(seen):
     assert 'the result follows on ~/status' in seen.computing['hint']
 
 
-def test_meanwhile_passes_and_remaining_change_are_said(seen):
+def test_the_status_shows_passes_and_remaining_change_of_the_fit(seen):
     status = seen.computing
     assert (status['computing_stage'], status['computing_passes']) == ('smoother', '3')
     change = float(status['computing_change_sigmas'])
@@ -138,7 +138,7 @@ def test_meanwhile_passes_and_remaining_change_are_said(seen):
     assert (done['computing_change_sigmas'], done['computing_percent']) == ('nan', '0.0')
 
 
-def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_again(seen):
+def test_the_result_follows_in_status_and_parameters_and_to_the_next_call(seen):
     assert seen.last.success
     assert 'accepted: scale factor ' in seen.last.message
     assert seen.valid
@@ -148,13 +148,13 @@ def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_agai
     assert within(seen.scale, seen.truth.scale)
 
 
-def test_a_leg_without_running_estimate_says_so_and_may_be_dropped(seen):
+def test_a_missing_running_estimate_is_reported_and_the_leg_can_be_cancelled(seen):
     assert 'leg 2 is being computed; there is no running estimate' in seen.short.answer.message
     assert 'The final result of all legs' in seen.short.answer.message
     assert (seen.cancelled.success, seen.cancelled.message) == (False, 'leg 2 is cancelled')
 
 
-def test_a_leg_that_would_be_rejected_is_no_good_news():
+def test_the_answer_reports_that_a_leg_would_be_rejected():
     session = Session()
     session.start(1, Config())
     now = SessionView(session, Config(), faults=(

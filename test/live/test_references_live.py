@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs by poses, by TF, and by ~/mark from point to point; their journals replay to the bit."""
+"""Legs with poses, TF or ~/mark on points as reference; their journals replay identically."""
 
 import importlib.util
 from types import SimpleNamespace
@@ -42,19 +42,19 @@ def transforms(t_ns, place, child, frame):
 
 @pytest.fixture(scope='module')
 def tf(tmp_path_factory):
-    """Drive the same by TF: odom creeps away at 0.1 m/s, SLAM corrects it."""
+    """Drive the same with TF: odom drifts by 0.1 m/s, SLAM corrects it."""
     messages = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed')
     from rclpy.qos import DurabilityPolicy, QoSProfile
     drive = simulate(SimOptions(**TOWN))
     types, sent = messages_of(drive, fix=None)
     t_fix, t = drive.fix.stamp_ns, drive.odometer.stamp_ns
 
-    def creep(at_ns):
+    def drift(at_ns):
         return np.outer((at_ns - t[0]) * 1e-10, [1.0, 0.0, 0.0])
-    sent += transforms(t_fix, drive.positions() - creep(t_fix), 'odom', 'map')
-    sent += transforms(t, creep(t), 'base_link', 'odom')
+    sent += transforms(t_fix, drive.positions() - drift(t_fix), 'odom', 'map')
+    sent += transforms(t, drift(t), 'base_link', 'odom')
     driven = types | {'fix': TF}, sorted(sent, key=lambda one: one.stamp_ns)
-    # a turn of a quarter, which leaves the positions
+    # a quarter turn, which does not change the positions
     fixed = make.transform(0, (0.0, 0.0, 0.0), 'prism', 'base_link')
     fixed.transform.rotation.z = fixed.transform.rotation.w = 0.5 ** 0.5
     start_s = (drive.leg().start_ns - driven[1][0].stamp_ns) * 1e-9
@@ -73,7 +73,7 @@ def tf(tmp_path_factory):
 @pytest.mark.parametrize(('leg', 'words'), [
     ('posed', 'fix: geometry_msgs/msg/PoseStamped on /slam/pose, best effort'),
     ('tf', 'fix: tf2_msgs/msg/TFMessage on /tf, best effort')])
-def test_a_leg_by_positions_finds_the_truth_and_replays_to_the_last_bit(leg, words, request):
+def test_a_leg_with_a_position_reference_is_accurate_and_replays_identically(leg, words, request):
     seen = request.getfixturevalue(leg)
     assert words in seen.node.text
     assert 'Traceback' not in seen.node.text
@@ -83,10 +83,10 @@ def test_a_leg_by_positions_finds_the_truth_and_replays_to_the_last_bit(leg, wor
     assert 4 * scale['sigma'] < 0.004
     assert 'LOCAL_FRAME' in {r['code'] for r in seen.live['legs'][0]['reasons']}
     assert seen.live['inputs'][0]['topics']['fix'] == words.split(' on ')[1].split(',')[0]
-    assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # it names its topics
+    assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # topics are known
 
 
-def test_without_tf2_msgs_the_node_says_what_to_install():
+def test_without_tf2_msgs_the_error_names_the_package_to_install():
     if importlib.util.find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed')
     with pytest.raises(BadConfig, match="'tf2_msgs/msg/TFMessage' cannot be imported here: "
@@ -94,7 +94,7 @@ def test_without_tf2_msgs_the_node_says_what_to_install():
         message_class(TF)
 
 
-def test_one_topic_is_not_odometer_and_reference(start):
+def test_one_topic_cannot_be_odometer_and_reference(start):
     node = start({}, '-r', 'fix:=/odom', '-r', 'odometer:=/odom')
     assert node.wait() != 0
     assert ('/odom is both odometer and fix: an odometer cannot be calibrated against itself; '
@@ -102,7 +102,7 @@ def test_one_topic_is_not_odometer_and_reference(start):
     assert 'Traceback' not in node.text
 
 
-def test_an_odometry_is_the_reference_where_the_name_is_remapped(start, connect):
+def test_an_odometry_topic_is_the_reference_if_fix_is_remapped_to_it(start, connect):
     from nav_msgs.msg import Odometry
     node = start({}, '-r', 'fix:=/lidar/odometry')
     connect().node.create_publisher(Odometry, '/lidar/odometry', 1)
@@ -148,7 +148,7 @@ def marked(request, tmp_path_factory):
                                hints=hints, **vars(leg.stopped(at, 3.0)))
 
 
-def test_marks_are_refused_answered_and_asked_for(marked):
+def test_marks_are_refused_in_motion_answered_and_requested_by_the_hint(marked):
     assert not marked.early.success
     assert 'call ~/start_leg first, then ~/mark on each point' in marked.early.message
     assert not marked.turning.success
@@ -162,7 +162,7 @@ def test_marks_are_refused_answered_and_asked_for(marked):
     assert 'call ~/mark' not in marked.hints[1]
 
 
-def test_marks_find_both_wheels_and_the_track_width(marked):
+def test_marks_determine_both_wheels_and_the_track_width(marked):
     assert marked.stop.success, marked.stop.message
     options = marked.drive.options
     left, right = marked.drive.truth.wheel_scales
@@ -175,7 +175,7 @@ def test_marks_find_both_wheels_and_the_track_width(marked):
     assert ('LOCAL_FRAME' in codes) is options.imu
 
 
-def test_its_journal_replays_to_the_last_bit_and_options_precede_it(marked):
+def test_a_journal_with_marks_replays_identically_and_options_take_precedence(marked):
     check_replay(marked.live, marked.journal)
     with pytest.raises(BadUsage, match='--mark 14: the odometer has no data there'):
         calibrate_bag(marked.journal, config={'reference.marks': [14.0]})

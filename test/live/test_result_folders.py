@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result folders that are read-only, removed or shared, and nodes that end: nothing half."""
+"""Result folders that are read-only, removed or shared, and nodes that end: complete files."""
 
 import json
 from pathlib import Path
@@ -34,7 +34,7 @@ def driven():
 
 
 def leg(driven, nodes, clients, between=lambda: None):
-    """Drive a leg for nodes that hear the same topics; return their answers."""
+    """Drive a leg for nodes with the same topics; check that each succeeds."""
     drives = [Drive(*one, driven, SPEED) for one in zip(nodes, clients, strict=True)]
     first = drives[0]
     wait_for(lambda: all(p.get_subscription_count() == len(clients)
@@ -57,11 +57,11 @@ def true(content):
 
 
 def results(folder):
-    """Return the folders that were written for results, whatever is in them."""
+    """Return the result folders, also incomplete ones."""
     return [path for path in folder.iterdir() if path.name != 'journal' and not path.is_symlink()]
 
 
-def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
+def test_a_read_only_folder_is_reported_and_used_once_it_is_writable(
         start, connect, driven, tmp_path):
     folder = tmp_path / 'shut'
     folder.mkdir()
@@ -81,7 +81,7 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     assert abs(float(status['scale_factor']) - SCALE) < 5 * float(status['scale_factor_sigma'])
     assert not client.call('save').success
     assert list(folder.iterdir()) == []
-    # and no journal is missed where none is wanted
+    # no warning if no journal is required
     assert client.set(journal__max_bytes=0).successful
     client.until(journal='', journal_trouble='')
     folder.chmod(0o755)
@@ -101,7 +101,7 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     assert node.process.poll() is None
 
 
-def test_a_folder_removed_while_a_leg_is_driven_is_made_again(start, connect, driven, tmp_path):
+def test_a_folder_removed_during_a_leg_is_created_again(start, connect, driven, tmp_path):
     folder = tmp_path / 'gone'
     node, client = start({'output.directory': folder} | QUICK), connect()
 
@@ -128,7 +128,7 @@ def test_two_nodes_that_save_into_one_folder_have_a_result_each(
         client.ask('save') for client in clients for _ in range(3)]]
     assert all(answer.success for answer in answers), answers
     folders = results(tmp_path)
-    assert len(folders) == 8              # each node saved by itself, too
+    assert len(folders) == 8              # with the automatic saves
     assert all(true(whole_content(one)) for one in folders)
     assert (tmp_path / 'latest').resolve() in folders
     for client in clients:
@@ -148,7 +148,7 @@ def sent():
 
 @pytest.mark.parametrize(('how', 'before'), [
     (signal.SIGINT, ''), (signal.SIGTERM, SLOW)])
-def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
+def test_a_signal_right_after_a_leg_ends_the_node_with_complete_files(
         play_to, sent, tmp_path, how, before):
     leg = play_to(sent, QUICK | {
         'alignment.heading_source': 'fixed', 'alignment.heading': 0.7,
@@ -156,11 +156,11 @@ def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
     leg.record(40, 60, 115)
     answer, node = leg.ended(115), leg.node
     assert answer.success, answer.message
-    if before:      # the numbers are there, the report is being drawn
+    if before:      # the numbers are written, the report is being drawn
         wait_for(lambda: list(tmp_path.glob('2*/calibration.json')), 'the numbers')
     began = time.monotonic()
     assert node.end(how) == 0
-    assert time.monotonic() - began < 5.0 + 5.0      # launch's patience; ours of a busy machine
+    assert time.monotonic() - began < 5.0 + 5.0      # timeout of launch; margin if busy
     assert 'terminate' not in node.text
     folder, = tmp_path.glob('2*')
     assert json.loads((folder / 'calibration.json').read_text())['verdict'] != 'rejected'
@@ -172,7 +172,7 @@ def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
 @pytest.mark.parametrize(('stage', 'moment_s'), [
     *(('stop', m) for m in np.random.default_rng(12).uniform(0.0, 4.0, 2).round(3)),
     *(('save', m) for m in np.random.default_rng(13).uniform(0.0, 0.4, 2).round(3))])
-def test_a_node_killed_at_its_files_leaves_whole_ones(driven, tmp_path, stage, moment_s):
+def test_a_node_killed_while_writing_leaves_complete_results(driven, tmp_path, stage, moment_s):
     left = killed_at_files(driven, stage, moment_s, tmp_path, **QUICK)
     assert left.half == []
     assert left.latest

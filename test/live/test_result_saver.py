@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The worker, the answer of ~/save, and what ``latest`` points at: never quietly a worse one."""
+"""The worker, the answer of ~/save, and ``latest``: a worse result does not replace it."""
 
 import os
 from pathlib import Path
@@ -54,7 +54,7 @@ def save(saving, tmp_path):
     return run
 
 
-def test_what_cannot_be_saved_is_a_warning_until_it_is(saving, tmp_path):
+def test_a_failed_save_is_a_warning_until_a_save_succeeds(saving, tmp_path):
     (tmp_path / 'file').touch()
     success, text = saving.save(GOOD, tmp_path / 'file')
     assert not success
@@ -65,7 +65,7 @@ def test_what_cannot_be_saved_is_a_warning_until_it_is(saving, tmp_path):
     assert saving.saver.trouble == ''
 
 
-def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
+def test_a_worse_result_becomes_latest_by_the_second_save_of_the_operator(save, tmp_path):
     assert save(GOOD, by_operator=False)[1]
     for _ in range(2):
         assert not save(BAD, by_operator=False)[1]
@@ -79,7 +79,7 @@ def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
     assert not list(tmp_path.glob('.latest*'))
 
 
-def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(saving, tmp_path, monkeypatch):
+def test_neither_the_answer_nor_a_leg_waits_for_the_report(saving, tmp_path, monkeypatch):
     gate, worker, done = threading.Event(), saving.worker, []
     monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: (
         gate.wait(20), ('<html></html>', ''))[1])
@@ -95,7 +95,7 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(saving, tmp_p
     assert done + saving.messages == ['a leg']
 
 
-def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path):
+def test_the_next_save_removes_what_a_killed_node_left(save, tmp_path):
     empty, full, new = (tmp_path / f'2026-01-01T00-00-0{k}Z' for k in range(3))
     other = tmp_path / 'notes'
     for folder in (empty, full, new, other):
@@ -111,17 +111,17 @@ def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path)
             or one.exists()} == {full.name, new.name, other.name, young.name}
 
 
-def test_jobs_given_before_the_end_are_done_but_a_long_one_does_not_hold_it():
+def test_pending_jobs_are_finished_at_the_end_but_a_long_one_does_not_delay_it():
     done, gate, w = [], threading.Event(), Worker()
     w.submit(lambda: gate.wait(5.0), lambda *_: None)
     w.submit(lambda: done.append('saved'), lambda *_: None)
-    assert not w.close(0.05)       # returns though the first has not ended
+    assert not w.close(0.05)       # returns before the first has ended
     threading.Timer(0.05, gate.set).start()
     assert w.close()
     assert done == ['saved']
 
 
-def test_each_node_has_a_folder_of_its_own_in_the_ros_home(tmp_path, monkeypatch):
+def test_each_node_has_its_own_folder_in_the_ros_home(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
     assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'
@@ -149,8 +149,7 @@ def latest(tmp_path):
     return link.readlink() if link.is_symlink() else None
 
 
-def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operators(tmp_path,
-                                                                                  monkeypatch):
+def test_old_results_of_automatic_legs_are_removed(tmp_path, monkeypatch):
     of = {}       # name: (automatic, usable)
 
     def stored(path):
@@ -167,22 +166,22 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
         folders.point_latest(folder, day, False)
         folders.prune(folder, 0)
     (tmp_path / 'journal').mkdir()
-    assert len(list(tmp_path.glob('2026*'))) == 8        # 0: all
+    assert len(list(tmp_path.glob('2026*'))) == 8        # 0: no limit
     folders.prune(folder, 2)
-    # the operator's; 4 is what latest shows, 3 what it would go back to; the last two
+    # kept: the operator's, 4 as latest, 3 as latest after an undo, and the last two
     assert [p.name[8:10] for p in sorted(tmp_path.glob('2026*'))] == ['01', '03', '04', '07', '08']
     assert latest(tmp_path) == Path('2026-05-04T09-12-00Z')
     assert (tmp_path / 'journal').is_dir()
 
 
-def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
+def test_a_result_of_an_earlier_session_is_compared_too(make, tmp_path):
     ResultFolders().point_latest(make('old'), 1, False)
     folders = ResultFolders()
     assert folders.point_latest(make('bad'), 2, False) == 'it is rejected'
     assert latest(tmp_path) == Path('old')
 
 
-def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
+def test_undo_sets_latest_back_to_the_result_of_the_remaining_legs(make, tmp_path):
     ResultFolders().point_latest(make('old'), 0, False)
     folders = ResultFolders()
     a = make('a')
@@ -196,10 +195,10 @@ def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
     assert folders.withdraw(0) is None
 
 
-def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
+def test_undo_removes_latest_if_its_target_is_missing(make, tmp_path):
     old, folders = make('old'), ResultFolders()
     folders.point_latest(old, 1, False)
-    folders.withdraw(0)       # the first of all
+    folders.withdraw(0)       # the first result
     assert latest(tmp_path) is None
     assert old.is_dir()
     ResultFolders().point_latest(old, 0, False)
@@ -210,7 +209,7 @@ def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
     assert latest(tmp_path) is None
 
 
-def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
+def test_a_link_changed_by_another_program_is_kept(make, tmp_path):
     folders = ResultFolders()
     folders.point_latest(make('a'), 1, False)
     ResultFolders().point_latest(make('other'), 5, False)
@@ -218,15 +217,15 @@ def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
     assert latest(tmp_path) == Path('other')
 
 
-def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
-    """Whoever looks at what is there points at its own before the next looks."""
+def test_two_nodes_update_latest_one_after_the_other(make, tmp_path, monkeypatch):
+    """Each node reads and replaces the link before the next one reads it."""
     good, bad = make('good'), make('bad')
     late = threading.Thread(target=lambda: ResultFolders().point_latest(good, 1, False))
     stored_in = module.stored_in
 
     def slowly(path):
         found = stored_in(path)
-        if not late.ident:          # bad has looked, and good comes
+        if not late.ident:          # bad has read it, good starts
             late.start()
             late.join(0.3)
         return found

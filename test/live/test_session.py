@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The operator's session: every command in every state."""
+"""The session of the operator: every command in every state."""
 
 from dataclasses import replace
 import json
@@ -46,7 +46,7 @@ def with_legs(count):
     return session
 
 
-def test_a_leg_goes_from_mark_to_mark():
+def test_a_leg_is_recorded_and_computed_between_two_marks():
     session = Session()
     session.start(100, CONFIG)
     assert (session.state, session.event, session.leg_id) == (State.RECORDING, 'started', 1)
@@ -59,7 +59,7 @@ def test_a_leg_goes_from_mark_to_mark():
     assert (session.state, len(session.legs)) == (State.REJECTED, 2)
 
 
-def test_a_failed_leg_stays_until_retried_or_cancelled():
+def test_a_failed_leg_is_kept_until_a_retry_or_a_cancellation():
     session = with_legs(1)
     session.start(50, CONFIG)
     session.stop(60)
@@ -74,7 +74,7 @@ def test_a_failed_leg_stays_until_retried_or_cancelled():
     assert (session.state, session.event, len(session.legs)) == (State.CALIBRATED, 'cancelled', 1)
 
 
-def test_cancel_gives_back_the_state_before_the_leg():
+def test_cancel_restores_the_state_before_the_leg():
     session = Session()
     session.start(1, CONFIG)
     session.cancel()
@@ -83,7 +83,7 @@ def test_cancel_gives_back_the_state_before_the_leg():
     assert session.leg_id == 2  # ids are never used twice: replay would mix the legs up
 
 
-def test_undo_takes_the_last_leg_and_shows_its_marks():
+def test_undo_removes_the_last_leg_and_shows_its_marks():
     session = with_legs(2)
     assert [leg.leg_id for leg in session.begin_undo()] == [1]
     assert (session.leg_id, session.start_ns, session.stop_ns) == (2, 11, 15)
@@ -99,7 +99,7 @@ def test_undo_takes_the_last_leg_and_shows_its_marks():
     assert (session.state, session.calibration) == (State.IDLE, None)
 
 
-def test_a_reset_drops_all_legs_and_what_is_carried_on():
+def test_a_reset_drops_all_legs_and_the_carried_result():
     session = with_legs(3)
     session.set_carried('two legs', 2)
     assert [leg.leg_id for leg in session.legs] == [3]
@@ -125,7 +125,7 @@ def test_an_open_leg_must_be_ended_first(command):
         command(session)
 
 
-def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
+def test_an_unusable_automatic_leg_does_not_change_the_result():
     session = with_legs(1)
     before = session.calibration
     session.start(50, CONFIG, is_automatic=True)
@@ -141,12 +141,12 @@ def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
 
 @pytest.fixture(scope='module')
 def town():
-    """Return the result of a drive through town, and its configuration."""
+    """Return the result of a drive through a town, and its configuration."""
     made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
     return calibrate(made.leg(), settings(made, method='auto')), settings(made)
 
 
-def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest(town):
+def test_many_legs_keep_their_values_and_only_the_newest_their_tracks(town):
     (whole, config), session = town, Session()
     for leg in range(LEGS_HELD + 2):
         session.start(10 * leg + 1, CONFIG)
@@ -165,7 +165,7 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest(town):
     assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}
 
 
-def test_legs_beyond_those_kept_stay_in_the_result(town, monkeypatch):
+def test_released_legs_remain_in_the_result(town, monkeypatch):
     """A sigma may differ by 5 %: the scatter between legs is carried over on a grid."""
     whole, config = town
     every = [replace(whole, methods=dict(whole.methods), start_ns=whole.start_ns + day * 10**14,

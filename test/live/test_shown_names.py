@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What layouts, the SROS2 policy and each ros2 line of the docs name is what a node has."""
+"""Names in layouts, in the SROS2 policy and in ros2 commands of the docs exist in a node."""
 
 from contextlib import suppress
 import re
@@ -32,7 +32,7 @@ ALL = {'gnss.use_velocity': True, 'odometer.left': 'topic', 'odometer.right': 't
 
 
 def has_field(msgtype, fields):
-    """Return whether a message has a number at these fields."""
+    """Return whether a message type has a number at a path of fields."""
     kind = msgtype
     for field in fields:
         inner = message_class(kind).get_fields_and_field_types()
@@ -51,31 +51,31 @@ def keys_on_the_page():
     return {name for row in rows for name in re.findall(r'`(\w+)`', row) if name != '_sigma'}
 
 
-def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
+def test_the_node_has_the_topics_and_services_of_the_layouts(start, connect):
     start()
     client = connect()
     status = client.until(state='waiting')
     node = client.node
 
     def of_node(what):
-        # a message may be here before discovery knows the name of who sent it
+        # a message may arrive before discovery knows the name of its sender
         with suppress(NodeNameNonExistentError):
             return dict(getattr(node, f'get_{what}_names_and_types_by_node')('calibrator', '/'))
         return {}
     wait_for(lambda: set(shown.published()) <= set(of_node('publisher')), 'all publishers')
     for topic, kind in shown.published().items():
         assert of_node('publisher')[topic] == [kind]
-        # a node that has just ended may still be there
+        # a node that has just ended may still be listed
         info, = wait_for(lambda topic=topic: len(
             found := node.get_publishers_info_by_topic(topic)) == 1 and found,
             f'the one publisher of {topic}')
-        if topic != '/diagnostics':      # the display asks for it: latched
+        if topic != '/diagnostics':      # the display needs it latched
             assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
     assert shown.status_keys() <= set(status)
     documented = keys_on_the_page()
     assert len(documented) > 40
     assert documented <= set(status)
-    # and no key is kept from the reader; a sigma stands with its value
+    # all keys are documented; a sigma is described with its value
     rest = set(status) - documented - {'level', 'name', 'message'}
     assert not {key for key in rest if '_sigma' not in key}
     array = client.arrays[-1].status[0]
@@ -83,12 +83,12 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
     wait_for(lambda: set(shown.services()) <= set(of_node('service')), 'all services')
     for service in shown.services():
         assert of_node('service')[service] == ['std_srvs/srv/Trigger']
-    for kind, names in allowed('/calibrator').items():      # an ordinary node stays within it
+    for kind, names in allowed('/calibrator').items():      # a node conforms to the policy
         assert seen(client, kind) <= names
 
 
 @pytest.mark.parametrize(('topic', 'fields'), sorted(shown.of_inputs()))
-def test_the_inputs_have_the_fields_that_are_drawn(topic, fields):
+def test_the_inputs_have_the_fields_that_the_layouts_plot(topic, fields):
     assert has_field(INPUT_TYPES[topic], fields)
     assert not has_field(INPUT_TYPES[topic], (*fields[:-1], 'nothing'))
 
@@ -116,7 +116,7 @@ def seen(client, kind, node='calibrator'):
     return set()
 
 
-def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, connect):
+def test_the_policy_equals_the_graph_of_a_node_with_all_inputs(start, connect):
     from geometry_msgs.msg import TwistStamped
     from sensor_msgs.msg import FluidPressure, Imu, NavSatFix
     from std_msgs.msg import Int64
@@ -134,7 +134,7 @@ def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, c
                  f'{kind}: {sorted(names)}')
 
 
-def test_the_operator_may_ask_what_the_node_answers():
+def test_the_operator_may_call_only_services_of_the_node():
     node, operator = allowed('/calibrator'), allowed('/calibrator_operator')
     assert operator['request'] <= node['reply']
     assert operator['subscribe'] <= node['publish']
@@ -142,7 +142,7 @@ def test_the_operator_may_ask_what_the_node_answers():
 
 
 @pytest.mark.parametrize('name', ['config/sros2_policy.xml', 'package.xml'])
-def test_security_names_files_that_are_there(name):
+def test_security_names_existing_files(name):
     assert (ROOT / name).exists()
     assert name in (ROOT / 'SECURITY.md').read_text()
 
@@ -154,7 +154,7 @@ LEG = '/calibrator/start_leg', '/calibrator/stop_leg'
 
 
 def of(*start):
-    """Return what follows the first words in the lines that begin with them."""
+    """Return the arguments of all ros2 commands that begin with these words."""
     found = [words[1 + len(start):] for _, words in LINES if words[1:1 + len(start)] == [*start]]
     assert found, f'no line with ros2 {" ".join(start)}: take its test away'
     return found
@@ -169,9 +169,9 @@ def driven(tmp_path_factory):
                     words=tuple(run[run.index('--ros-args') + 1:])) as leg:
         leg.names, client = TOPICS, leg.client
         seen = SimpleNamespace(client=client, answers={}, truth=made.truth.scale)
-        # others belong to runs of their own: test_references_live.py, test_drive_pattern.py
+        # other services have their own tests: test_references_live.py, test_drive_pattern.py
         kinds = dict(of('service', 'call'))
-        # standing; driving to the next stop, and a little on: a leg ends with its last message
+        # standstill; drive to the next stop and 2 s more: a leg ends with its last message
         for name, (begin, mark, end) in zip(LEG, [(45, 60, 60), (60, 117, 119)], strict=True):
             leg.play(begin, mark)
             future = ask(client.node, name, kinds[name])
@@ -191,7 +191,7 @@ def ask(node, name, kind):
     return client.call_async(service.Request())
 
 
-def test_every_line_is_of_a_kind_that_is_tried_here():
+def test_every_ros2_command_of_the_docs_is_tested_here():
     alone = ('run', 'launch', 'odocal')
     assert {(words[1],) if words[1] in alone else tuple(words[1:3])
             for _, words in LINES} == {*((word,) for word in alone), ('service', 'call'),
@@ -208,7 +208,7 @@ def test_run_and_odocal_name_commands_of_the_package():
         assert cli._parser(command).parse_args([command, *options]).command == command
 
 
-def test_launch_names_a_file_and_arguments_that_are_there():
+def test_launch_names_an_existing_file_and_its_arguments():
     for package, name, *arguments in of('launch'):
         if package in FOREIGN:
             continue
@@ -225,18 +225,18 @@ def test_the_calls_start_and_stop_a_leg(driven):
     assert 'scale factor' in driven.answers['/calibrator/stop_leg'].message
 
 
-def test_what_is_echoed_comes(driven):
+def test_echoed_topics_have_messages(driven):
     from rclpy.qos import DurabilityPolicy, QoSProfile
     node = driven.client.node
     for words in of('topic', 'echo'):
         topic = next(word for word in words if word.startswith('/'))
-        if topic in INPUT_TYPES:          # what the operator's drivers send
+        if topic in INPUT_TYPES:          # sent by the operator's drivers
             assert has_field(INPUT_TYPES[topic], words[words.index('--field') + 1].split('.'))
             continue
         kind, = wait_for(lambda topic=topic: driven.graph().get(topic), f'the type of {topic}')
         got = []
-        # as ros2 topic echo does: latched where all that is offered is
-        # messages may be here before discovery knows who sends them
+        # as ros2 topic echo does: latched if all publishers are
+        # messages may arrive before discovery knows their senders
         publishers = wait_for(
             lambda topic=topic: node.get_publishers_info_by_topic(topic), f'who sends {topic}')
         offered = {p.qos_profile.durability for p in publishers}
@@ -248,7 +248,7 @@ def test_what_is_echoed_comes(driven):
         node.destroy_subscription(subscription)
 
 
-def test_parameters_are_there_hold_the_result_and_can_be_set(driven):
+def test_parameters_exist_hold_the_result_and_can_be_set(driven):
     from rcl_interfaces.srv import ListParameters
     client, values = driven.client, {}
     for name, parameter in of('param', 'get'):
@@ -267,8 +267,8 @@ def test_parameters_are_there_hold_the_result_and_can_be_set(driven):
     assert {'method', 'odometer.nominal_scale', 'result.scale_factor'} <= set(listed)
 
 
-def test_what_is_recorded_is_published(driven):
-    # a bag to inspect holds no leg yet, and needs no status
+def test_recorded_topics_are_published(driven):
+    # a bag for odocal inspect has no leg yet and needs no status
     for words, status in zip(of('bag', 'record'), (set(), {'/calibrator/status'}), strict=True):
         topics = [word for word in words if word.startswith('/')]
         assert set(topics) == {*TOPICS.values(), *status}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the node shows: on its console, to ``odocal watch``, and as topics to plot."""
+"""Output of the node: console, ``odocal watch``, and topics to plot."""
 
 import io
 import math
@@ -38,7 +38,7 @@ def test_hint_and_values_are_latched_in_standard_types(start, connect):
         client.node.create_subscription(
             kind, f'/calibrator/{name}',
             lambda message, name=name: received.update({name: message.data}), LATCHED)
-    wait_for(lambda: len(received) == 4, 'latched values')     # to one who comes late
+    wait_for(lambda: len(received) == 4, 'latched values')     # for a late subscriber
     assert received['hint'] == client.status['hint']
     assert (received['scale_factor'], received['scale_factor_sigma']) == (0.02, 1e-5)
     assert math.isnan(received['yaw_mounting_angle'])
@@ -52,7 +52,7 @@ def watch(*paths, **env):
         env=os.environ | {'PYTHONPATH': os.pathsep.join(map(str, paths))} | env)
 
 
-def test_without_the_library_a_sentence_says_what_to_install(tmp_path):
+def test_without_rich_an_error_names_the_package_to_install(tmp_path):
     (tmp_path / 'rich.py').write_text('raise ModuleNotFoundError("no", name="rich")\n')
     ended = watch(tmp_path, ROOT)
     assert (ended.returncode, ended.stdout) == (2, '')
@@ -69,7 +69,7 @@ def test_the_panel_shows_a_running_node(start, connect):
         assert words in ended.stdout
 
 
-def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
+def test_the_panel_shows_the_running_estimate_during_the_computation():
     rich = pytest.importorskip('rich.console')
     from odocal_ros.live.watch import panel
     status = {'state': 'computing', 'scale_factor': '0.03', 'scale_factor_sigma': '0.0001',
@@ -86,7 +86,7 @@ def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
     assert 'scale factor 0.03000 ± 0.00010' in done
 
 
-def test_once_without_a_node_ends(monkeypatch, capsys):
+def test_watch_once_ends_if_there_is_no_node(monkeypatch, capsys):
     pytest.importorskip('rich')
     monkeypatch.setattr(commands, 'WAIT_S', 0.5)
     assert main(['watch', '/nobody', '--once']) == 2
@@ -95,13 +95,13 @@ def test_once_without_a_node_ends(monkeypatch, capsys):
     assert 'no status on /nobody/status for 0.5 s: start the node' in err
 
 
-def test_a_name_that_no_node_can_have_is_refused(capsys):
+def test_an_invalid_node_name_is_refused(capsys):
     pytest.importorskip('rich')
     assert main(['watch', 'not a name', '--once']) == 2
     assert "'not a name' is not the name of a node; ros2 node list" in capsys.readouterr().err
 
 
-def test_the_bars_are_shares_of_what_is_asked():
+def test_the_bars_show_progress_relative_to_the_limits():
     pytest.importorskip('rich')
     from odocal_ros.live.watch import progress_shares
     found = progress_shares({'distance_m': '75.0', 'distance_to_minimum_m': '25.0',
@@ -111,7 +111,7 @@ def test_the_bars_are_shares_of_what_is_asked():
                              'required_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
         'path': 0.75, 'standstill': 0.6, 'scale': 0.25, 'yaw': 0.0}
-    # after a leg it is the result that is compared with the limits
+    # after a leg the result is compared with the limits
     done = {'state': 'calibrated', 'required_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
             'scale_factor_sigma': '0.00004', 'required_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
@@ -122,11 +122,11 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert progress_shares(done | {'state': 'recording'})['scale'] == (0.0,
                                                                        'not known, limit 1000 ppm')
     assert progress_shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
-    # without a leg no metres are missing, and '0 m to go' would be wrong
+    # without a leg there is no remaining distance, and '0 m to go' would be wrong
     assert 'path' not in progress_shares({'state': 'waiting', 'distance_to_minimum_m': '0.0'})
 
 
-def test_what_anybody_publishes_does_not_reach_the_terminal():
+def test_control_characters_from_topics_do_not_reach_the_terminal():
     odd = 'waiting\x1b]52;c;eA==\x07\x1b]0;title\x07\u202e'
     with StatusListener('/odd') as listener:
         other = listener._node
@@ -134,7 +134,7 @@ def test_what_anybody_publishes_does_not_reach_the_terminal():
         hint = other.create_publisher(String, '/odd/hint', LATCHED)
         hint.publish(String(data=odd * 100_000))
         found = iter(listener)
-        status.publish(DiagnosticArray())           # of no status: passed over
+        status.publish(DiagnosticArray())           # without status: ignored
         listener._executor.spin_once(timeout_sec=1.0)
         status.publish(DiagnosticArray(status=[DiagnosticStatus(
             values=[KeyValue(key='state', value=odd)] * 5000)]))
@@ -144,7 +144,7 @@ def test_what_anybody_publishes_does_not_reach_the_terminal():
         assert 'waiting' in hint_text
 
 
-def test_a_status_comes_with_its_own_hint(connect):
+def test_each_status_is_paired_with_its_own_hint(connect):
     node = connect('/sent').node
     status = node.create_publisher(DiagnosticArray, '/sent/status', LATCHED)
     hint = node.create_publisher(String, '/sent/hint', LATCHED)
@@ -167,7 +167,7 @@ def test_a_status_comes_with_its_own_hint(connect):
 SECOND = 10**9
 
 
-def test_each_thing_is_said_once_or_seldom():
+def test_each_message_is_printed_once_or_at_growing_intervals():
     hint_text = []
     console = Console(SimpleNamespace(info=lambda x: hint_text.append(('info', x)),
                                       warning=lambda x: hint_text.append(('warning', x))))
@@ -180,16 +180,16 @@ def test_each_thing_is_said_once_or_seldom():
 
     nothing = {'missing': ['no IMU on /imu/data']}
     times = [s for s in range(-20000, 280) if report(s, **nothing)]
-    assert [t + 20000 for t in times[:4]] == [5, 15, 35, 75]       # 5 s, then ever more seldom
+    assert [t + 20000 for t in times[:4]] == [5, 15, 35, 75]       # 5 s, then growing intervals
     assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 3600
-    # what is missing changes: soon again; the seconds of a silence are no change
+    # another missing input is printed soon; the duration of a silence is not a change
     other = {'missing': ['no IMU on /imu/data for 3 s: 1 publisher found']}
     assert [s for s in range(280, 290) if report(s, **other)] == [285]
     assert report(290, missing=['no IMU on /imu/data for 9 s: 1 publisher found']) == []
     assert report(300, rates_hz={'imu': 100.0})[0] == (
         'info', 'ready (imu 100 Hz): stand still for 10 s, then call ~/start_leg')
     assert report(301) == []
-    assert report(302, **nothing) == [('warning', 'no IMU on /imu/data')]       # at once now
+    assert report(302, **nothing) == [('warning', 'no IMU on /imu/data')]       # immediately
     assert report(303, **nothing) == []
     assert report(304) == [('info', 'all inputs are available again')]
     two = {'duplicate_publishers': ['/ticks has 2 publishers (/a, /b)']}
@@ -211,7 +211,7 @@ def test_each_thing_is_said_once_or_seldom():
 
 
 def test_a_problem_that_later_messages_contradict_is_withdrawn_once():
-    """An IMU whose messages are late looks silent; then all of them arrive."""
+    """Late messages of an IMU look like a gap; then all of them arrive."""
     hint_text, session = [], Session()
     console = Console(SimpleNamespace(info=hint_text.append, warning=hint_text.append))
     cut = (Reason(Code.LEG_CUT, 'the IMU is missing for 1.30 s'),)
@@ -237,7 +237,7 @@ def test_ready_without_known_rates_has_no_empty_brackets():
     assert hint_text == ['ready: stand still for 10 s, then call ~/start_leg']
 
 
-def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connect):
+def test_similar_topics_and_duplicate_publishers_are_reported(start, connect):
     from sensor_msgs.msg import Imu
     from std_msgs.msg import Int64
     node, client = start(), connect()
@@ -254,7 +254,7 @@ def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connec
     wait_for(lambda: '~/start_leg refused: no leg can be started' in node.text, 'the refusal')
 
 
-def test_a_sender_that_returns_with_another_type_is_named(start, connect):
+def test_a_publisher_with_another_type_is_reported(start, connect):
     from geometry_msgs.msg import TwistStamped
     from std_msgs.msg import Int64
     node, client, other = start(), connect(), connect()

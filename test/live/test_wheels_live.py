@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs of two wheels, without an IMU, skid steering, four wheels: journals replay to the bit."""
+"""Legs with two wheels, without an IMU, with skid steering and with four wheels."""
 
 import re
 from types import SimpleNamespace
@@ -37,7 +37,7 @@ def sides(drive):
 
 @pytest.fixture(scope='module')
 def skid(tmp_path_factory):
-    """Drive 90 s of a robot with two wheels that slide in turns."""
+    """Drive 90 s with a robot whose two wheels slide in turns."""
     return leg_of(
         tmp_path_factory.mktemp('skid'),
         INDOOR | {'duration': 90.0, 'imu_rate': 50.0, 'drive': 'skid'}, indoor,
@@ -47,7 +47,7 @@ def skid(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def bare(tmp_path_factory):
-    """Drive 90 s of a robot with two wheels and motion capture, without an IMU."""
+    """Drive a robot with two wheels and motion capture, without an IMU."""
     return leg_of(tmp_path_factory.mktemp('bare'), INDOOR | {'duration': 110.0, 'imu': False},
                   indoor, sides, rest_s=4.0, leg_s=100.0, speed=10.0, names=NAMES)
 
@@ -67,13 +67,13 @@ def four(tmp_path_factory):
 
 
 @pytest.mark.parametrize('leg', ['skid', 'bare', 'four'])
-def test_a_journal_replays_to_the_last_bit(leg, request):
+def test_the_replay_of_a_journal_is_identical(leg, request):
     seen = request.getfixturevalue(leg)
-    assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # it names its topics
+    assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # topics are known
     assert 'Traceback' not in seen.node.text
 
 
-def test_skid_steering_gives_the_effective_width(skid):
+def test_skid_steering_gives_the_effective_track_width(skid):
     width, true = skid.live['result']['track_width'], effective_width(skid.drive.options)
     assert width['method'] == 'planar'
     assert within(width, true)
@@ -96,7 +96,7 @@ def test_a_robot_without_an_imu_is_calibrated_by_its_wheels(bare):
     assert 'no forecast for the leg' not in bare.node.text
 
 
-def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
+def test_status_and_answer_name_each_of_four_wheels(four):
     for name, true in zip(four.drive.joints, four.drive.truth.wheel_scales, strict=True):
         assert f', {name} 0.3' in four.stop.message
         found = four.live['result'][f'scale_factor_{name}']
@@ -106,11 +106,11 @@ def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
     assert four.status['left_right_ok'] == 'unknown'
     assert 'WHEELS_STEERED' in four.status['reasons']
     seen = four.live['legs'][0]['methods']['smoother']['external']['pressure']
-    assert seen['messages'] > 150       # means of a second
+    assert seen['messages'] > 150       # means over 1 s
 
 
 def test_an_imu_is_required_if_it_is_published(start, connect):
-    """A node with two wheels does not ask for an IMU until somebody publishes one."""
+    """A node with two wheels does not require an IMU until one is published."""
     from sensor_msgs.msg import Imu
     start({'odometer.left': 'left', 'odometer.right': 'right'})
     client = connect()
@@ -128,7 +128,7 @@ def session(tmp_path_factory):
     drive = simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, fix_noise='rtk',
         imu_grade='tactical', odometer='angle', two_wheels=True, heading=0.7, seed=4))
-    # no setting says which joints are the wheels: their names do
+    # the wheels are chosen by the names of the joints, without a setting
     wheels = {'left_steering': drive.odometer_right, 'right_steering': drive.odometer,
               'wheel_left': drive.odometer, 'wheel_right': drive.odometer_right}
     driven = messages_of(drive, odometer=encode.joints('odometer', wheels))
@@ -150,7 +150,7 @@ def session(tmp_path_factory):
         stopping = client.ask('stop_leg')
         client.until(state='computing')
         leg.play(start_s + 160, start_s + 163)
-        # inputs that are silent while it is computed would be the hint
+        # inputs without messages during the computation would change the hint
         with leg.playing(start_s + 163, 240, 1.0):
             seen.stop = client.result(stopping)
             seen.result = wait_for(lambda: client.status['state'] in ('calibrated', 'rejected')
@@ -158,7 +158,7 @@ def session(tmp_path_factory):
         return seen
 
 
-def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
+def test_the_start_answers_with_the_manoeuvres_and_the_observable_values(session):
     assert session.start.success
     text = session.start.message
     assert re.search(r'drive 1?\d\d m more, faster than leg.min_speed, 2.78 m/s \(10 km/h\), ',
@@ -174,7 +174,7 @@ def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
     assert TURNS in session.first['manoeuvres']
 
 
-def test_while_it_is_driven_each_quantity_is_yes_or_no(session):
+def test_each_quantity_is_yes_or_no_in_the_status_during_the_leg(session):
     seen = session.looked
     assert seen['state'] == 'recording'
     assert {seen[f'{name}_ok'] for name in ('scale', 'yaw', 'pitch', 'left_right', 'track_width')
@@ -182,7 +182,7 @@ def test_while_it_is_driven_each_quantity_is_yes_or_no(session):
     assert (seen['track_width_ok'] == 'yes') == (TURNS not in seen['hint'])
 
 
-def test_the_stop_answers_with_both_wheels_and_how_good_each_quantity_is(session):
+def test_the_stop_answers_with_both_wheels_and_the_quality_of_each_quantity(session):
     assert session.stop.success
     text, status = session.stop.message, session.result
     for words in ('scale factor 0.', ', left 0.', ', right 0.', ', track width 1.', ' OK: scale'):

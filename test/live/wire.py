@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hostile messages on the wire and services in any order: a node that hears them lives."""
+"""Hostile messages over DDS and services in any order: the node must survive them."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,14 +21,14 @@ BEFORE_S, START_S, STOP_S, LAST_S = 30.0, 60.0, 170.0, 174.0    # of the drive
 SIGMAS = 5.0
 BAD_WORDS = ('Traceback', 'RuntimeWarning', 'nternal error', ' broke: ')
 SET = {'leg__min_distance': 100.0, 'verdict__min_legs': 1, 'imu__nominal_yaw': float('nan')}
-# of the status: what no clock may make negative
+# values of the status that no clock may make negative
 SPANS = ('duration_s', 'standstill_s', 'distance_m', 'max_speed_mps', 'distance_to_minimum_m',
          'seconds_to_stand', 'estimate_age_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz')
 
 
 @dataclass
 class Seen:
-    """What came of a round; ``wrong`` is empty where all is as it should be."""
+    """Outcome of a round; ``wrong`` is empty if there is no error."""
 
     seed: int
     sent: int = 0
@@ -39,7 +39,7 @@ class Seen:
 
 
 class Wire:
-    """A node and who is hostile to it, through rounds of one drive whose stamps go on."""
+    """A node and a hostile sender, in rounds of one drive with increasing stamps."""
 
     def __init__(self, driven, folder: Path, speed: float) -> None:
         self._client, self._rounds = Client(), 0
@@ -52,11 +52,11 @@ class Wire:
         return code
 
     def round(self, seed: int) -> Seen:
-        """Drive a leg among hostile messages and calls."""
+        """Drive a leg with hostile messages and calls."""
         rng, seen = random.Random(seed), Seen(seed)
         share = rng.choice([0.0, 0.001, 0.01, 0.1, 0.5])
         self._rounds += 1
-        for name, value in SET.items():     # what the last round has left
+        for name, value in SET.items():     # the last round may change them
             self._client.set(**{name: value})
         if rng.random() < 0.5:
             self._ask(seen, 'reset')
@@ -92,16 +92,16 @@ class Wire:
             odd = rng.choice([0, 1, 2**31 - 1, -1, -2**31, 1_000_000, 1_900_000_000])
             return raw[:4] + struct.pack('<iI', odd, rng.choice([0, 10**9 - 1, 2**32 - 1])
                                          ) + raw[12:]
-        if kind == 1:      # of a foreign size
+        if kind == 1:      # a wrong size
             return raw[:4] + rng.randbytes(rng.choice([0, 1, 4, 100, 1000, 100_000]))
-        if kind == 2:      # an odd frame, of the length that was there
+        if kind == 2:      # an odd frame of the same length
             size = struct.unpack_from('<I', raw, 12)[0]
             text = rng.choice([b'$(x)', b'\x1b[2J', b'\n', b'\xff\xfe', b'', b'../x'])
             return raw[:16] + text[:size].ljust(size, b'\0') + raw[16 + size:]
         return mutations.cdr(rng, raw)
 
     def _ask(self, seen, name, then=None) -> None:
-        """Call a service; it answers, whatever it says."""
+        """Call a service and require an answer."""
         call = self._client.ask(name)
         if then:        # a leg ends when its topics have passed the mark
             rng, share = then
@@ -112,7 +112,7 @@ class Wire:
             seen.wrong.append(f'{name} answers nothing')
 
     def _anything(self, rng, seen) -> None:
-        """Call a service that is not expected, or set a parameter to something odd."""
+        """Call a random service, or set a parameter to an odd value."""
         if rng.random() < 0.6:
             self._ask(seen, rng.choice(SERVICES))
             return
@@ -125,7 +125,7 @@ class Wire:
         seen.calls += 1
 
     def _look(self, seen) -> None:
-        """See that the node lives and has reported nothing wrong."""
+        """Check that the node is running and has reported neither an error nor a wrong value."""
         client, node, seen_before = self._client, self._drive.node, len(self._client.statuses)
         wait_for(lambda: len(client.statuses) > seen_before, 'a status')
         if node.process.poll() is not None:
