@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Drives with faults at random places and of random sizes, fed to ``odometry`` and held to the truth.
+Drives with random faults, fed to ``odometry`` and compared with the truth.
 
-A stream is its seed and its number: ``python benchmarks/stream_faults.py --seed S --only N``.
+Seed and number define a stream: ``python benchmarks/stream_faults.py --seed S --only N``.
 """
 
 from functools import cache
@@ -22,13 +22,13 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 PIECE_NS, SIGMAS, DRIVES = 200_000_000, 5.0, 6
 TOPICS = ('imu', 'odometer')
-FLOOR = np.repeat([0.02, 1e-3], 3)      # m, rad: the simulation and a sum are no better at once
+FLOOR = np.repeat([0.02, 1e-3], 3)      # m, rad: accuracy of the simulation and of sums
 KINDS = ('counts', 'speed', 'angle')
 ODD = (np.nan, np.inf, -np.inf, 1e150, 1e300, -1e300, 5e-324)
 
 
 def calibration(truth, rng):
-    """Return estimates that err as their sigmas say."""
+    """Return estimates with random errors according to their sigmas."""
     true = {'scale_factor': (truth.scale, 3e-4 * truth.scale),
             'yaw_mounting_angle': (truth.yaw, 2e-3), 'pitch_mounting_angle': (truth.pitch, 2e-3)}
     return {name: Estimate(value + sigma * rng.standard_normal(), sigma, '')
@@ -36,7 +36,7 @@ def calibration(truth, rng):
 
 
 def started(drive, seed, **changes):
-    """Return the odometry of a drive whose calibration errs by a seed."""
+    """Return the odometry of a drive with calibration errors drawn by a seed."""
     estimates = calibration(drive.truth, np.random.default_rng(seed))
     return odometry_of(drive, estimates, **{'publish__rate': 5.0} | changes)
 
@@ -50,7 +50,7 @@ def drive_of(number):
 
 
 def columns_of(drive):
-    """Return what the faults change: arrays by topic, in order of arrival."""
+    """Return the columns that faults change: arrays by topic, in order of arrival."""
     imu, odometer = drive.imu, drive.odometer
     return {'imu': {'arrival': imu.stamp_ns.copy(), 'stamp': imu.stamp_ns.copy(),
                     'w': imu.w_i.copy(), 'f': imu.f_i.copy()},
@@ -59,7 +59,7 @@ def columns_of(drive):
 
 
 def some_rows(rng, topic, most_s=3.0):
-    """Return rows in turn, from one to some seconds."""
+    """Return a slice of consecutive rows: one row up to some seconds."""
     n = len(topic['stamp'])
     rate = 1e9 / np.median(np.diff(topic['arrival']))
     count = int(min(rng.choice([1, 1, 2, 3, 5, 10, rng.uniform(0, most_s) * rate]), n // 4)) or 1
@@ -68,12 +68,12 @@ def some_rows(rng, topic, most_s=3.0):
 
 
 def size(rng, low, high):
-    """Return a number between two, even in its logarithm, of any sign."""
+    """Return a number of random sign, its magnitude log-uniform between two limits."""
     return rng.choice([-1, 1]) * 10**rng.uniform(np.log10(low), np.log10(high))
 
 
 def imu_values(rng, topics):
-    """Add to, or replace, a rate or a force."""
+    """Add to or replace a turn rate or a specific force."""
     imu = topics['imu']
     name, low, high = rng.choice([('w', 0.1, 1e4), ('f', 1.0, 1e7)])
     value = rng.choice(ODD) if rng.random() < 0.2 else size(rng, low, high)
@@ -90,7 +90,7 @@ def imu_stuck(rng, topics):
 
 
 def stamps(rng, topics):
-    """Put stamps elsewhere, of some rows or of all that follow."""
+    """Shift or replace stamps of some rows, or shift all that follow."""
     name = rng.choice(TOPICS)
     topic = topics[name]
     rows = some_rows(rng, topic)
@@ -100,7 +100,7 @@ def stamps(rng, topics):
     seconds = size(rng, 0.01, 1e3)
     stays = rng.random() < 0.2
     rows = slice(rows.start, None) if stays else rows
-    if stays and name == 'imu':      # the clock that the poses are on
+    if stays and name == 'imu':      # the clock of the poses
         topics['set'] = int(topic['stamp'][rows.start]), int(seconds * 1e9)
     topic['stamp'][rows] += int(seconds * 1e9)
     where = 'for good' if stays else f'in {rows.stop - rows.start} rows'
@@ -115,7 +115,7 @@ def missing(rng, topics):
 
 
 def mixed(rng, topics):
-    """Repeat rows, or exchange their order."""
+    """Repeat rows, or reverse their order."""
     name = rng.choice(TOPICS)
     rows = some_rows(rng, topics[name])
     order = np.arange(len(topics[name]['stamp']))
@@ -166,7 +166,7 @@ def blocks_of(topics):
 
 
 def run(drive, odometry, topics):
-    """Return (restarts so far, pose) of a stream, and what was said."""
+    """Return (restarts so far, pose) of a stream, and the notes."""
     blocks, out, notes = blocks_of(topics), [], []
     begin, end = topics['imu']['arrival'][[0, -1]]
     for edge in range(int(begin), int(end) + 1, PIECE_NS):
@@ -174,19 +174,19 @@ def run(drive, odometry, topics):
             a, b = np.searchsorted(block.received_ns, [edge, edge + PIECE_NS])
             if b > a:
                 odometry.feed(slot, take(block, slice(a, b)), drive.form)
-        path = odometry.restarts          # of what comes before a restart in it
+        path = odometry.restarts          # of poses before a restart in this piece
         out += [(path, pose) for pose in odometry.poses()]
         notes += odometry.take_notes()
     return out, notes
 
 
 def worst_of(drive, poses, topics, path=0):
-    """Return the largest error over sigma of the poses, and what it is of."""
+    """Return the largest error over sigma of the poses, and its axis, time and size as text."""
     set_ns, by_ns = topics.get('set', (0, 0))
     stamp_ns = np.array([p.stamp_ns for p in poses])
-    # a pose is on the clock of its IMU row: after a step of it on the new one
-    anew = (stamp_ns >= set_ns + max(by_ns, 0)) | (path > 0 and stamp_ns[0] >= set_ns + by_ns)
-    t = (stamp_ns - by_ns * anew - drive.options.start_ns) * 1e-9
+    # a pose has the clock of its IMU row: after a clock step the new one
+    stepped = (stamp_ns >= set_ns + max(by_ns, 0)) | (path > 0 and stamp_ns[0] >= set_ns + by_ns)
+    t = (stamp_ns - by_ns * stepped - drive.options.start_ns) * 1e-9
     inside = (t > 0) & (t < drive.motion.duration)
     if not inside.all():
         return np.inf, 'a stamp outside of the drive'
@@ -194,12 +194,12 @@ def worst_of(drive, poses, topics, path=0):
         return np.inf, 'not finite'
     state = drive.motion.at(t)
     origin = Origin(state.latitude[0], state.longitude[0], state.height[0])
-    way_n = origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
-    heads = matrix_from_quat(poses[0].q)[:, 0]      # it may turn while it begins
+    place_n = origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
+    heads = matrix_from_quat(poses[0].q)[:, 0]      # it may turn at the start
     yaw = state.yaw[0] - np.arctan2(heads[1], heads[0])
     c, s = np.cos(yaw), np.sin(yaw)
     C_on = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    off_p = np.array([p.position for p in poses]) - poses[0].position - way_n @ C_on.T
+    off_p = np.array([p.position for p in poses]) - poses[0].position - place_n @ C_on.T
     turned = np.einsum('kij,klj->kil', matrix_from_quat(np.array([p.q for p in poses])),
                        C_on @ attitude(state))
     off = np.stack([turned[:, 2, 1] - turned[:, 1, 2], turned[:, 0, 2] - turned[:, 2, 0],
@@ -213,7 +213,7 @@ def worst_of(drive, poses, topics, path=0):
 
 
 def stream(seed, number):
-    """Return (number, faults, worst, of what, restarts, whether anything was said) of a stream."""
+    """Return (number, faults, worst, its text, restarts, whether there were notes) of a stream."""
     rng = random.Random(f'{seed}:{number}')
     drive = drive_of(number % DRIVES)
     topics = columns_of(drive)
@@ -223,7 +223,7 @@ def stream(seed, number):
     odometry = started(drive, number)
     try:
         poses, notes = run(drive, odometry, topics)
-    except Exception as error:       # that none comes is what is tested
+    except Exception as error:       # the test requires that there is none
         return number, faults, np.inf, repr(error), 0, True
     worst = max([worst_of(drive, [p for r, p in poses if r == restart], topics, restart)
                  for restart in {r for r, _ in poses}], default=(0.0, ''))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drives fed to the odometry as the node feeds them, and replay's own reckoning of the same."""
+"""Drives fed to the odometry as the node feeds them, with the settings of a replay."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.sensors import imu_rotation
 
 SLOTS = ('imu', 'odometer', 'odometer_right')
-PIECE_NS = 300_000_000       # as the messages of some moments come at once
+PIECE_NS = 300_000_000       # as messages that arrive together
 
 
 def poses_of(odometry, blocks, form, piece_ns=PIECE_NS):
-    """Return all poses of samples that come in pieces of time."""
+    """Return all poses of samples that are fed in pieces."""
     blocks = {slot: block for slot, block in blocks.items() if len(block.stamp_ns)}
     first = min(int(block.stamp_ns[0]) for block in blocks.values())
     last = max(int(block.stamp_ns[-1]) for block in blocks.values())
@@ -35,14 +35,14 @@ def poses_of(odometry, blocks, form, piece_ns=PIECE_NS):
 
 
 def samples_of(drive, begin_ns=0):
-    """Return a drive's samples by slot, from the IMU's row at a time on."""
+    """Return the samples of a drive by slot, from a time of the IMU on."""
     early = {'imu': begin_ns, 'odometer': begin_ns - 10**9, 'odometer_right': begin_ns - 10**9}
     return {slot: take(block, block.stamp_ns >= early[slot])
             for slot, block in ((slot, getattr(drive, slot)) for slot in SLOTS)}
 
 
 def true_estimates(drive, sigma=1e-4):
-    """Return what a calibration without error would say."""
+    """Return the estimates of a calibration without errors."""
     truth = drive.truth
     values = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
               'pitch_mounting_angle': truth.pitch}
@@ -53,7 +53,7 @@ def true_estimates(drive, sigma=1e-4):
 
 
 def odometry_of(drive, estimates=None, **changes):
-    """Return the odometry of a drive's vehicle; changes are settings as group__name."""
+    """Return the odometry for the vehicle of a drive; changes: settings as group__name."""
     config = with_settings(ApplyConfig(), {
         'imu.grade': drive.options.imu_grade, 'publish.rate': 10.0} | {
         name.replace('__', '.'): value for name, value in changes.items()})

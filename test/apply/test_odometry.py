@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Dead reckoning as the samples come, against replay's own of the same drive, and closed forms."""
+"""Dead reckoning of incoming samples, compared with replay of the same drive and closed forms."""
 
 from drives import settings
 import numpy as np
@@ -28,12 +28,12 @@ KINDS = {'counts': {}, 'speed': {'odometer': 'speed'}, 'angle': {'odometer': 'an
 
 @pytest.fixture(scope='module', params=KINDS)
 def drive(request):
-    """Simulate two minutes of a hilly town, by each kind of odometer."""
+    """Simulate two minutes in a hilly town with each kind of odometer."""
     return simulate(SimOptions(scenario='town', slope=0.03, fix_noise='rtk',
                                imu_grade='tactical', **RATES, **KINDS[request.param]))
 
 
-def test_the_path_is_that_of_replay_as_calibrated(drive):
+def test_the_path_equals_that_of_replay_with_the_calibration(drive):
     row = int(np.searchsorted(drive.imu.stamp_ns, drive.truth.start_ns)) - 5
     alignment = alignment_of(drive, row)
     result = calibrate(drive.leg(), settings(drive), alignment)
@@ -44,19 +44,19 @@ def test_the_path_is_that_of_replay_as_calibrated(drive):
     assert len(poses) > 900
     rows = np.searchsorted(drive.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
     off = np.array([p.position for p in poses]) - (result.track_n[rows] - result.track_n[0])
-    # of 600 m, summed in another order
+    # rounding errors: 600 m are summed in another order
     assert np.abs(off).max() < 1e-9
 
 
 @pytest.fixture(scope='module')
 def two_wheels():
-    """Simulate two wheels whose factors differ by 2 %."""
+    """Simulate two wheels whose scale factors differ by 2 %."""
     return simulate(SimOptions(scenario='town', two_wheels=True, wheel_difference=0.02,
                                fix_noise='rtk', imu_grade='tactical', **RATES))
 
 
 @pytest.mark.core
-def test_of_two_wheels_each_has_its_own_factor(two_wheels):
+def test_each_of_two_wheels_has_its_own_scale_factor(two_wheels):
     made = two_wheels
     row = int(np.searchsorted(made.imu.stamp_ns, made.truth.start_ns)) - 5
     alignment, config = alignment_of(made, row), settings(made)
@@ -72,7 +72,7 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
 
 
 def blocks_with(drive, change):
-    """Return a drive's samples with the odometer's changed: (stamps s from begin, values)."""
+    """Return the samples of a drive; change(t from the first row in s, values) of its odometer."""
     blocks = samples_of(drive)
     sent = blocks['odometer']
     t = (sent.stamp_ns - sent.stamp_ns[0]) * 1e-9
@@ -108,18 +108,18 @@ FAULTS = {'rollover': (rolling, 1e-9), 'reset': (reset, 1.0), 'false rows': (one
 
 @pytest.fixture(scope='module')
 def counted():
-    """Simulate two minutes of town with a counter and a gyro that starts with a bias."""
+    """Simulate two minutes in a town with a counter and a gyro with a bias."""
     return simulate(SimOptions(scenario='town', slope=0.03, imu_grade='consumer', **RATES))
 
 
 @pytest.fixture(scope='module')
 def whole(counted):
-    """Return the poses of that drive with nothing wrong."""
+    """Return the poses of that drive without faults."""
     return poses_of(odometry_of(counted), samples_of(counted), counted.form)
 
 
 @pytest.mark.parametrize('fault', FAULTS)
-def test_what_a_counter_does_costs_little_of_the_path(counted, whole, fault):
+def test_faults_of_a_counter_change_the_path_only_slightly(counted, whole, fault):
     change, most = FAULTS[fault]
     form = OdometerForm('cumulative', 2**16 if change is rolling else 2**64, 'm/pulse')
     odometry = odometry_of(counted)
@@ -134,28 +134,28 @@ def test_what_a_counter_does_costs_little_of_the_path(counted, whole, fault):
     assert max(np.linalg.norm(p.velocity) for p in poses) < 25.0
 
 
-def test_rows_that_are_no_numbers_or_come_twice_change_nothing(counted, whole):
+def test_repeated_rows_change_nothing(counted, whole):
     blocks = samples_of(counted)
     imu = blocks['imu']
-    rows = np.insert(np.arange(len(imu.stamp_ns)), 1000, [998, 998])    # of before, again
+    rows = np.insert(np.arange(len(imu.stamp_ns)), 1000, [998, 998])    # earlier rows again
     blocks['imu'] = take(imu, rows)
     poses = poses_of(odometry_of(counted), blocks, counted.form)
     assert [p.stamp_ns for p in poses] == [p.stamp_ns for p in whole]
     np.testing.assert_array_equal(poses[-1].position, whole[-1].position)
 
 
-def test_it_begins_at_zero_along_the_vehicle_and_takes_the_bias_from_rest(counted, whole):
+def test_the_path_starts_at_zero_along_x_and_the_bias_is_estimated_at_rest(counted, whole):
     first = whole[0]
     np.testing.assert_allclose(first.position, 0.0, atol=1e-6)
     C = matrix_from_quat(first.q)
     assert abs(np.arctan2(C[1, 0], C[0, 0])) < 1e-4
-    # of 0.04 deg/s: what is left is noise of two seconds
+    # of 0.04 deg/s: the remainder is the noise of two seconds
     at_rest = [p.rate for p in whole[:20]]
     assert np.abs(np.mean(at_rest, axis=0)).max() < 3e-4
     assert np.abs(counted.truth.gyro_bias).max() > 3e-4
 
 
-def test_the_pose_is_within_its_covariance(counted, whole):
+def test_the_pose_error_is_within_its_covariance(counted, whole):
     last = whole[-1]
     state = counted.motion.at(np.array(
         [(p.stamp_ns - counted.options.start_ns) * 1e-9 for p in (whole[0], last)]))
@@ -170,7 +170,7 @@ def test_the_pose_is_within_its_covariance(counted, whole):
     assert grown[-1] > grown[len(grown) // 2] > grown[0]
 
 
-def test_base_link_goes_round_a_wheel_that_is_not_under_it(counted):
+def test_base_link_rotates_about_a_wheel_with_a_lever_arm(counted):
     arm = np.array([1.2, -0.7, 0.3])
     whole, poses = (poses_of(odometry_of(counted, levelling=False, odometer__lever_arm=where),
                              samples_of(counted), counted.form)
@@ -184,7 +184,7 @@ def test_base_link_goes_round_a_wheel_that_is_not_under_it(counted):
                                np.cross(turning.rate, -arm), atol=1e-3)
 
 
-def test_time_that_goes_back_begins_anew(counted):
+def test_a_backward_time_jump_restarts_the_odometry(counted):
     odometry = odometry_of(counted)
     blocks = samples_of(counted)
     first = poses_of(odometry, blocks, counted.form)
@@ -194,7 +194,7 @@ def test_time_that_goes_back_begins_anew(counted):
     np.testing.assert_allclose(again[-1].position, first[-1].position, atol=1e-9)
 
 
-def test_an_imu_without_accelerometer_serves(counted, whole):
+def test_an_imu_without_accelerometer_is_used_with_a_larger_height_variance(counted, whole):
     blocks = samples_of(counted)
     imu = blocks['imu']
     blocks['imu'] = ImuSamples(imu.stamp_ns, imu.received_ns, imu.w_i, np.zeros_like(imu.f_i),
@@ -202,11 +202,11 @@ def test_an_imu_without_accelerometer_serves(counted, whole):
     poses = poses_of(odometry_of(counted), blocks, counted.form)
     off = np.linalg.norm((poses[-1].position - whole[-1].position)[:2])
     assert off < 3 * np.sqrt(np.trace(poses[-1].pose_cov[:2, :2]))
-    assert poses[-1].pose_cov[2, 2] > 2 * whole[-1].pose_cov[2, 2]       # nothing levels it
+    assert poses[-1].pose_cov[2, 2] > 2 * whole[-1].pose_cov[2, 2]       # no levelling
 
 
-def test_the_last_of_the_braking_is_no_tilt():
-    """A level drive of perfect sensors that stops hard at every phase of the looks."""
+def test_the_end_of_braking_is_not_treated_as_tilt():
+    """A level drive with perfect sensors and hard stops at all phases of the levelling updates."""
     rate, period = 100.0, 9.55
     t = np.arange(0.0, 20 * period, 1 / rate)
     since = (t - 4.0) % period
@@ -226,12 +226,12 @@ def test_the_last_of_the_braking_is_no_tilt():
     poses = poses_of(Odometry(vehicle_of(known, config), config), {'imu': imu, 'odometer': wheel},
                      form)
     pitch = np.array([np.arcsin(-matrix_from_quat(p.q)[2, 0]) for p in poses])
-    # 0.1 s by which a speed is late, of 6 m/s^2, is a tilt of 0.06 rad where it is believed
+    # a speed that is late by 0.1 s at 6 m/s^2 would give a tilt of 0.06 rad
     assert np.abs(pitch).max() < 0.03
 
 
 @pytest.mark.core
-def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
+def test_the_scale_factor_as_sent_is_used_if_it_is_given():
     exact = {'scale_factor': Estimate(0.987, 3e-4, '1')}
     assert vehicle_of(exact, ApplyConfig()).scale == 0.987
     sent = exact | {'scale_factor_as_sent': Estimate(0.995, 4e-4, '1')}
@@ -240,8 +240,8 @@ def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
     assert vehicle.scale_sigma == pytest.approx(4e-4 / 0.995)
 
 
-def test_covariances_of_many_poses_are_those_of_few(counted):
-    """At 50 Hz they are up to 0.05 s old, but for the twist's interval."""
+def test_covariances_do_not_depend_on_the_rate_of_poses(counted):
+    """At 50 Hz they are up to 0.05 s old, except for the interval of the twist."""
     few, many = (poses_of(odometry_of(counted, publish__rate=rate), samples_of(counted),
                           counted.form) for rate in (10.0, 50.0))
     same = {p.stamp_ns: p for p in few}
@@ -250,15 +250,15 @@ def test_covariances_of_many_poses_are_those_of_few(counted):
     assert len(pairs) > 300
     sigmas = np.sqrt([[np.diag(p.pose_cov) for p in pair] for pair in pairs])
     ratio = sigmas[:, 0] / sigmas[:, 1]
-    # grown by the rest of 0.05 s in minutes; more while the speed changes, by the delay
+    # growth within 0.05 s of minutes; more while the speed changes, because of the delay
     assert np.abs(np.median(ratio, axis=0) - 1).max() < 0.005
     assert ratio.min() > 0.8
-    # of rows 0.02 s apart every third is 0.05 s after the last
+    # rows are 0.02 s apart: each third one is 0.05 s after the last update
     assert len({p.pose_cov.tobytes() for p in many}) == pytest.approx(len(many) / 3, rel=0.1)
 
 
 @pytest.mark.core
-def test_after_the_wait_the_next_pose_has_all_it_needs():
+def test_exactly_one_pose_is_ready_after_the_wait_time():
     made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=100.0,
                                odometer_rate=100.0, imu_grade='tactical'))
     odometry, blocks = odometry_of(made, publish__rate=20.0), samples_of(made)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A counter stamped at arrival: its times as rows come, and the delay of the IMU beside it."""
+"""A counter stamped on arrival: estimated times of its rows, and the delay of the IMU."""
 
 from dataclasses import replace
 
@@ -23,30 +23,30 @@ REPORT = 'relative to the odometer'
 
 
 def placed(arrivals, travel, speed=10.0, quantum=0.0):
-    """Return the times of rows, s, and the rhythm after them."""
+    """Return the estimated times of rows, s, and the estimator after them."""
     row_times = RowTimes()
     return np.array([row_times.next_time(t, s, speed, quantum) for t, s in zip(
         arrivals.tolist(), travel.tolist(), strict=True)]), row_times
 
 
 def in_order(t):
-    """Return arrivals none of which passes another, s."""
+    """Return arrivals in increasing order, s."""
     order = 2e-5 * np.arange(len(t))
     return np.maximum.accumulate(t - order) + order
 
 
 @pytest.fixture(scope='module')
 def even():
-    """Return times on a rhythm, and arrivals that are late by 5 ms on average."""
+    """Return periodic times, and arrivals that are late by 5 ms on average."""
     t = np.arange(3000) / RATE
     return t, in_order(t + np.random.default_rng(1).exponential(5e-3, len(t)))
 
 
-def test_late_rows_are_put_on_the_rhythm(even):
+def test_late_rows_get_periodic_times(even):
     t, arrivals = even
     times, row_times = placed(arrivals, 10.0 * t)
     off = (times - t)[500:]
-    # 500 rows of 5 ms on average: the earliest is late by 0.01 ms, that of 50 by 0.1 ms
+    # delays of 5 ms on average: the smallest of 500 is 0.01 ms, of 50 it is 0.1 ms
     assert np.std(off) < 2e-4
     assert np.median(np.abs(np.diff(off))) < 5e-5
     assert (np.diff(times) > 0).all()
@@ -64,7 +64,7 @@ def starved(t, stalls, seed):
 
 
 @pytest.mark.parametrize('stalls', [0.02, 0.05])
-def test_a_sender_that_stalls_keeps_its_rhythm(even, stalls):
+def test_rows_of_a_stalling_sender_get_periodic_times(even, stalls):
     t, _ = even
     arrivals = starved(t, stalls, 5)
     assert np.quantile(arrivals - t, 0.9) > 0.2
@@ -73,8 +73,7 @@ def test_a_sender_that_stalls_keeps_its_rhythm(even, stalls):
     assert row_times.error_s < 1e-3
 
 
-# rows that are lost, others that are late until a time, speed, and the largest error of the rows
-# from one on
+# lost rows, rows that are late until a time, speed, first tested row and largest error
 LOST = {
     # four rows at once follow the last late one: 0.1 s are five intervals
     'a delay at rest that ends is no lost row': (
@@ -87,7 +86,7 @@ LOST = {
 
 
 @pytest.mark.parametrize('case', LOST)
-def test_lost_rows(even, case):
+def test_lost_rows_and_late_rows_are_distinguished(even, case):
     (t, arrivals), (lost, rows, until_s, speed, first, most) = even, LOST[case]
     kept, late = np.delete(np.arange(len(t)), lost), arrivals.copy()
     late[rows] = np.maximum(late[rows], until_s(t[rows]))
@@ -97,7 +96,7 @@ def test_lost_rows(even, case):
     assert np.abs(off[first:]).max() < most
 
 
-def test_another_rate_is_another_rhythm(even):
+def test_the_times_follow_a_change_of_the_rate(even):
     t, arrivals = even
     slow = t[-1] + 1.0 + np.arange(1000) / (RATE / 2)
     after = in_order(slow + np.random.default_rng(2).exponential(5e-3, len(slow)))
@@ -117,13 +116,13 @@ def test_uneven_times_and_even_stamps_are_kept():
     np.testing.assert_array_equal(times, t)
 
 
-def test_what_no_rhythm_explains_is_in_the_error():
+def test_the_error_covers_delays_of_irregular_rows():
     rng = np.random.default_rng(4)
-    t = np.cumsum(rng.uniform(0.01, 0.03, 3000))            # no rhythm, and late
+    t = np.cumsum(rng.uniform(0.01, 0.03, 3000))            # irregular and late
     late = in_order(t + rng.exponential(3e-3, len(t)))
     times, row_times = placed(late, 10.0 * t)
     assert np.mean(times == late) > 0.98      # chance may favour a line for some rows
-    # rows 20 ms apart are off their neighbours by somewhat more or less than evenly spaced ones
+    # the deviation from the neighbours differs slightly from that of evenly spaced rows
     assert row_times.error_s == pytest.approx(3e-3, rel=0.4)
 
 
@@ -159,13 +158,13 @@ def test_the_twist_of_a_late_counter_is_within_its_covariance(late_s):
     error, sigma = twists(late_s, seed=1)
     assert len(error) > 500
     assert np.mean(np.abs(error) < 2 * sigma) >= 0.95
-    # what one count in 50 ms makes, and little more
+    # little more than the effect of one count in 50 ms
     assert np.sqrt(np.mean(error**2)) < 0.2
     assert np.median(sigma) < 0.25
 
 
 def test_times_rise_far_from_zero():
-    """A counter stamped at arrival beside an IMU that counts from its start: 1.7e9 s."""
+    """A counter stamped on arrival has times of 1.7e9 s if the IMU clock starts at zero."""
     rng, row_times = np.random.default_rng(1), RowTimes()
     arrival = np.maximum.accumulate(1.7e9 + np.arange(0, 60, 0.02) + rng.exponential(0.02, 3000))
     placed = [row_times.next_time(t, 0.2 * k, 10.0, 0.01) for k, t in enumerate(arrival.tolist())]
@@ -173,7 +172,7 @@ def test_times_rise_far_from_zero():
 
 
 def searched(late, bias=0.1, seconds=200):
-    """Take seconds of a speed whose acceleration is a cosine of 9 s; the force is late."""
+    """Search the delay of the force, late in s, with an acceleration of 9 s period."""
     notes = []
     search = DelaySearch(0.0, 0.01, notes)
 
@@ -188,7 +187,7 @@ def searched(late, bias=0.1, seconds=200):
 
 
 @pytest.mark.parametrize('late', [0.1, -0.2])
-def test_a_delay_is_found_beside_a_bias(late):
+def test_a_delay_is_found_in_the_presence_of_a_bias(late):
     """
     Of a sine of w the slope is off by w / sin(w), of which CHANGE_SMOOTHED is taken off.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faulty streams into odometry: nothing unsaid, no NaN, no pose beyond five of its sigmas."""
+"""Faulty streams into odometry: each fault is reported, no NaN, no error beyond five sigmas."""
 
 from faulty_streams import columns_of, drive_of, run, SIGMAS, started, stream, worst_of
 import numpy as np
@@ -17,7 +17,7 @@ SECOND = 10**9
 
 
 def published(drive, topics):
-    """Return the odometry after 75 s of a stream, its poses, and what it said."""
+    """Return the odometry after 75 s of a stream, its poses and its notes."""
     topics = {name: {k: v[:row_at(topic, 75.0)] for k, v in topic.items()}
               for name, topic in topics.items()}
     odometry = started(drive, 5)
@@ -30,7 +30,7 @@ def row_at(topic, seconds):
 
 
 def put(name, column, value, rows=1):
-    """Return a fault: a value of rows from t = 45 s on, or what a function makes of theirs."""
+    """Return a fault: rows from t = 45 s on get a value, or a function of their values."""
     def change(topics):
         at = row_at(topics[name], 45.0)
         some = topics[name][column][at:at + rows]
@@ -71,7 +71,7 @@ FAULTS = {'force of 1e5': imu('f', 1e5), 'force of 1e150': imu('f', 1e150),
 
 
 @pytest.mark.parametrize('fault', FAULTS)
-def test_one_fault_is_said_and_within_the_covariance(fault):
+def test_each_fault_is_reported_and_its_error_is_within_the_covariance(fault):
     drive = drive_of(4 if 'speed' in fault else 0)      # 50 Hz: speeds, counts
     topics = columns_of(drive)
     FAULTS[fault](topics)
@@ -84,7 +84,7 @@ def test_one_fault_is_said_and_within_the_covariance(fault):
     assert odometry.restarts == sum('restarts' in text for text in notes)
 
 
-def test_an_unharmed_stream_is_not_talked_about():
+def test_a_stream_without_faults_gives_no_note():
     for number in range(3):          # counts, speeds, angles
         drive = drive_of(number)
         odometry, poses, notes = published(drive, columns_of(drive))
@@ -93,7 +93,7 @@ def test_an_unharmed_stream_is_not_talked_about():
 
 
 def bursts(topics):
-    """Send the rows of half a second at once, without a stamp of their own."""
+    """Send the rows of half a second at once, stamped on arrival."""
     odometer, burst_ns = topics['odometer'], SECOND // 2
     burst = odometer['stamp'] // burst_ns + 1
     within = np.arange(len(burst)) - np.searchsorted(burst, burst)
@@ -108,14 +108,14 @@ def lost_steps(topics):
     """Lose the travel of a fifth of the rows, or send a speed of zero."""
     value = topics['odometer']['value']
     lost = np.random.default_rng(3).random(len(value)) < 0.2
-    if value.max() > 70.0:           # no speed
+    if value.max() > 70.0:           # not a speed
         value[:] = np.cumsum(np.where(lost, 0.0, np.diff(value, prepend=value[0])))
     value[lost & (value.max() < 70.0)] = 0.0
 
 
 @pytest.mark.parametrize(('fault', 'number'), [
     (bursts, 0), (bursts, 1), (bursts, 2), (once_a_second, 1), (lost_steps, 1), (lost_steps, 5)])
-def test_what_the_rows_do_not_show_of_the_travel_is_in_the_covariance(fault, number):
+def test_missing_travel_is_covered_by_the_covariance(fault, number):
     drive = drive_of(number)         # counts, speeds, angles
     topics = columns_of(drive)
     fault(topics)
@@ -126,7 +126,7 @@ def test_what_the_rows_do_not_show_of_the_travel_is_in_the_covariance(fault, num
     assert bool(notes) or fault is not lost_steps
 
 
-# that were beyond their covariance, or ended it; more: benchmarks/stream_faults.py
+# streams that once exceeded their covariance or raised; more: benchmarks/stream_faults.py
 KNOWN = {
     (20261126, 41): 'angles of 1e300', (20261126, 311): 'angles of 1e300',
     (1, 143): 'imu clock set back by 0.117 s', (1, 168): 'turn of 0.155 rad/s in 5 rows',
@@ -138,7 +138,7 @@ KNOWN = {
 
 @pytest.mark.parametrize(('seed', 'number'), KNOWN, ids=[
     f'{number}: {what}' for (_, number), what in KNOWN.items()])
-def test_known_streams(seed, number):
+def test_streams_that_once_failed_are_within_the_covariance(seed, number):
     _, faults, worst, what, _, notes = stream(seed, number)
     assert seed == 1 or 'counter put -1e+300 in 3 rows' in faults
     assert worst <= SIGMAS, (faults, what)
@@ -146,7 +146,7 @@ def test_known_streams(seed, number):
 
 
 def sifted(rows, block):
-    """Return the rows that a screen keeps where they come in blocks."""
+    """Return the rows that a screen keeps if they arrive in blocks."""
     screen, held, kept = SpikeScreen(), [], []
     for begin in range(0, len(rows), block):
         new, held = screen.screen(held + rows[begin:begin + block])
@@ -154,7 +154,7 @@ def sifted(rows, block):
     return kept
 
 
-def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
+def test_a_single_step_of_the_gyro_is_implausible_but_a_beginning_turn_is_not():
     t = np.arange(200) * 0.01
     w = 0.002 * np.random.default_rng(1).standard_normal((200, 3))
     turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
@@ -172,7 +172,7 @@ def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
     x = np.hstack([0.002 * rng.standard_normal((n, 3)), rng.standard_normal((n, 3)) + 9.8])
     for at, rows, step in ((100, 1, 3.0), (200, 3, -8.0), (300, 300, 0.2), (400, 80, 5.0)):
         x[at:at + rows, 2] += step
-    x[150:180] = x[150]      # hangs for longer than STUCK_TIME
+    x[150:180] = x[150]      # constant for longer than STUCK_TIME
     x[180:, 1] += 0.1
     rows = [Row(k * 0.01, k, tuple(w), tuple(f)) for k, (w, f) in enumerate(
         zip(x[:, :3].tolist(), x[:, 3:].tolist(), strict=True))]
@@ -183,7 +183,7 @@ def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
     assert all(kept == first for kept in others)
 
 
-def test_a_turn_that_no_vehicle_begins_is_doubted():
+def test_an_impossible_turn_is_reported_and_increases_the_yaw_sigma():
     drive = drive_of(0)
     topics = columns_of(drive)
     at = row_at(topics['imu'], 45.0)
@@ -193,7 +193,7 @@ def test_a_turn_that_no_vehicle_begins_is_doubted():
     assert any('more than a vehicle can turn' in text for text in notes)
     before, after = (np.sqrt(poses[k][1].pose_cov[5, 5]) for k in (150, -1))
     assert before < 0.05
-    assert 0.3 < after < 2.0         # of 1 rad that it turned falsely
+    assert 0.3 < after < 2.0         # for a false turn of 1 rad
 
 
 def usable(arrivals, stamp_ns, received_ns):
@@ -210,7 +210,7 @@ def shifted(stamp, by_ns, until=None):
 
 
 @pytest.mark.parametrize('by_s', [0.0, 0.1, -0.1])
-def test_a_clock_that_moved_a_little_shows_and_late_messages_do_not(by_s):
+def test_a_small_clock_step_is_found_and_late_messages_are_not_one(by_s):
     stamp = 10**18 + np.arange(0, 20 * SECOND, SECOND // 50)
     late = np.random.default_rng(1).exponential(5e6, len(stamp)).astype(np.int64)
     received, odd = np.maximum.accumulate(stamp + late), shifted(stamp, by_s * SECOND)
@@ -240,8 +240,8 @@ def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
 
 
 @pytest.mark.core
-def test_a_false_speed_at_rest_is_doubted_from_the_speed_before_all_of_it():
-    """It is accepted in two steps, as the speed follows: both are off the rest before them."""
+def test_the_variance_covers_a_false_speed_at_rest():
+    """The speed is accepted in two steps; the variance covers both, starting from rest."""
     t = np.arange(0.0, 22.3, 0.04)
     value = np.where(t > 20.0, -22.1, 0.0)
     wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)

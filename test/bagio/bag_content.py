@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a bag gives by slot and column, and where its bytes lie."""
+"""Rows of a bag by slot and column, and the offsets of its chunks."""
 
 from dataclasses import fields
 

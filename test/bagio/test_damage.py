@@ -34,7 +34,7 @@ def truncated(notes):
     ('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('sqlite3', 'none'),
     ('sqlite3', 'file')])
 @pytest.mark.parametrize('share', [0.35, 0.5, 0.65])
-def test_bag_cut_off_gives_what_is_there(tmp_path, expected, storage, compression, share):
+def test_a_truncated_bag_gives_its_rows(tmp_path, expected, storage, compression, share):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(), storage, compression)
     data = file_of(path).read_bytes()
     file_of(path).write_bytes(data[:int(len(data) * share)])
@@ -52,7 +52,7 @@ def test_bag_cut_off_gives_what_is_there(tmp_path, expected, storage, compressio
     assert 'without metadata.yaml the lost time is unknown' in str(read(path)[1])
 
 
-def test_an_mcap_that_lost_only_its_index(tmp_path, plain, expected):
+def test_an_mcap_file_without_its_index_is_read_completely(tmp_path, plain, expected):
     path = shutil.copytree(plain, tmp_path / 'bag')
     file_of(path).write_bytes(file_of(path).read_bytes()[:-100])
     found, notes = read(path)
@@ -60,8 +60,8 @@ def test_an_mcap_that_lost_only_its_index(tmp_path, plain, expected):
     assert notes == ('drive.mcap is damaged (cut off), but all 1550 messages were read',)
 
 
-def test_large_rows_of_a_cut_database_span_pages(tmp_path):
-    """Rows beyond a page lie on overflow pages: those whole are kept, to the last byte."""
+def test_large_rows_of_a_truncated_database_are_read_across_pages(tmp_path):
+    """Rows larger than a page use overflow pages; complete rows are kept in every byte."""
     rng = np.random.default_rng(1)
     images = [make.kind('sensor_msgs/msg/CompressedImage')(
         header=make.header(T0 + i), format='x' * (i % 7),
@@ -78,7 +78,7 @@ def test_large_rows_of_a_cut_database_span_pages(tmp_path):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_what_is_left_is_no_bag(tmp_path, storage):
+def test_a_file_without_usable_content_is_refused(tmp_path, storage):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(1.0), storage)
     data, rng = file_of(path).read_bytes(), np.random.default_rng(2)
     magics = (data[:16], b'#ROSBAG V2.0\n', b'(\xb5/\xfd', b'')
@@ -89,7 +89,7 @@ def test_what_is_left_is_no_bag(tmp_path, storage):
             pass
 
 
-def test_metadata_that_cannot_be_used(tmp_path, plain, expected):
+def test_unusable_metadata_is_reported_and_the_files_are_read(tmp_path, plain, expected):
     for text in ('{', '[]', 'rosbag2_bagfile_information: 3', '', None):
         path = shutil.copytree(plain, tmp_path / f'bag{text and len(text)}')
         if text is None:
@@ -101,7 +101,7 @@ def test_metadata_that_cannot_be_used(tmp_path, plain, expected):
         assert ('names no existing file' if text is None else 'cannot be parsed') in notes[0]
 
 
-def test_files_that_metadata_list_are_shorter_missing_or_ruined(tmp_path, plain):
+def test_files_that_are_shorter_than_listed_missing_or_empty_are_reported(tmp_path, plain):
     path = ros_bags.write(tmp_path / 'drive', ros_bags.drive(4.0))
     own = (path / 'metadata.yaml').read_text()
     shutil.copy(plain / 'metadata.yaml', path)
@@ -116,7 +116,7 @@ def test_files_that_metadata_list_are_shorter_missing_or_ruined(tmp_path, plain)
     assert len(found['imu', 'stamp_ns']) == 400
 
 
-def test_damaged_messages_are_left_out_and_told(tmp_path):
+def test_damaged_messages_are_omitted_and_reported(tmp_path):
     rows = ros_bags.drive(1.0)
     topic, time_ns, message = rows[30]
     rows[30] = topic, time_ns, make.cdr(message)[:20]
@@ -145,7 +145,7 @@ def copied(mcap, tmp_path):
 
 @pytest.mark.parametrize('where', ['record', 'length', 'head', 'name', 'data'])
 @pytest.mark.parametrize('which', [0, 1])
-def test_a_chunk_that_is_damaged_costs_itself(mcap, copied, which, where):
+def test_a_damaged_chunk_loses_only_its_own_messages(mcap, copied, which, where):
     path, data = copied
     at, size = chunks_of(data)[which]
     place = at + {'record': 0, 'length': 3, 'head': 25, 'name': 37, 'data': size // 2}[where]
@@ -157,10 +157,10 @@ def test_a_chunk_that_is_damaged_costs_itself(mcap, copied, which, where):
     assert set(rows.tolist()) <= set(whole.tolist())
     assert (np.diff(rows) > 0).all()      # none twice
     assert [n.code for n in notes] == [Code.BAG_TRUNCATED] * len(notes)
-    assert notes or where == 'data'       # eight bytes of one value show only by a checksum
+    assert notes or where == 'data'       # only a checksum finds a changed value
 
 
-def test_a_bag_without_a_sound_chunk_is_refused(copied):
+def test_a_bag_without_an_undamaged_chunk_is_refused(copied):
     path, data = copied
     for at, size in chunks_of(data):
         data[at + size // 2] ^= 0xA5
@@ -170,7 +170,7 @@ def test_a_bag_without_a_sound_chunk_is_refused(copied):
         read(path)
 
 
-def test_a_checksum_finds_what_nothing_else_shows(copied):
+def test_a_checksum_finds_a_changed_value(copied):
     path, data = copied
     at, size = chunks_of(data)[0]
     packed = at + 9 + 28 + 4 + int.from_bytes(data[at + 37:at + 41], 'little') + 8
@@ -193,7 +193,7 @@ def test_a_database_that_is_being_written_is_refused(tmp_path):
     file.close()
 
 
-def test_a_database_whose_rows_are_no_messages(tmp_path):
+def test_invalid_rows_of_a_database_are_omitted(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(2.0), 'sqlite3')
     whole = len(read(path)[0]['imu', 'stamp_ns'])
     db = sqlite3.connect(file_of(path))

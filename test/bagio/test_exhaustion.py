@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files that ask for more than their size can explain: a sentence, in bounded time and memory."""
+"""Files that demand too much time or memory give one error message, within limits of both."""
 
 from contextlib import closing
 import os
@@ -21,7 +21,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
 from odocal_ros.safe_io.limits import FACTOR_VARIABLE, zstd_module
 
-MEMORY_LIMIT = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
+MEMORY_LIMIT = 2**28       # bytes: a quarter of the additional memory that a reading may use
 
 
 def record(op, body):
@@ -33,7 +33,7 @@ def text(what):
 
 
 def zeros(mebibytes):
-    """Return zstd of so many MiB of zeros: 1 GiB is 32 kB."""
+    """Return zstd data of so many MiB of zeros: 1 GiB is 32 kB."""
     packer = zstd_module().ZstdCompressor()
     return b''.join([packer.compress(bytes(2**20)) for _ in range(mebibytes)]) + packer.flush()
 
@@ -86,7 +86,7 @@ def bomb():
 
 
 @pytest.mark.parametrize('kind', ['chunk', 'scan', 'file', 'message'])
-def test_a_stream_that_unpacks_to_2_gib(tmp_path, bomb, kind):
+def test_a_stream_that_decompresses_to_2_gib_is_refused(tmp_path, bomb, kind):
     path = tmp_path / 'bag.mcap'
     if kind == 'file':
         path.write_bytes(bomb)
@@ -110,12 +110,12 @@ def test_the_limit_can_be_raised(tmp_path, monkeypatch):
     assert 'exceeds the limit of' not in peak_memory_and_error(path)[1]
 
 
-def test_an_index_that_names_a_chunk_many_times(tmp_path):
+def test_a_chunk_that_the_index_names_many_times_is_counted_once(tmp_path):
     message = record(5, struct.pack('<HIQQ', 1, 0, 5, 5))
     packed = zstd_module().compress(message * 100_000)
     path = mcap(tmp_path / 'bag.mcap', packed, 3_100_000, times=1000)
     with open_bag(path) as bag:
-        assert bag.topics['/imu'].count == 100_000      # it is not believed
+        assert bag.topics['/imu'].count == 100_000      # once
 
 
 @pytest.mark.parametrize('sql', [
@@ -128,13 +128,13 @@ def test_an_index_that_names_a_chunk_many_times(tmp_path):
      'encoded_message_definition GENERATED ALWAYS AS (zeroblob(900000000)))',
      'INSERT INTO {t} (topic_id, timestamp) VALUES (1, 5)']])
 @pytest.mark.parametrize('table', ['messages', 'topics', 'message_definitions'])
-def test_a_schema_that_makes_rows_of_its_own(tmp_path, table, sql):
+def test_a_database_schema_that_generates_rows_stays_within_the_memory_limit(tmp_path, table, sql):
     lines = [f'ALTER TABLE {table} RENAME TO before', *(line.format(t=table) for line in sql)]
     path = database(tmp_path, *((line,) for line in lines))
     assert peak_memory_and_error(path)[0] < MEMORY_LIMIT
 
 
-def test_pages_that_lead_back_to_themselves(tmp_path):
+def test_overflow_pages_in_a_loop_stay_within_the_memory_limit(tmp_path):
     path = database(tmp_path, *[('INSERT INTO messages (topic_id, timestamp, data) VALUES '
                                  '(1, ?, zeroblob(200000))', T0)] * 3)
     file = path / 'bag.db3'
@@ -165,7 +165,7 @@ DEFINITIONS = {
 
 
 @pytest.mark.parametrize('kind', DEFINITIONS)
-def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
+def test_a_huge_or_recursive_definition_is_refused(tmp_path, kind, monkeypatch):
     monkeypatch.setattr('odocal_ros.safe_io.limits.PARSE_SECONDS', 3)
     peak, error_text = peak_memory_and_error(database(
         tmp_path, ("UPDATE topics SET type = 'a/msg/B'",),
@@ -176,7 +176,7 @@ def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
     assert 'exceeds the limit of' in error_text or 'cannot be parsed' in error_text
 
 
-def test_annotations_cost_nothing():
+def test_annotations_of_a_definition_are_skipped():
     strings = '"a (b" ' * 20_000
     text = (f'module a {{ module msg {{ @verbatim(text={strings}) '
             '@x struct B { @y(z=(1)) long x; /* ( */ }; }; };')
@@ -184,7 +184,7 @@ def test_annotations_cost_nothing():
     assert [name for name, _ in found['a/msg/B'][1]] == ['x']
 
 
-def test_what_is_no_file(tmp_path):
+def test_devices_and_pipes_are_not_read(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5))
     os.mkfifo(path / 'x.mcap')
     (path / 'metadata.yaml').unlink()
@@ -197,7 +197,7 @@ def test_what_is_no_file(tmp_path):
             pass
 
 
-def test_a_decompressor_is_looked_for_once_and_not_for_each_message(tmp_path, monkeypatch):
+def test_the_decompressor_is_searched_once_not_for_each_message(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(1.0), 'mcap', 'message')
     searched = []
 
@@ -213,7 +213,7 @@ def test_a_decompressor_is_looked_for_once_and_not_for_each_message(tmp_path, mo
 
 
 @pytest.mark.parametrize('kind', ['chunk', 'file'])
-def test_empty_frames_cost_no_more_than_their_number(tmp_path, kind):
+def test_many_empty_frames_are_refused_within_2_s(tmp_path, kind):
     frames = zstd_module().compress(b'') * 100_000        # 0.9 MB
     path = tmp_path / 'bag.mcap'
     if kind == 'file':
@@ -234,7 +234,7 @@ def metadata(folder, change):
     return path
 
 
-def test_links_in_each_other_are_not_written_out(tmp_path):
+def test_nested_yaml_aliases_are_not_expanded(tmp_path):
     links = ['&l0 [x, x, x, x, x, x, x, x]']
     links += [f'&l{k} [{", ".join([f"*l{k - 1}"] * 8)}]' for k in range(1, 8)]
     odd = '{' + ', '.join(f'k{k}: {link}' for k, link in enumerate(links)) + '}'
@@ -250,14 +250,14 @@ def test_links_in_each_other_are_not_written_out(tmp_path):
 
 @pytest.mark.parametrize(('text', 'what'), [
     ('#' * 2**22, 'bytes'), (''.join(f'k{n}: {n}\n' for n in range(38_000)), 'values')])
-def test_a_text_that_does_not_end_or_has_very_many_keys_is_not_used(tmp_path, text, what):
+def test_metadata_that_are_too_long_or_have_too_many_keys_are_not_used(tmp_path, text, what):
     path = metadata(tmp_path, lambda own: own + text)
     with open_bag(path) as bag:
         assert any('exceeds the limit of' in note and what in note for note in bag.notes)
 
 
 @pytest.mark.parametrize('link', ['hardlink_to', 'symlink_to', 'same name'])
-def test_a_file_of_many_names_is_read_once(tmp_path, link):
+def test_a_file_with_many_names_is_read_once(tmp_path, link):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'mcap')
     names = [file.name for file in path.iterdir() if file.suffix == '.mcap']
     assert len(names) == 1
@@ -275,6 +275,6 @@ def test_a_file_of_many_names_is_read_once(tmp_path, link):
         assert len(bag.files) == 1
 
 
-def test_one_message_of_a_database_is_bounded(tmp_path):
+def test_the_size_of_one_message_of_a_database_is_limited(tmp_path):
     line = 'UPDATE messages SET data = zeroblob(200000000) WHERE rowid = 3'
     assert peak_memory_and_error(database(tmp_path, (line,)))[0] < 2**27

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags of every kind through the one way in, and paths that are no bags."""
+"""Bags of every kind read by open_bag, and paths that are not bags."""
 
 from contextlib import closing
 import hashlib
@@ -37,8 +37,8 @@ SPLIT, TALKER = {'AAA': 804, 'HHH': 726}, {'/topic': 10, '/rosout': 10, '/parame
     ('service_events_mcap', 1, None, {'/test_topic1': 1, '/test_topic2': 1}),
     ('autoware_kinematic_state_no_metadata.db3', 1, 2130,
      {'/localization/kinematic_state': 2130})])
-def test_bags_of_rosbag2(data_dir, name, files, messages, topics):
-    """Written by rosbag2 itself."""
+def test_bags_of_rosbag2_are_read(data_dir, name, files, messages, topics):
+    """The bags were written by rosbag2."""
     with open_bag(data_dir / 'reader_bags' / name) as bag:
         assert len(bag.files) == files
         assert messages in (None, sum(topic.count for topic in bag.topics.values()))
@@ -55,7 +55,7 @@ def test_bags_of_rosbag2(data_dir, name, files, messages, topics):
     ('empty_sqlite3_with_wal', 'the bag is empty, 0 messages on 2 topics'),
     ('unknown_serialization_sqlite3', "'wrong_format', only cdr"),
     ('README.md', 'a text file, which is not a bag'), ('nothing_here', 'no such file or folder')])
-def test_bags_that_cannot_be_read(data_dir, name, says):
+def test_bags_that_cannot_be_read_are_refused_with_the_reason(data_dir, name, says):
     with pytest.raises(BadBag, match=says), open_bag(data_dir / 'reader_bags' / name):
         pass
 
@@ -63,7 +63,7 @@ def test_bags_that_cannot_be_read(data_dir, name, says):
 @pytest.mark.parametrize(('storage', 'compression'), [
     ('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('mcap', 'message'),
     ('sqlite3', 'none'), ('sqlite3', 'file'), ('sqlite3', 'message')])
-def test_storages_and_compressions_hold_the_same(tmp_path, expected, storage, compression):
+def test_storages_and_compressions_give_the_same_rows(tmp_path, expected, storage, compression):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(), storage, compression)
     found, notes = read(path)
     assert same(found, expected)
@@ -74,11 +74,11 @@ def test_storages_and_compressions_hold_the_same(tmp_path, expected, storage, co
     found, (note,) = read(path)
     assert same(found, expected)
     assert 'metadata.yaml is missing' in note
-    shutil.copy(file_of(path), tmp_path / 'drive.active')       # another ending
+    shutil.copy(file_of(path), tmp_path / 'drive.active')       # another extension
     assert same(read(tmp_path / 'drive.active')[0], expected)
 
 
-def test_rosbag1(tmp_path, expected):
+def test_a_rosbag1_file_gives_the_same_rows(tmp_path, expected):
     path = ros_bags.write(tmp_path / 'drive.bag', ros_bags.drive(), 'rosbag1')
     assert same(read(path)[0], expected)
     with open_bag(path) as bag:
@@ -87,7 +87,7 @@ def test_rosbag1(tmp_path, expected):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3', 'rosbag1'])
-def test_split_files_in_number_order(tmp_path, expected, storage):
+def test_split_files_are_read_in_order_of_their_numbers(tmp_path, expected, storage):
     rows = ros_bags.drive()
     folder = tmp_path / 'split'
     folder.mkdir()
@@ -112,7 +112,7 @@ def test_files_that_overlap_are_merged_by_time(tmp_path, expected, monkeypatch):
     assert same(found, expected)
 
 
-def test_changes_still_in_the_wal(tmp_path, expected):
+def test_changes_in_the_wal_are_read_and_no_file_is_changed(tmp_path, expected):
     rows = ros_bags.drive()
     path = ros_bags.write(tmp_path / 'bag', rows, 'sqlite3')
     db = sqlite3.connect(path / 'bag.db3')
@@ -131,7 +131,7 @@ def test_changes_still_in_the_wal(tmp_path, expected):
     assert {f.name: f.read_bytes() for f in copy.iterdir()} == before
 
 
-def test_foreign_types_come_with_the_bag(tmp_path):
+def test_foreign_types_are_read_by_the_definitions_in_the_bag(tmp_path):
     from rosbags.typesys import get_types_from_msg, get_typestore, Stores
     name, store = 'create_msgs/msg/WheelTicks', get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('std_msgs/Header header\nint32 ticks_left\n', name))
@@ -154,7 +154,7 @@ def test_foreign_types_come_with_the_bag(tmp_path):
         bag.read({'/ticks': make_reader('odometer', name, settings)}, print)
 
 
-def test_sums_are_those_of_sha256sum(data_dir, plain):
+def test_checksums_agree_with_sha256sum(data_dir, plain):
     with open_bag(plain) as bag:
         assert bag_sha256(bag) == hashlib.sha256((plain / 'drive.mcap').read_bytes()).hexdigest()
     with open_bag(data_dir / 'reader_bags' / 'split3_mcap_no_metadata') as bag:
@@ -163,7 +163,7 @@ def test_sums_are_those_of_sha256sum(data_dir, plain):
         assert bag_sha256(bag) == hashlib.sha256(listing.encode()).hexdigest()
 
 
-def test_memory_stays_bounded_with_a_camera_beside(tmp_path):
+def test_memory_stays_bounded_if_the_bag_has_camera_images(tmp_path):
     picture = np.random.default_rng(0).integers(0, 255, 400_000, np.uint8)
     image = make.kind('sensor_msgs/msg/CompressedImage')(
         header=make.header(T0), format='jpeg', data=picture)
@@ -182,7 +182,7 @@ def test_memory_stays_bounded_with_a_camera_beside(tmp_path):
 
 
 
-def test_topic_with_two_types_is_read_as_the_frequent_one(tmp_path):
+def test_a_topic_with_two_types_is_read_as_the_more_frequent_one(tmp_path):
     from rosbags.rosbag2 import Writer
     with Writer(tmp_path / 'bag', version=9, storage_plugin=ros_bags.STORAGES['mcap']) as bag:
         for kind, messages in (('Int32', 2), ('Int64', 5)):
@@ -195,7 +195,7 @@ def test_topic_with_two_types_is_read_as_the_frequent_one(tmp_path):
         assert 'messages of 2 types' in bag.notes[0]
 
 
-def test_what_is_asked_wrongly(tmp_path, plain, monkeypatch):
+def test_wrong_topics_and_paths_are_refused_with_the_cause(tmp_path, plain, monkeypatch):
     with open_bag(plain) as bag:
         assert list(bag.messages('/nothing')) == []
         with pytest.raises(BadUsage, match=r'no topic /x; the bag has:\n  /fix,\n  /imu/'):
@@ -207,7 +207,7 @@ def test_what_is_asked_wrongly(tmp_path, plain, monkeypatch):
         pass
     path = ros_bags.write(tmp_path / 'x.bag', ros_bags.drive(0.1), 'rosbag1')
     before, key, after = path.read_bytes().partition(b'index_pos=')
-    path.write_bytes(before + key + bytes(8) + after[8:])       # as one that was never closed
+    path.write_bytes(before + key + bytes(8) + after[8:])       # like a bag that was never closed
     with pytest.raises(BadBag, match='rosbag reindex'), open_bag(path):
         pass
 
@@ -218,8 +218,8 @@ def test_what_is_asked_wrongly(tmp_path, plain, monkeypatch):
         pass
 
 
-def test_the_frame_is_that_of_the_first_message_that_can_be_read(tmp_path):
-    """Big endian too, which has no layout; frames that are no text are no frames."""
+def test_the_frame_is_that_of_the_first_readable_message(tmp_path):
+    """Also of big-endian messages, which have no layout; invalid text is not a frame."""
     little, odd = (bytearray(make.cdr(make.imu(T0, frame=frame))) for frame in ('a é', 'axx'))
     odd[17] = 0xff
     for first, expected in ((little[:40], 'b'), (odd, 'b'), (little, 'a é'),

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is touched inside of rosbags, which is 0.x; without it standard types are read."""
+"""Internals of rosbags (0.x) that are used, and reading of standard types without it."""
 
 from importlib.metadata import version
 import inspect
@@ -31,11 +31,11 @@ PROGRAM = ("import sys; sys.modules['rosbags'] = None\n"
            'sys.exit(main(sys.argv[1:]))')
 
 
-def test_the_version_is_one_that_was_looked_at():
+def test_the_installed_version_is_one_that_was_checked():
     assert re.match(r'0\.11\.', version('rosbags'))
 
 
-def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
+def test_the_reader_of_rosbag1_has_the_expected_internals(tmp_path):
     assert set(reader.decompressors) == set(rosbags_readers.PACKINGS)
     assert set(reader.Chunk._fields) == {'datasize', 'datapos', 'decompressor'}
     assert list(inspect.signature(rosbag1.Reader.read_index_data).parameters) == [
@@ -54,7 +54,7 @@ def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
     file.close()
 
 
-def test_a_rosbag1_whose_index_runs_in_circles(tmp_path, monkeypatch):
+def test_a_rosbag1_with_a_circular_index_is_refused(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
     given, found = rosbag1.Reader.read_chunk_info, []
 
@@ -70,7 +70,7 @@ def test_a_rosbag1_whose_index_runs_in_circles(tmp_path, monkeypatch):
         rosbags_readers.Rosbag1File(path, Allowance(path, len(data)), print)
 
 
-def test_a_rosbag1_that_unpacks_to_more_than_it_may(tmp_path, monkeypatch):
+def test_a_rosbag1_that_decompresses_beyond_the_limit_is_refused(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
     part = rosbags_readers.Rosbag1File(path, Allowance(path, 2**40), lambda raw, _: raw)
     part._allowance.most = 1000
@@ -80,7 +80,7 @@ def test_a_rosbag1_that_unpacks_to_more_than_it_may(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('compression', ['none', 'storage'])
-def test_the_mcap_writer_takes_our_checksums(tmp_path, compression):
+def test_the_mcap_writer_uses_our_checksums(tmp_path, compression):
     assert 'write_uint32(rec, 0)' in inspect.getsource(storage_mcap.McapWriter.close_chunk)
     drive = simulate(SimOptions(scenario='straight', duration=180.0))
     path = write.write_bag(tmp_path / 'bag', write.drive_topics(drive), 'mcap', compression)
@@ -115,7 +115,7 @@ def test_a_bag_of_standard_types_is_calibrated(tmp_path, storage):
 
 
 @pytest.mark.slow
-def test_what_needs_it_says_so(tmp_path):
+def test_commands_that_need_rosbags_report_it(tmp_path):
     made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
     write_bag(tmp_path / 'drive.bag', [imu('/imu/data', made.imu)], storage='rosbag1')
     for words in (['inspect', 'drive.bag'], [

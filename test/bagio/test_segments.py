@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag that grows by closed files: what readers find of it whenever its writer stops."""
+"""A bag that grows by closed files: its content for readers whenever its writer stops."""
 
 from contextlib import suppress
 from itertools import count
@@ -79,7 +79,7 @@ def test_other_readers_read_a_segment(tmp_path, monkeypatch, zstd):
             assert [(t, bytes(raw)) for _, t, raw in reader.messages(mine)] == sent
 
 
-def test_records_are_read_without_an_index_and_chunks_come_back_as_packed(tmp_path):
+def test_records_are_read_without_an_index_and_chunks_are_unchanged(tmp_path):
     packed, messages = second(0)
     write_file(tmp_path / 'cut.mcap', CHANNELS, packed)
     whole = (tmp_path / 'cut.mcap').read_bytes()
@@ -145,7 +145,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize('join', [SegmentedBag.join_some, SegmentedBag.finish])
-def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, join):
+def test_a_kill_at_any_step_of_joining_neither_loses_nor_repeats_messages(tmp_path, join):
     seen = set()
     for step in count(1):
         folder = tmp_path / str(step) / 'leg'
@@ -163,7 +163,7 @@ def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, join)
     assert len(seen) > 5      # states that differ were met
 
 
-def test_without_room_for_the_copy_the_segments_are_the_bag(tmp_path):
+def test_without_space_for_the_copy_the_segments_remain_the_bag(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 3)
     bag.finish(room=bag.size - 1)
     assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [part_name(k, k) for k in range(3)]
@@ -185,14 +185,14 @@ def test_a_mark_is_added_to_a_finished_bag(tmp_path, room, metadata):
     assert read(bag.folder) == {topic: messages[topic] + more[topic] for topic in messages}
 
 
-def test_names_are_looked_at_in_journals_only(tmp_path):
+def test_file_names_are_checked_in_journals_only(tmp_path):
     bag, _ = grown(tmp_path / 'leg', 2)
     (bag.folder / part_name(0, 0)).rename(bag.folder / part_name(0, 5))
     (bag.folder / JOURNAL).unlink()
     assert len(read(bag.folder)['/odometer']) == 40
 
 
-def test_an_empty_folder_of_a_journal_is_said(tmp_path):
+def test_an_empty_folder_of_a_journal_is_reported(tmp_path):
     (tmp_path / JOURNAL).touch()
     with pytest.raises(BadBag, match='holds no .mcap'), open_bag(tmp_path):
         pass

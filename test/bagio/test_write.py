@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags written are read back by rosbags, value for value."""
+"""Written bags are read back by rosbags, value for value."""
 
 import sqlite3
 
@@ -48,7 +48,7 @@ def xyz(v):
 @pytest.mark.parametrize(('storage', 'compression'), [
     ('mcap', 'none'), ('mcap', 'message'), ('mcap', 'file'), ('mcap', 'storage'),
     ('sqlite3', 'none'), ('sqlite3', 'message'), ('sqlite3', 'file'), ('rosbag1', 'none')])
-def test_a_drive_comes_back_value_for_value(tmp_path, drive, storage, compression):
+def test_a_written_drive_is_read_back_value_for_value(tmp_path, drive, storage, compression):
     path = tmp_path / ('drive.bag' if storage == 'rosbag1' else 'drive')
     assert write_bag(path, drive_topics(drive), storage, compression) == path
     back = messages(path)
@@ -90,14 +90,14 @@ def same_fixes(rows, fixes):
                                    getattr(fixes, name), rtol=4.5e-16)
 
 
-def test_no_orientation_is_said_as_rep_145_wants(tmp_path):
+def test_a_missing_orientation_is_marked_as_in_rep_145(tmp_path):
     drive = simulate(SimOptions(**SHORT))
     back = messages(write_bag(tmp_path / 'drive', drive_topics(drive)))
     assert {m.orientation_covariance[0] for _, m in back['/imu/data']} == {-1.0}
 
 
 @pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'imu_link', 'a_rather_long_frame_name'])
-def test_every_length_of_frame_is_padded_right(tmp_path, drive, frame):
+def test_frames_of_every_length_are_padded_correctly(tmp_path, drive, frame):
     topics = [encode.imu('/imu', drive.imu, frame), encode.fix('/fix', drive.fix, frame),
               encode.twist('/speed', drive.odometer, frame),
               encode.joints('/joints', {'l': drive.odometer, 'right': drive.odometer}, frame)]
@@ -129,7 +129,7 @@ def test_two_wheels_have_two_counters_or_two_joints(tmp_path, odometer, topics):
         assert [m.data for _, m in back['/odometer/right']] == drive.odometer_right.value.tolist()
 
 
-def test_blocks_leave_no_trace(tmp_path, drive, monkeypatch):
+def test_the_block_size_does_not_change_the_bag(tmp_path, drive, monkeypatch):
     whole = messages(write_bag(tmp_path / 'whole', drive_topics(drive), 'sqlite3'))
     monkeypatch.setattr('odocal_ros.bagio.write.BLOCK', 7)
     reported = []
@@ -166,7 +166,7 @@ def test_an_existing_bag_is_kept_unless_forced(tmp_path):
     assert len(messages(path)['/odometer']) == 2
 
 
-def test_no_other_folder_is_replaced_and_a_bad_one_is_one_sentence(tmp_path):
+def test_only_a_bag_folder_is_replaced_and_an_unwritable_path_is_refused(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.txt').write_text('ten years')
     with pytest.raises(BadUsage, match='is not a bag; choose another'):
@@ -181,13 +181,13 @@ def test_no_other_folder_is_replaced_and_a_bad_one_is_one_sentence(tmp_path):
     ('rar', 'none', '--storage rar: required: one of mcap'),
     ('mcap', 'lz77', '--compression lz77: required: one of none'),
     ('sqlite3', 'storage', '--compression storage is not available for --storage sqlite3')])
-def test_what_cannot_be_written_is_said(tmp_path, storage, compression, reported):
+def test_an_unknown_storage_or_compression_is_refused(tmp_path, storage, compression, reported):
     with pytest.raises(BadUsage, match=reported):
         write_bag(tmp_path / 'bag', counts(), storage, compression)
     assert not (tmp_path / 'bag').exists()
 
 
-def test_a_writer_that_fails_half_way_leaves_nothing(tmp_path):
+def test_a_failed_writer_leaves_no_file(tmp_path):
     def broken(rows):
         if rows.stop > 1:
             raise OSError(28, 'No space left on device')

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One case of fuzzing: a bag, something done to it, a command in a process of its own, a judgement.
+One fuzz case: a bag, a mutation, a command in its own process, and a check of the outcome.
 
-A case is its seed and its number; alone: ``python benchmarks/fuzz.py --seed S --only N``.
+Seed and number define a case; one case: ``python benchmarks/fuzz.py --seed S --only N``.
 """
 
 from contextlib import redirect_stderr, redirect_stdout
@@ -32,8 +32,8 @@ from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate
 
-SECONDS = 60.0           # of a case, at most
-MEMORY = 2**30           # bytes over what a clean bag takes, at most
+SECONDS = 60.0           # limit of a case
+MEMORY = 2**30           # bytes: limit above the memory for a clean bag
 BASES = {'mcap': ('mcap', 'none', 'counts'), 'zstd': ('mcap', 'storage', 'counts'),
          'messages': ('mcap', 'message', 'speed'), 'file': ('mcap', 'file', 'counts'),
          'sqlite3': ('sqlite3', 'none', 'counts'), 'angle': ('sqlite3', 'none', 'angle'),
@@ -46,7 +46,7 @@ JOURNAL = ('/calibrator:\n  ros__parameters:\n    leg:\n      min_distance: 50.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case; ``wrong`` is empty where it is as it should be."""
+    """Outcome of a case; ``wrong`` is empty if there is no error."""
 
     number: int
     what: str
@@ -59,7 +59,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Bases:
-    """Clean bags by name, the truth of each, and options that have a clean one accepted."""
+    """Clean bags by name, the truth of each, and options with which a clean one is accepted."""
 
     folder: Path
     truth: dict
@@ -86,8 +86,8 @@ def bases(folder: Path) -> Bases:
         if name == 'journal':
             (path / 'journal.yaml').write_text(JOURNAL)
         truth[name] = made.truth
-    # a heading, and limits within which the two ends alone are accepted: so the cheapest method
-    # has something to be wrong about
+    # a heading, and limits within which the two-point method is accepted: so the cheapest method
+    # can give a wrong value
     options = [f'alignment.heading={made.truth.heading}', 'alignment.heading_sigma=0.002',
                'alignment.heading_source=fixed', 'verdict.max_scale_sigma=0.005',
                'verdict.max_yaw_sigma=0.05']
@@ -95,9 +95,9 @@ def bases(folder: Path) -> Bases:
 
 
 def warm_up(clean: Bases) -> Bases:
-    """Import here what every case would import, that a forked process has it; return the bags."""
+    """Import all that a case needs, so that a forked process has it; return the bags."""
     from odocal_ros.offline.cli import main
-    os.environ['MPLCONFIGDIR'] = str(clean.folder)      # of matplotlib's list of fonts
+    os.environ['MPLCONFIGDIR'] = str(clean.folder)      # for the font list of matplotlib
     for name, out in (('mcap', 'out'), ('messages', 'odd'), ('sqlite3', 'db'), ('rosbag1', 'one')):
         with redirect_stdout(None), redirect_stderr(None):
             main(['inspect', str(clean.bag(name))])
@@ -109,16 +109,16 @@ def warm_up(clean: Bases) -> Bases:
 
 def run(seed: int, clean: Bases, work: Path, numbers: list[int]) -> list[Outcome]:
     """
-    Run cases in one forked process, and those again that fail, each in one of its own.
+    Run cases in one forked process; repeat each failed case in its own process.
 
-    So a fork is paid once for many, and nothing that a case leaves behind judges another.
+    One fork serves many cases, and no case affects the outcome of another.
     """
-    told = work / f'told_{numbers[0]}'
-    told.touch()
+    ended = work / f'told_{numbers[0]}'
+    ended.touch()
     pid = os.fork()
     if not pid:
         try:
-            with told.open('a') as file:
+            with ended.open('a') as file:
                 limit()
                 for number in numbers:
                     outcome = case(seed, clean, work, number, here)
@@ -127,14 +127,14 @@ def run(seed: int, clean: Bases, work: Path, numbers: list[int]) -> list[Outcome
         finally:
             os._exit(0)
     os.wait4(pid, 0)
-    ran = {line['number']: Outcome(**line) for line in map(json.loads, told.open())}
-    told.unlink()
+    ran = {line['number']: Outcome(**line) for line in map(json.loads, ended.open())}
+    ended.unlink()
     return [ran[n] if n in ran and not ran[n].wrong else case(seed, clean, work, n, child)
             for n in numbers]
 
 
 def case(seed: int, clean: Bases, work: Path, number: int, ran) -> Outcome:
-    """Run a case in a folder of its own, which is gone afterwards."""
+    """Run a case in its own folder, which is removed afterwards."""
     rng = random.Random(f'{seed}:{number}')
     place = work / f'case_{number}'
     shutil.rmtree(place, ignore_errors=True)
@@ -171,9 +171,9 @@ def command(rng, bag, wide, options, whole) -> list[str]:
 
 def mutated(rng, base, bag):
     """
-    Change a bag, or say it all by options; return what was done, the options, and the factors.
+    Change a bag, or make odd options; return the name of the change, options and factors.
 
-    Factors of the true scale factor, (least, largest): of what changes the meaning; else None.
+    Factors of the true scale factor, (least, largest), if the meaning changes; else None.
     """
     if rng.random() < 0.15:
         return 'options', mutations.texts(rng, bag.parent), None
@@ -189,13 +189,13 @@ def mutated(rng, base, bag):
 
 
 def tree(place: Path) -> dict:
-    """Return all files under a folder with their sums."""
+    """Return all files under a folder with their checksums."""
     return {str(f.relative_to(place)): hashlib.sha256(f.read_bytes()).digest()
             for f in sorted(place.rglob('*')) if f.is_file()}
 
 
 def child(argv, place):
-    """Run a command in a forked process; return its code, seconds and most memory, bytes."""
+    """Run a command in a forked process; return its code, seconds and peak memory, bytes."""
     pid = os.fork()
     if not pid:
         code = 99
@@ -209,15 +209,15 @@ def child(argv, place):
 
 
 def limit() -> None:
-    """Bound the memory of this process, and have it tell a warning as often as it comes."""
+    """Limit the memory of this process, and show every repeated warning."""
     resource.setrlimit(resource.RLIMIT_DATA, (3 * MEMORY, 3 * MEMORY))
     warnings.filterwarnings('always', category=RuntimeWarning)
 
 
 def here(argv, place):
-    """Run a command in this process; return its code, seconds and the process's most memory."""
+    """Run a command in this process; return its code, seconds and the peak memory, bytes."""
     from odocal_ros.offline.cli import main
-    signal.alarm(int(2 * SECONDS))         # ends the process, if it waits for what never comes
+    signal.alarm(int(2 * SECONDS))         # ends a process that waits forever
     os.environ.update(HOME=str(place / 'home'), TMPDIR=str(place / 'tmp'))
     os.chdir(place / 'tmp')
     tempfile.tempdir = str(place / 'tmp')
@@ -233,10 +233,10 @@ def here(argv, place):
 
 
 def judged(place, before, code, seconds, memory, said, truth) -> str:
-    """Return what is wrong with an outcome, '' if nothing is."""
-    # what a journal is read with is told before
+    """Return the error of an outcome, '' if there is none."""
+    # the settings of a journal are printed first
     lines = [line for line in said.strip().splitlines() if ' is a journal: ' not in line]
-    # topics, and clauses that end in a semicolon, have lines of their own
+    # topics, and clauses that end in a semicolon, have their own lines
     sentences = [line for previous, line in zip(['', *lines], lines, strict=False)
                  if not line.startswith('  /') and not previous.endswith(';')]
     if code not in (0, 1, 2):
@@ -260,7 +260,7 @@ def judged(place, before, code, seconds, memory, said, truth) -> str:
 
 
 def false_value(content, truth) -> str:
-    """Return the worst value that is accepted without a word and is not true."""
+    """Return the worst of the accepted values that are wrong, '' if there is none."""
     if content['verdict'] != 'accepted':
         return ''
     sigmas, what = semantic.worst_error({

@@ -18,7 +18,7 @@ def file_of(bag):
 
 
 def some_place(rng, size):
-    """Return a place in a file, near its ends more often than not."""
+    """Return an offset in a file, mostly near its ends."""
     kind = rng.random()
     if kind < 0.25:
         return rng.randrange(min(size, 4096))
@@ -26,7 +26,7 @@ def some_place(rng, size):
 
 
 def spoil(rng, data):
-    """Change bytes anywhere: bits, numbers, runs, cuts, doubles."""
+    """Change bytes anywhere: bits, numbers, runs, cuts, repetitions."""
     data = bytearray(data)
     for _ in range(rng.choice([1, 1, 2, 4, 16])):
         if not data:

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Faulty messages through what the calibrator does with them, without DDS: read, watched, calibrated.
+Faulty messages in the calibrator without DDS: decoding, running estimate, calibration.
 
-A leg is its seed and its number: ``python benchmarks/live_faults.py --seed S --only N``.
+Seed and number define a leg: ``python benchmarks/live_faults.py --seed S --only N``.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ FIELDS = {IMU: (*semantic.RATES, *semantic.FORCES), JOINTS: ('position[0]',), CO
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a leg; sigmas: the largest error of a value, over its sigma."""
+    """Outcome of a leg; sigmas: the largest error of a value, over its sigma."""
 
     number: int
     faults: tuple[str, ...]
@@ -59,7 +59,7 @@ def drive_of(number):
 
 
 def settings_of(drive):
-    """Return settings that have a clean leg of this length accepted."""
+    """Return settings with which a clean leg of this length is accepted."""
     return with_settings(Config(), {
         'imu.grade': 'industrial', 'alignment.heading': drive.truth.heading,
         'alignment.heading_sigma': 0.002, 'alignment.heading_source': 'fixed',
@@ -76,7 +76,7 @@ def rows_of(drive):
 
 
 def some(rng, rows, kind, most_s=30.0):
-    """Return some rows in turn of a type: one, a few, or seconds of them."""
+    """Return a slice of consecutive rows of a type: one, a few, or some seconds."""
     n = len(rows[kind])
     rate = n / 240.0
     count = max(1, int(min(rng.choice([1, 2, 5, rng.uniform(0, most_s) * rate]), n // 3)))
@@ -85,7 +85,7 @@ def some(rng, rows, kind, most_s=30.0):
 
 
 def values(rng, rows):
-    """Put one value into a field, or add to it, for a while."""
+    """Set a field to one value, or add a value to it, for a while."""
     kind = rng.choice(list(rows))
     field, which = rng.choice(FIELDS[kind]), some(rng, rows, kind)
     odd = 10**6 if kind == COUNTER else rng.choice(ODD)
@@ -97,7 +97,7 @@ def values(rng, rows):
 
 
 def axes_for_a_while(rng, rows):
-    """Exchange axes of gyro or accelerometer, for a while."""
+    """Swap axes of gyro or accelerometer for a while."""
     order = rng.sample(range(3), 3)
     semantic.put_all(rows, IMU, rng.choice([semantic.RATES, semantic.FORCES]),
                      lambda *x: [x[k] for k in order], some(rng, rows, IMU, 100.0))
@@ -105,7 +105,7 @@ def axes_for_a_while(rng, rows):
 
 
 def burst(rng, rows):
-    """Have messages of some seconds arrive at once."""
+    """Make messages of some seconds arrive at once."""
     kind = rng.choice(list(rows))
     which = some(rng, rows, kind)
     last = rows[kind][which][-1][0]
@@ -129,7 +129,7 @@ def missing(rng, rows):
 
 
 def far_stamps(rng, rows):
-    """Stamp some messages far off, in the past or the future."""
+    """Shift the stamps of some messages far into the past or the future."""
     kind = rng.choice([one for one in rows if one != COUNTER])
     which, by_ns = some(rng, rows, kind), rng.choice([-1, 1]) * int(10**rng.uniform(8, 18))
     first = rows[kind][which][0][0]
@@ -143,13 +143,13 @@ FAULTS = (values, values, values, axes_for_a_while, burst, stuck, missing, far_s
 
 
 class AtOnce:
-    """Runs the jobs of the running estimate as they come; keeps errors without a sentence."""
+    """Runs the jobs of the running estimate immediately; keeps unexpected errors."""
 
     def __init__(self):
         self.raised = []
 
     def submit(self, job, then):
-        """Run a job and hand on its result."""
+        """Run a job and pass on its result."""
         update = job()
         if update.error is not None and not isinstance(update.error, OdocalError):
             self.raised.append(repr(update.error))
@@ -225,7 +225,7 @@ def leg(seed, number):
             computed = worker.compute(recorder, start_ns, stop_ns, [], config)
         except OdocalError as error:
             return Outcome(number, tuple(done), 'refused', 0.0, '', (str(error),), '')
-        except Exception as error:      # that none comes is what is tested
+        except Exception as error:      # the test requires that there is none
             return Outcome(number, tuple(done), '', 0.0, '', (), repr(error))
     calibration = computed.calibration
     worst, what = semantic.worst_error({

@@ -24,7 +24,7 @@ PACKED = struct.Struct('<QQQI')
 
 
 def without_checksums(rng, bag):
-    """Return the file of a bag, an mcap file mostly as those have it that write no checksums."""
+    """Return the file of a bag; remove the checksums of most mcap files."""
     file = file_of(bag)
     data = bytearray(file.read_bytes())
     if data.startswith(MAGIC) and rng.random() < 0.7:
@@ -70,7 +70,7 @@ def joined(records):
 
 
 def some_records(rng, records):
-    """Drop, double, exchange or spoil some of a list of records."""
+    """Drop, repeat, swap or damage some of a list of records."""
     for _ in range(rng.choice([1, 1, 3, 10])):
         i, j = rng.randrange(len(records)), rng.randrange(len(records))
         kind = rng.randrange(6)
@@ -104,7 +104,7 @@ def mcap_records(rng, records):
 
 
 def unindexed(records, index=(2, 7, 8, 11, 14)):
-    """Return records without an index: its places are not right, a reader has to do without."""
+    """Return records without an index: its offsets are wrong, a reader has to work without it."""
     return [r for r in records if r[0] not in index] + [(2, bytes(20))]
 
 
@@ -114,7 +114,7 @@ def places_of(records, op):
 
 @of_records
 def mcap_inside(rng, records):
-    """Change records or values in a chunk and pack it anew, so that all the outside fits."""
+    """Change records or values in a chunk, and pack it again with matching sizes."""
     which = rng.choice(places_of(records, CHUNK))
     body = records[which][1]
     start, end, _, _ = PACKED.unpack_from(body)
@@ -146,7 +146,7 @@ INDEX = {         # places and sizes of numbers of a record
 
 @of_records
 def mcap_lies(rng, records):
-    """Have indexes, heads of chunks and counts lie: as another record says it, or by a number."""
+    """Make indexes, chunk headers and counts wrong: by a value of another record or a number."""
     for _ in range(rng.choice([1, 1, 3, 30])):
         op = rng.choice([k for k in INDEX if any(k == one for one, _ in records)])
         i, j = (rng.choice(places_of(records, op)) for _ in range(2))
@@ -164,14 +164,14 @@ def mcap_lies(rng, records):
 
 @of_records
 def mcap_overlap(rng, records):
-    """Repeat or exchange chunks, so that their times overlap; the index is true or is missing."""
+    """Repeat or swap chunks, so that their times overlap; the index is correct or missing."""
     chunks = places_of(records, CHUNK)
     kind, i, j = rng.randrange(3), rng.choice(chunks), rng.choice(chunks)
     if kind == 0:
         records.insert(j, records[i])
     elif kind == 1:
         records[i], records[j] = records[j], records[i]
-    else:                      # the same chunk by two entries of the index
+    else:                      # two index entries of the same chunk
         entries = places_of(records, 8)
         records.insert(rng.choice(entries), records[rng.choice(entries)])
     return unindexed(records) if kind < 2 else records
@@ -194,7 +194,7 @@ def ros1_joined(records):
 
 
 def ros1_inside(rng, bag):
-    """Change records of the file or of a chunk, or values in messages; all places stay."""
+    """Change records of the file or of a chunk, or values in messages; all offsets stay."""
     magic, rest = bag.read_bytes().split(b'\n', 1)
     records = ros1_records(rest)
     chunks = [i for i, (head, _) in enumerate(records) if b'op=\x05' in head]
@@ -280,5 +280,5 @@ OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, mcap_lies, mc
       'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_oddities,
                   sqlite_pages, metadata, linked],
       'rosbag1': [raw, clump, ros1_inside, ros1_inside],
-      'file': [raw, clump, metadata],                   # packed as a whole, and
-      'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached
+      'file': [raw, clump, metadata],                   # compressed as a whole
+      'messages': [raw, clump, mcap_records, metadata]}  # each compressed

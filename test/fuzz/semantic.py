@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Seeded mutations of what the messages of a bag mean; every message stays well-formed.
+Seeded mutations of the meaning of messages; every message stays well-formed.
 
-Each takes a random.Random and the rows of a bag by topic, and returns by what factors the true
-scale factor is multiplied: (least, largest), of which a mixture may be the mean.
+Each takes a random.Random and the rows of a bag by topic, and returns the factors (least,
+largest) of the true scale factor; an estimate may lie between both.
 """
 
 from contextlib import closing
@@ -90,7 +90,7 @@ def some_range(rng, n):
 
 
 def second_imu(rng, rows):
-    """Send some messages of the IMU as a second one has them, that sits turned about z."""
+    """Replace some messages of the IMU by those of a second one that is rotated about z."""
     angle = rng.uniform(-3.0, 3.0)
     c, s = math.cos(angle), math.sin(angle)
     which = slice(0, None, rng.choice([2, 2, 3, 10]))
@@ -123,15 +123,15 @@ def units(rng, rows):
     return (1 / abs(factor),) * 2 if name == kind else SAME
 
 
-def exchanged_fix(rng, rows):
-    """Send latitude and longitude in each other's place, or with the other sign."""
+def swapped_fix(rng, rows):
+    """Swap latitude and longitude, with the same or the other sign."""
     sign = rng.choice([1.0, -1.0])
     put_all(rows, FIX, ['latitude', 'longitude'], lambda x, y: (sign * y, x))
     return SAME
 
 
 def doubled_range(rng, rows):
-    """Repeat a part of the recording, of one topic or all, in the order of time or behind it."""
+    """Repeat a part of the recording, of one topic or all, at the same times or later."""
     later_ns = rng.choice([0, 0, 1, 10**9])
     for kind in rng.choice([[rng.choice(list(rows))], list(rows)]):
         part = rows[kind][some_range(rng, len(rows[kind]))]
@@ -140,7 +140,7 @@ def doubled_range(rng, rows):
 
 
 def spliced(rng, rows):
-    """Go on with the odometer of another vehicle, or with its IMU too, in the midst of a drive."""
+    """Continue a drive with the odometer of another vehicle, or also with its IMU."""
     kind, fields = odometer_of(rows)
     n, factor = len(rows[kind]), math.exp(rng.choice([-1, 1]) * rng.uniform(0.005, 1.0))
     begin = rng.randrange(n // 5, n - n // 5)
@@ -156,7 +156,7 @@ def spliced(rng, rows):
 
 
 def second_publisher(rng, rows):
-    """Have a second sender on the topic of odometer or fixes, that is elsewhere."""
+    """Add a second publisher with other values to the topic of odometer or fixes."""
     every = rng.choice([1, 2, 7])
     if rng.random() < 0.5:
         kind, fields = odometer_of(rows)
@@ -180,7 +180,7 @@ def stamped(kind, data, by_ns):
 
 
 def clock_step(rng, rows):
-    """Set the clock of a topic, for a while or for good; a drift of it too."""
+    """Step the clock of a topic, for a while or permanently."""
     kind = rng.choice(list(rows))
     which = some_range(rng, len(rows[kind]))
     by_ns = int(rng.choice([-1, 1]) * 10**rng.uniform(7.0, 11.0))
@@ -191,7 +191,7 @@ def clock_step(rng, rows):
 
 
 def wrapped(rng, rows):
-    """Have the odometer start again at a turn, or at a number of fewer bits."""
+    """Wrap the odometer at a full turn, or at a smaller modulus."""
     kind, fields = odometer_of(rows)
     span = rng.choice([256, 1000, 4096, 2**16] if kind == COUNTER else [2 * math.pi, 360.0])
     put_all(rows, kind, fields, lambda x: [x % span])
@@ -199,7 +199,7 @@ def wrapped(rng, rows):
 
 
 def carried(rng, rows):
-    """Have the vehicle wait at a standstill while something carries it, or lifts it."""
+    """Insert a standstill in which the vehicle is carried, or does not move."""
     kind, fields = odometer_of(rows)
     at, form = layout_of(kind, rows[kind][0][1]).find(fields[0])
     value = [np.frombuffer(data, form, 1, at)[0] for _, data in rows[kind]]
@@ -209,7 +209,7 @@ def carried(rng, rows):
     metres = rng.choice([0.0, 5.0, 30.0, 100.0, 1000.0])
     for name, some in rows.items():
         last = [row for row in some if time_ns - again_ns < row[0] <= time_ns]
-        more = [(t, data[:12] + rng.choice(last)[1][12:], by_ns)     # of a header and another row
+        more = [(t, data[:12] + rng.choice(last)[1][12:], by_ns)     # own header, another row
                 for by_ns in range(again_ns, wait_ns + 1, again_ns) for t, data in last]
         after = [(*row, wait_ns) for row in some if row[0] > time_ns]
         rows[name] = [row for row in some if row[0] <= time_ns] + [
@@ -220,5 +220,5 @@ def carried(rng, rows):
     return SAME
 
 
-ALL = [second_imu, axes, units, exchanged_fix, doubled_range, spliced, second_publisher,
+ALL = [second_imu, axes, units, swapped_fix, doubled_range, spliced, second_publisher,
        clock_step, wrapped, carried]

@@ -46,7 +46,7 @@ def sqlite_values(rng, bag):
 
 
 COLUMNS = ('id', 'topic_id', 'timestamp', 'data')
-TABLES = [          # that hold the same rows in another way
+TABLES = [          # other tables with the same rows
     'CREATE TABLE other (data BLOB, timestamp INTEGER, topic_id INTEGER, id INTEGER PRIMARY KEY)',
     'CREATE TABLE other (id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB, '
     'PRIMARY KEY (timestamp, id)) WITHOUT ROWID',
@@ -66,7 +66,7 @@ ROWS = ['id, topic_id, timestamp, data', '-id, topic_id, timestamp, data',
 
 
 def sqlite_oddities(rng, bag):
-    """Hold the rows in a table, a view or a file that other writers of sqlite may have."""
+    """Store the rows in a table, a view or a file as other writers of sqlite do."""
     file = file_of(bag)
     old = file.with_suffix('.old')
     file.rename(old)
@@ -99,7 +99,7 @@ def sqlite_oddities(rng, bag):
 
 
 def sqlite_pages(rng, bag):
-    """Change the heads of pages: kinds, cells, where they lead."""
+    """Change the headers of pages: kinds, cells, page numbers."""
     file = file_of(bag)
     data = bytearray(file.read_bytes())
     size = int.from_bytes(data[16:18], 'big')

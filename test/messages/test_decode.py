@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages to samples: what each type says, and what is refused."""
+"""Decoding of messages: the samples of each type, and refused types."""
 
 from contextlib import nullcontext
 import dataclasses
@@ -34,7 +34,7 @@ def read(slot, messages, **settings_):
     return dict(pairs), reader
 
 
-def test_imu():
+def test_an_imu_message_gives_rates_forces_and_orientation():
     covariance = np.zeros(9)
     covariance[8] = 0.25
     found, reader = read('imu', [
@@ -57,7 +57,7 @@ def test_imu():
 @pytest.mark.parametrize(('slot', 'group', 'message'), [
     ('imu', 'imu', make.imu(0, w=(1, 2, 3))), ('fix', 'gnss', make.fix(5, 48.0, 11.0, 500.0)),
     ('odometer', 'odometer', make.twist_stamped(3, 1, 2, 3))])
-def test_arrival_times_replace_stamps_where_set(slot, group, message):
+def test_arrival_times_replace_stamps_if_set(slot, group, message):
     assert read(slot, [message] * 2)[0][slot].stamp_ns.tolist() != [7, 8]
     found, reader = read(slot, [message] * 2, **{f'{group}__arrival_time': True})
     assert found[slot].stamp_ns.tolist() == found[slot].received_ns.tolist() == [7, 8]
@@ -77,7 +77,7 @@ def test_arrival_times_replace_stamps_where_set(slot, group, message):
      {'velocity_n': [1, 2, 3], 'variance_n': [0, 0, 0]}),
     ('fix_velocity', make.twist_covariance(3, 1, 2, 3, (0.5, -1.0, math.nan)),
      {'variance_n': [0.5, 0, 0]})])      # unknown is 0
-def test_other_sensors(slot, message, expected):
+def test_heading_fix_and_velocity_messages_give_their_values(slot, message, expected):
     block = read(slot, [message])[0][slot]
     assert {name: getattr(block, name)[0].tolist() for name in expected} == expected
 
@@ -89,13 +89,13 @@ def span(name):
 
 
 @pytest.mark.parametrize('name', STD)
-def test_counters(name):
+def test_counters_have_the_modulus_of_their_type(name):
     low, high = span(name)
     found, reader = read('odometer', [make.whole(v, name) for v in (low, 5, high)])
     assert dataclasses.astuple(reader.form)[:3] == ('cumulative', high - low + 1, 'm/pulse')
     block = found['odometer']
     assert block.value.dtype == np.int64
-    # 64 bits without sign come as their int64 bits, the rest as they are
+    # unsigned 64-bit values are stored as their int64 bits, others unchanged
     assert block.value.tolist() == [low, 5, -1 if name == 'UInt64' else high]
     assert block.stamp_ns.tolist() == block.received_ns.tolist() == [7, 8, 9]
 
@@ -141,7 +141,7 @@ ODOMETERS = {
 
 
 @pytest.mark.parametrize('case', ODOMETERS)
-def test_what_an_odometer_says(case):
+def test_each_kind_of_odometer_gives_values_form_and_stamps(case):
     messages, more, values, form, stamps = ODOMETERS[case]
     found, reader = read('odometer', messages if isinstance(messages, list) else [messages],
                          **more)
@@ -153,8 +153,8 @@ def test_what_an_odometer_says(case):
     assert keys is None or reader.wheels == keys
 
 
-def test_wheels_without_a_name_are_a_mean_or_are_asked_for():
-    # counters roll over each for itself: a mean of raw counts would not
+def test_two_unnamed_wheels_are_averaged_and_four_require_a_setting():
+    # each counter rolls over separately: the mean of raw counts would be wrong
     found, reader = read('odometer', [make.whole_array([4, 5])])
     assert [block.value.tolist() for block in found.values()] == [[4], [5]]
     assert not reader.form.sides
@@ -171,7 +171,7 @@ def test_wheels_without_a_name_are_a_mean_or_are_asked_for():
     ([make.joints(1, ['arm'], [9.0]), make.joints(2, ['l', 'r'], [1, 2]),
       make.joints(3, ['arm'], [9.0]), make.joints(4, ['r', 'l'], [4, 3])],
      {'odometer__field': 'position[l]'}, [1, 3], 'names: arm')])
-def test_messages_without_the_wheel_are_left_out_and_counted(messages, more, values, trouble):
+def test_messages_without_the_wheel_are_omitted_and_counted(messages, more, values, trouble):
     found, reader = read('odometer', messages, **more)
     assert found['odometer'].value.tolist() == values
     assert found['odometer'].stamp_ns.tolist() == [2, 4]
@@ -180,7 +180,7 @@ def test_messages_without_the_wheel_are_left_out_and_counted(messages, more, val
 
 
 @pytest.mark.parametrize(('slot', 'value'), [('odometer', 1.0), ('odometer_right', 2.0)])
-def test_of_two_joints_on_a_topic_of_one_side_that_side_is_taken(slot, value):
+def test_the_joint_of_the_side_of_the_topic_is_used_if_it_has_both(slot, value):
     found, _ = read(slot, [make.joints(1, ['l_wheel', 'r_wheel'], [1, 2])], **BOTH)
     assert found[slot].value.tolist() == [value]
 
@@ -194,7 +194,7 @@ def test_a_joint_may_have_any_name(name):
 
 def test_two_wheels_as_a_list_are_left_and_right():
     assert config(odometer__wheels=('l', 'r')).odometer.names(2) == ('left', 'right')
-    # a list of indices is one of numbers in YAML
+    # YAML reads a list of indices as numbers
     assert config(odometer__wheels=[0, 1]).odometer.keys == ('0', '1')
 
 
@@ -202,7 +202,7 @@ def test_two_wheels_as_a_list_are_left_and_right():
     ('wheels[0].ticks', 10, COUNTER), ('wheels[1].ticks', 20.5, SPEED),
     ('wheel', 'its fields are header, wheels', None),
     ('wheels', 'is not a number but list', None)])
-def test_foreign_type_by_field_path(field, value, form):
+def test_a_field_of_a_foreign_type_is_read_by_its_path(field, value, form):
     class Ticks:
         __dataclass_fields__ = {'header': 0, 'wheels': 0}
 
@@ -236,16 +236,16 @@ LEFT, RIGHT, LIST, FIELD = (f'odometer__{name}' for name in ('left', 'right', 'w
     ('odometer', JOINTS, {LIST: tuple('abcdefghi')}, BadConfig, '8 at most'),
     ('odometer', JOINTS, {LIST: ('a', 'a')}, BadConfig, "'a', 'a'; required: different wheels"),
     ('odometer', JOINTS, {LEFT: 'a', RIGHT: 'a'}, BadConfig, 'required: different wheels')])
-def test_refused(slot, msgtype, settings_, error, words):
+def test_unsupported_types_and_settings_are_refused(slot, msgtype, settings_, error, words):
     with pytest.raises(error, match=words):
         make_reader(slot, msgtype, config(**settings_))
 
 
-def test_short_type_name_is_understood():
+def test_a_short_type_name_is_accepted():
     assert make_reader('imu', 'sensor_msgs/Imu', Config()).msgtype == 'sensor_msgs/msg/Imu'
 
 
-def test_damaged_messages_are_left_out_and_counted():
+def test_damaged_messages_are_omitted_and_counted():
     good = make.cdr(make.imu(1))
     text = 'a message of {} bytes cannot be read as sensor_msgs/msg/Imu: {}'.format
     stamp, frame = (f'too short or damaged from header.{x} on' for x in ('stamp.sec', 'frame_id'))
@@ -263,7 +263,7 @@ def test_damaged_messages_are_left_out_and_counted():
     assert reader.rows([bad], [1], make.deserializer('sensor_msgs/msg/Imu')) == []
 
 
-def test_a_joint_no_message_has_gives_no_rows_but_the_reason():
+def test_a_missing_joint_gives_no_rows_and_the_reason():
     found, reader = read('odometer', [make.joints(1, ['a'], [1.0])],
                          odometer__field='velocity[b]')
     assert found == {}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages in blocks, one by one and as plain numbers: the same rows, to the last bit."""
+"""Messages in blocks, single and as plain numbers give identical rows."""
 
 import dataclasses
 import importlib
@@ -82,7 +82,7 @@ def drawn(which, data):
     """Return serialised messages, their type, and a function that makes a reader of them."""
     messages, changes = MESSAGES[which]
     stream = data.draw(st.lists(messages, min_size=1, max_size=20))
-    # big endian has no layout: such rows go through deserialize amid the others
+    # big-endian messages have no layout: they are deserialised among the others
     raws = [make.cdr(m, data.draw(st.sampled_from([True, True, True, False]))) for m in stream]
     slot, msgtype = which.split()[0], stream[0].__msgtype__
     return raws, msgtype, lambda: make_reader(slot, msgtype, with_settings(Config(), changes))
@@ -92,7 +92,7 @@ def drawn(which, data):
 @settings(max_examples=40, deadline=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_chopping_gives_the_rows_of_single_messages(which, monkeypatch, data):
+def test_any_division_into_blocks_gives_the_rows_of_single_messages(which, monkeypatch, data):
     raws, msgtype, new_reader = drawn(which, data)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(raws)), max_size=4)))
     times = [10 + i for i in range(len(raws))]
@@ -128,7 +128,7 @@ def test_readings_are_the_rows_in_plain_numbers(which, data):
     assert read('readings') == read('rows')
 
 
-def test_readings_of_an_imu_without_force_have_none():
+def test_readings_of_an_imu_without_accelerometer_have_nan_forces():
     message = make.imu(7, f=(4, 5, 6))
     message.linear_acceleration_covariance = np.array([-1.0] + [0.0] * 8)
     reader = make_reader('imu', message.__msgtype__, Config())
@@ -138,8 +138,8 @@ def test_readings_of_an_imu_without_force_have_none():
         assert np.isnan(f_i).all()
 
 
-def test_alike_messages_are_read_without_arrays(monkeypatch):
-    """The property above would hold if readings were always made of rows."""
+def test_messages_of_equal_layout_are_read_without_arrays(monkeypatch):
+    """The property above would also hold if readings were always made from rows."""
     for slot, message, row in (
             ('imu', make.imu(7, w=(1, 2, 3), f=(4, 5, 6)), (7, 1, (1, 2, 3), (4, 5, 6))),
             ('odometer', make.whole(3), (1, 1, 3)),
@@ -153,8 +153,8 @@ def test_alike_messages_are_read_without_arrays(monkeypatch):
             assert reader.readings([raw], [1], None)[0][1] == [row]
 
 
-def test_a_layout_is_remembered_for_messages_that_have_it():
-    """Not for one that is cut off, nor for one of other lengths; and found again after those."""
+def test_a_layout_is_reused_for_messages_of_the_same_lengths():
+    """Truncated messages and messages of other lengths do not use it; later ones find it again."""
     raws = [make.cdr(make.imu(1, frame=frame)) for frame in ('imu', 'other', 'six')]
     first, other, again = (cdr.layout_of(make.imu(1).__msgtype__, raw) for raw in raws)
     assert first.size == len(raws[0])
@@ -166,8 +166,8 @@ def test_a_layout_is_remembered_for_messages_that_have_it():
         assert cdr.layout_of(make.imu(1).__msgtype__, raw[:-1]) is None
 
 
-def test_layouts_do_read_columns():
-    """The property above would hold if the block path never ran: here it must."""
+def test_layouts_are_used_to_read_columns():
+    """The property above would also hold if layouts were never used."""
     for slot, message in (('imu', make.imu(1)), ('fix', make.fix(1, 2, 3)),
                           *(('odometer', one) for one in (
                               make.joints(1, ['a'], [1]), make.odometry(1, 2), make.whole(3),
@@ -178,7 +178,7 @@ def test_layouts_do_read_columns():
         assert len(block.stamp_ns) == 50
 
 
-def test_a_recorder_gets_one_leg_from_any_blocks():
+def test_the_leg_of_a_recorder_does_not_depend_on_the_block_size():
     raws = [make.cdr(make.imu(10**9 * i, w=(i, 0, 0), frame='x' * (i % 3))) for i in range(20)]
     legs = []
     for size in (1, 7, 20):
@@ -196,7 +196,7 @@ def test_a_recorder_gets_one_leg_from_any_blocks():
     make.joints(1, ['l', 'right'], [], [1.0, 2.0]), make.joints(1, ['l'], [1.0], []),
     make.whole_array([1, 2], labels=['abc']), make.odometry(1, 2.5, 'b'), make.twist(1.0),
     make.twist_covariance(1, 2.0)], ids=lambda m: m.__msgtype__)
-def test_what_rclpy_serialises_has_the_same_layout(message):
+def test_messages_serialised_by_rclpy_have_the_same_layout(message):
     serialization = pytest.importorskip('rclpy.serialization')
     package, _, name = message.__msgtype__.split('/')
     ros = getattr(importlib.import_module(f'{package}.msg'), name)
@@ -212,7 +212,7 @@ def test_what_rclpy_serialises_has_the_same_layout(message):
         [big], [5], lambda raw: serialization.deserialize_message(raw, ros)))
 
 
-def test_a_nan_that_signals_is_one_in_silence():
+def test_a_signalling_nan_is_read_without_a_floating_point_error():
     position = np.zeros((2, 3))
     position.view(np.uint64)[1] = 0x7ff0000000000001
     ns = np.zeros(2, np.int64)

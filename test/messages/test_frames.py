@@ -45,7 +45,7 @@ def read(frames, pieces=(), frame_id='', little_endian=True):
 
 
 @pytest.mark.parametrize('little_endian', [True, False])
-def test_one_frame_is_used_however_the_stream_is_chopped(little_endian):
+def test_one_frame_is_used_for_any_division_into_blocks(little_endian):
     frames = ['front', 'rear_imu'] * 10
     whole, reader = read(frames, little_endian=little_endian)
     assert reader.frame == 'front'
@@ -64,7 +64,7 @@ def test_one_frame_is_used_however_the_stream_is_chopped(little_endian):
                 assert one.tobytes() == other.tobytes()
 
 
-def test_a_damaged_frame_decides_nothing_and_one_that_is_set_is_used_at_once():
+def test_a_damaged_frame_is_ignored_and_a_configured_frame_is_used():
     found, reader = read(['x\x07', *['front'] * 9])
     assert reader.frame == 'front'
     assert found.keys() == {'imu'}
@@ -149,7 +149,7 @@ def places(reach, n=200):
 
 
 @pytest.mark.parametrize('latitude_deg', [-85.0, -33.0, 0.0, 48.0, 85.0])
-def test_a_local_frame_is_a_tangent_plane_as_proj_has_it(latitude_deg):
+def test_a_local_frame_is_a_tangent_plane_as_in_proj(latitude_deg):
     position = places(10_000.0)
     lat, lon, height = geodetic_of(position, latitude_deg)
     local = Transformer.from_pipeline(
@@ -160,24 +160,24 @@ def test_a_local_frame_is_a_tangent_plane_as_proj_has_it(latitude_deg):
 
 
 @pytest.mark.parametrize('latitude_deg', [-33.0, 0.0, 48.0])
-def test_the_core_sees_every_distance_as_the_frame_has_it(latitude_deg):
+def test_distances_in_n_equal_those_in_the_local_frame(latitude_deg):
     position = places(10_000.0)
     geodetic = np.stack(geodetic_of(position, latitude_deg), -1)
-    position_n = Origin(*geodetic[7]).to_n(geodetic)       # the core's frame has another origin
+    position_n = Origin(*geodetic[7]).to_n(geodetic)       # n has another origin
     for row in (0, 5, 9):
         own, core = (np.linalg.norm(p - p[row], axis=1) for p in (position, position_n))
         assert np.abs(core - own).max() < TENTH_MM
 
 
-def test_a_z_of_zero_is_no_height():
+def test_a_z_of_zero_is_not_a_height():
     """2D SLAM and AMCL do not measure it."""
     _, _, height = geodetic_of(np.array([[3.0, 4.0, 0.0], [3.0, 4.0, 1e-3]]), math.nan)
     assert np.isnan(height[0])
     assert height[1] == pytest.approx(1e-3, abs=1e-5)    # 5 m from the origin: 2 um above it
 
 
-def test_a_frame_at_the_equator_has_an_origin_too():
-    """There latitude and longitude zero would mean 'no position'."""
+def test_a_local_frame_at_the_equator_gives_positions():
+    """Latitude 0 and longitude 0 together would mean 'no position'."""
     block = fixes_of([make.pose(1, (0.0, 0.0, 0.0))], reference__latitude_deg=0.0)
     assert has_position(block).all()
 
@@ -197,7 +197,7 @@ def test_each_type_gives_its_position_and_no_covariance(message):
     assert covariance[0, 0, 0] == 2.5**2
 
 
-def test_a_stated_covariance_is_the_block_of_the_position():
+def test_the_covariance_is_the_position_block_of_the_message():
     whole = np.diag([0.04, 0.09, 0.25, 7.0, 8.0, 9.0])
     whole[0, 1] = whole[1, 0] = 0.01
     block = fixes_of([make.pose_covariance(1, (1, 2, 3), whole)])
@@ -206,20 +206,20 @@ def test_a_stated_covariance_is_the_block_of_the_position():
     np.testing.assert_array_equal(covariance[0], whole[:3, :3])
 
 
-def test_an_odometry_as_reference_is_its_pose():
+def test_an_odometry_message_as_reference_gives_its_pose():
     block = fixes_of([make.odometry(1, 9.0)])                   # its covariance is 0, 1, 2 .. 35
     assert block.covariance_n[0].tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]]
     np.testing.assert_allclose(local(block), [[1.0, 2.0, 3.0]], atol=TENTH_MM)
 
 
-def test_map_coordinates_and_nan_are_no_positions():
+def test_map_coordinates_and_nan_are_not_positions():
     far = (LARGEST_FRAME + 1.0, 0.0, 0.0)
     block = fixes_of([make.pose(1, (500_000.0, 5_300_000.0, 300.0)), make.pose(2, far),
                       make.pose(3, (math.nan, 0.0, 0.0)), make.pose(4, (1.0, 2.0, 3.0))])
     assert has_position(block).tolist() == [False, False, False, True]
 
 
-def test_other_types_are_refused_with_those_that_serve():
+def test_other_types_are_refused_with_the_supported_types():
     with pytest.raises(BadData, match='sensor_msgs/msg/NavSatFix or gps_msgs/msg/GPSFix or '
                        'gps_common/msg/GPSFix or geometry_msgs/msg/PoseStamped'):
         make_reader('fix', 'sensor_msgs/msg/Imu', Config())

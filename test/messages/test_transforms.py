@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""TF as a reference: chains are those of scipy's rotations, and blocks leave no trace."""
+"""TF as a reference: chains agree with scipy, and blocks do not change the result."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def expected(t):
     return rotation.apply(place) + shift
 
 
-def test_a_chain_is_that_of_another_program():
+def test_a_chain_of_transforms_agrees_with_scipy():
     stamps, places = read(reader())
     t = stamps[0] / NS
     inside = T_MAP[1:]      # the first may be old
@@ -113,7 +113,7 @@ def test_a_chain_is_that_of_another_program():
 @pytest.mark.parametrize('block', [1, 7, 100])
 @pytest.mark.parametrize('static_after', [0, 3])
 @pytest.mark.parametrize('moving', [MOVING, SLOW, THREE], ids=['fast', 'slow', 'three'])
-def test_blocks_and_the_arrival_of_static_transforms_leave_no_trace(block, static_after, moving):
+def test_blocks_and_late_static_transforms_change_no_position(block, static_after, moving):
     plain = read(reader(), moving)
     others = read(reader(), moving, block=block, static_after=static_after)
     for a, b in zip(plain, others, strict=True):
@@ -132,7 +132,7 @@ def test_other_encodings_give_the_same_bits():
     assert plain[1] == pytest.approx(read(reader(), slashed)[1], abs=1e-9)
 
 
-def test_a_single_transform_is_a_pose():
+def test_a_single_transform_gives_the_position_of_a_pose():
     place = np.array([[1.0, 2.0, 0.5], [-3.0, 4.0, 0.0]])
     sent = [(NS * k, message(make.transform(NS * k, p, 'robot', 'world')))
             for k, p in enumerate(place, 1)]
@@ -143,7 +143,7 @@ def test_a_single_transform_is_a_pose():
         'latitude', 'longitude', 'height')]).tobytes()
 
 
-def test_no_position_in_a_gap_and_none_twice():
+def test_gaps_give_no_positions_and_repetitions_no_duplicates():
     gap = [(at, m) for at, m in MOVING if m.transforms[0].child_frame_id != 'base_link'
            or not 2 * NS < at < 3 * NS]
     again = [pair for pair in gap for _ in range(2)]
@@ -153,8 +153,8 @@ def test_no_position_in_a_gap_and_none_twice():
     assert {1.8, 3.2} <= set(t.round(1))
 
 
-def test_a_correction_that_is_sent_again_gives_no_position():
-    """SLAM repeats its last correction; in between the robot moves by its wheels."""
+def test_a_repeated_correction_gives_no_position():
+    """SLAM repeats its last correction while odometry moves the robot."""
     held = raws((T_MAP, *BY_SLAM), (T_ODOM, *BY_WHEELS), *(
         (T_MAP + later, lambda t: corrections(T_MAP), 'odom', 'map') for later in (0.05, 0.15)))
     t = read(reader(), held)[0][0] / NS
@@ -165,7 +165,7 @@ def test_a_correction_that_is_sent_again_gives_no_position():
     assert 'without corrections the positions are odometry alone' in source.trouble
 
 
-def test_a_recording_that_starts_again_is_read_on():
+def test_a_recording_that_starts_again_is_read_to_its_end():
     at_once = read(reader())
     for block in (13, 10**9):
         twice = read(reader(), MOVING + MOVING, block=block)
@@ -178,14 +178,14 @@ def test_a_recording_that_starts_again_is_read_on():
      "received: 'base_link', 'map', 'odom'); set reference.frames"),
     (['world', 'prism'], STATIC, "no transform from world to prism: 'map' has no parent frame"),
     (['base_link', 'prism'], STATIC, 'all transforms from base_link to prism are static')])
-def test_why_there_is_no_position(frames, static, message_):
+def test_the_reason_for_missing_positions_is_reported(frames, static, message_):
     source = reader(**{'reference.frames': frames})
     read(source, MOVING[:50], static)
     assert source.unreadable == 50
     assert message_ in source.trouble
 
 
-def test_more_than_may_wait_is_read_in_one_block(monkeypatch):
+def test_a_block_may_exceed_the_number_of_waiting_transforms(monkeypatch):
     monkeypatch.setattr('odocal_ros.nav.frame_chain.MOST_WAITING', 25)
     assert read(reader())[1].tobytes() == read(reader(), block=1)[1].tobytes()
     assert len(read(reader())[0][0]) == len(T_MAP) - 1
@@ -206,7 +206,7 @@ def test_damaged_messages_are_counted_and_random_bytes_raise_nothing():
     assert source.trouble == 'damaged messages'
 
 
-def test_of_a_bag_both_topics_are_read(tmp_path):
+def test_both_tf_topics_of_a_bag_are_read(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', [
         *(('/tf', at, m) for at, m in MOVING[:200]), ('/tf_static', 2 * NS, STATIC)])
     recorder, source = LegRecorder(), reader()

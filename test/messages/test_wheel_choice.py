@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which joints are wheels: names of real robots, and names that tell nothing."""
+"""Choice of wheels by the names of joints: real robots, and names without information."""
 
 from dataclasses import replace
 
@@ -41,14 +41,14 @@ REAL = {
 
 
 @pytest.mark.parametrize('robot', REAL)
-def test_wheels_of_real_robots(robot):
+def test_the_wheels_of_real_robots_are_found(robot):
     names, pair = REAL[robot]
     found = select_wheels(names, len(names))
     assert (found.keys, found.sides) == (pair, True)
     assert pair[0] in found.explanation
 
 
-def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
+def test_all_wheels_of_several_axles_are_listed_and_a_long_list_is_shortened():
     names, _ = REAL['husky']
     assert select_wheels(names, 4).explanation.endswith(
         '; for all wheels set odometer.wheels to [front_left_wheel, front_right_wheel, '
@@ -61,12 +61,12 @@ def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
     (['steering_joint', 'drive_joint'], ('drive_joint',)),
     (['front_wheel', 'rear_wheel'], ('rear_wheel',)),       # the front wheel of a bicycle steers
 ])
-def test_one_wheel(names, keys):
+def test_a_single_wheel_is_found(names, keys):
     assert select_wheels(names, len(names)).keys == keys
 
 
 @pytest.mark.parametrize('names', [['a', 'b'], ['motor_1', 'motor_2', 'mast'], []])
-def test_two_of_unknown_sides(names):
+def test_two_wheels_of_unknown_sides_are_averaged(names):
     found = select_wheels(names, len(names) or 2)
     assert found.keys == tuple(names[:2] or '01')
     assert not found.sides
@@ -78,11 +78,11 @@ def test_two_of_unknown_sides(names):
     (['left_wheel_1', 'right_wheel_1', 'left_wheel_2', 'right_wheel_2'], 4),
     (['left_wheel', 'l_wheel', 'right_wheel'], 3),
     (['shoulder', 'elbow', 'wrist'], 3), (['steering'], 1), (['a', 'a'], 2), ([], 4), ([], 0)])
-def test_what_cannot_be_told_is_not_guessed(names, count):
+def test_an_ambiguous_choice_gives_an_explanation(names, count):
     assert isinstance(select_wheels(names, count), str)
 
 
-def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
+def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_reported():
     made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
     leg = made.leg()
     blind = replace(leg, form=replace(leg.form, sides=False, chosen='the mean is used'))
@@ -92,13 +92,13 @@ def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
     assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is used'
     both = calibrate(leg, config)
     assert both.methods['smoother'].estimates['scale_factor_left'].value is not None
-    # named, but a straight way does not tell whether rightly
+    # the names give the sides, but a straight path cannot confirm them
     assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('too few turns')
     assert result.methods['two_point'].estimates['scale_factor'].value == \
         both.methods['two_point'].estimates['scale_factor'].value
 
 
-def test_a_dead_wheel_of_unknown_side_is_still_seen():
+def test_a_dead_wheel_of_unknown_side_is_still_found():
     made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
     leg = made.leg()
     dead = replace(leg.odometer_right, value=leg.odometer_right.value * 0)
