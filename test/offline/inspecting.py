@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A planar drive with known faults, and what odocal inspect tells of a bag."""
+"""A planar drive with known faults, and the output of odocal inspect."""
 
 import json
 import math
@@ -31,8 +31,8 @@ def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=F
     """
     Return rows of a planar drive.
 
-    C_ib takes b to the IMU frame; gyro, accel: factors on what is sent; lag: s, added to the
-    fixes' stamps; loop: half way round a circle and back to the start.
+    C_ib rotates from b to the IMU frame; gyro, accel: factors of the sent values; lag: s, added to
+    the stamps of the fixes; loop: a full circle.
     """
     t, v, w, a = planar(seconds)
     if loop:
@@ -59,7 +59,7 @@ def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=F
 
 
 def inspect(path, capsys, *options):
-    """Return what the command tells, as JSON and as text."""
+    """Return the output of the command, as JSON and as text."""
     assert main(['inspect', str(path), '--json', *options]) == 0
     seen = json.loads(capsys.readouterr().out)
     assert main(['inspect', str(path), *options]) == 0

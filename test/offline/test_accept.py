@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal replay --accept; a calibration beside its truth: exit codes, precedence, texts."""
+"""odocal replay --accept, and calibrations compared with the truth: exit codes and texts."""
 
 import json
 
@@ -45,9 +45,9 @@ def run(tmp_path, capsys):
     return command
 
 
-def test_a_real_truth_is_compared_by_the_ratio_inside_accept():
+def test_a_real_drive_is_compared_by_the_scale_ratio_within_accept():
     scale, yaw = rows(calibration(ratio=1.0109, yaw_deg=1.9), REAL)
-    assert scale.agrees       # 4.1 sigmas off, yet inside what the reference itself allows
+    assert scale.agrees       # 4.1 sigmas, but within the limits of the reference
     assert yaw.agrees
     assert not rows(calibration(ratio=1.0111), REAL)[0].agrees
     assert not rows(calibration(ratio=1.008, yaw_deg=2.1), REAL)[1].agrees
@@ -60,7 +60,7 @@ def test_four_sigmas_are_the_limit(run, scale, code):
     assert ('DOES NOT AGREE' in out) == bool(code)
 
 
-def test_the_table_reads_well(run):
+def test_the_table_shows_values_with_sigmas(run):
     code, out, err = run(calibration(), SIMULATED)
     assert (code, err) == (0, '')
     assert '0.02130 ± 0.00010' in out
@@ -77,7 +77,7 @@ def test_the_table_reads_well(run):
     ('{', SIMULATED, 'c.json: '),
     (calibration(), 'a: [', 't.yaml: '),
     (None, SIMULATED, 'cannot be read')])
-def test_what_cannot_be_compared_is_said(run, content, truth, match):
+def test_unusable_files_give_one_line_and_exit_code_2(run, content, truth, match):
     code, out, err = run(content, truth)
     assert (code, out) == (2, '')
     assert match in err
@@ -100,8 +100,8 @@ def bag(tmp_path_factory):
     (1e-3, 3e-3, [], 1, 'FAIL'),
     (-1e-6, 1e-6, [], 1, 'UNDECIDED'),
     (-1e-3, 1e-3, ['--strict'], 1, 'UNDECIDED')])
-def test_the_exit_code_and_one_line_of_json_tell_the_decision(bag, low, high, options, code,
-                                                             decision, tmp_path, capsys):
+def test_exit_code_and_a_json_line_give_the_decision(bag, low, high, options, code, decision,
+                                                     tmp_path, capsys):
     path, made = bag
     true = made.truth.scale_ratio
     argv = ['replay', str(path), '--method', 'two_point', '--set', 'vehicle=bus 7', '--set',
@@ -123,7 +123,7 @@ def test_the_exit_code_and_one_line_of_json_tell_the_decision(bag, low, high, op
         assert decision in lines
 
 
-def test_strict_alone_has_a_caution_exit_with_one(bag, tmp_path):
+def test_strict_without_accept_exits_with_1_for_a_caution(bag, tmp_path):
     argv = ['replay', str(bag[0]), '--method', 'two_point', '--quiet', '--output', str(tmp_path),
             '--set', 'output.formats=[legs]']
     assert main(argv) == 0

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odocal command as a person meets it: exit codes, one line, progress, doctor, ros2 odocal."""
+"""The odocal command: exit codes, one-line errors, progress, doctor, ros2 odocal."""
 
 import argparse
 from importlib import import_module
@@ -22,7 +22,7 @@ from odocal_ros.errors import BadBag
 from odocal_ros.offline import cli, doctor
 
 pytestmark = pytest.mark.core
-# what this package has itself, of others it knows the names
+# commands of this package; it knows only the names of others
 OWN = [name for name, (home, _) in cli.COMMANDS.items() if home.startswith('odocal_ros.')]
 SETUP = Path(__file__).resolve().parents[2] / 'setup.py'
 CODE = """
@@ -37,7 +37,7 @@ print('the result')
 """
 
 
-def test_help_of_everything_is_there_and_no_command_fails(capsys):
+def test_every_command_has_help_and_a_missing_command_fails(capsys):
     for argv in (['--help'], *([c, '--help'] for c in OWN)):
         with pytest.raises(SystemExit) as end:
             cli.main(argv)
@@ -47,7 +47,7 @@ def test_help_of_everything_is_there_and_no_command_fails(capsys):
     assert 'replay' in capsys.readouterr().out
 
 
-def test_a_full_disk_is_a_sentence_and_exit_2():
+def test_a_full_disk_gives_one_line_and_exit_code_2():
     with open('/dev/full', 'w') as full:
         done = subprocess.run([sys.executable, '-m', 'odocal_ros.offline.cli', 'doctor'],
                               stdout=full, stderr=subprocess.PIPE, text=True)
@@ -58,7 +58,7 @@ def test_a_full_disk_is_a_sentence_and_exit_2():
 
 @pytest.mark.parametrize('argv', [
     ['fly'], ['replay'], ['replay', 'x', '--nonsense'], ['replay', 'x', '--method', 'magic']])
-def test_wrong_use_is_one_line_and_exit_2(argv, capsys):
+def test_wrong_use_gives_one_line_and_exit_code_2(argv, capsys):
     assert cli.main(argv) == 2
     err = capsys.readouterr().err
     assert err.count('\n') == 1
@@ -70,7 +70,7 @@ def test_wrong_use_is_one_line_and_exit_2(argv, capsys):
 
 @pytest.mark.parametrize(('error', 'code'), [
     (BadBag('x.db3: empty'), 2), (KeyboardInterrupt(), 130), (ZeroDivisionError('oops'), 3)])
-def test_errors_are_one_line_with_their_exit_code(error, code, monkeypatch, capsys):
+def test_errors_give_one_line_and_their_exit_code(error, code, monkeypatch, capsys):
     def run(args):
         raise error
     monkeypatch.setattr(import_module(cli.COMMANDS['replay'][0]), 'run', run)
@@ -82,7 +82,7 @@ def test_errors_are_one_line_with_their_exit_code(error, code, monkeypatch, caps
         assert 'ZeroDivisionError: oops' in Path(err.split()[-1]).read_text()
 
 
-def test_the_package_run_as_a_module_is_the_command():
+def test_the_package_runs_as_a_module():
     result = subprocess.run([sys.executable, '-m', 'odocal_ros', '--version'], text=True,
                             capture_output=True, check=True)
     assert result.stdout == f'odocal_ros {__version__}\n'
@@ -107,7 +107,7 @@ def shown(capsys):
     return code, {name: text.strip() for name, text in rows.items()}
 
 
-def test_what_is_installed_and_what_is_lacking_is_shown(capsys, tmp_path, monkeypatch):
+def test_doctor_shows_installed_and_missing_packages(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     monkeypatch.setenv('SOME_TOKEN', 'a secret')
     code, rows = shown(capsys)
@@ -135,7 +135,7 @@ def ros2(*argv):
     name, module, attribute = re.fullmatch(r'(\w+) = ([\w.]+):(\w+)', group).groups()
     extension = getattr(import_module(module), attribute)()
     extension.NAME = name
-    assert inspect.getdoc(extension)        # of which the first line is the help
+    assert inspect.getdoc(extension)        # its first line is the help
     parser = argparse.ArgumentParser(prog='ros2')
     commands = parser.add_subparsers()
     own = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -147,7 +147,7 @@ def ros2(*argv):
     return extension.main(parser=parser, args=parser.parse_args(argv))
 
 
-def test_all_words_reach_the_command(monkeypatch):
+def test_all_arguments_reach_the_command(monkeypatch):
     calls = []
     monkeypatch.setattr(cli, 'main', lambda argv: calls.append(argv) or 5)
     words = ['replay', 'a bag', '--imu-topic', '/imu', '--set', 'a=b', '--help']
@@ -161,14 +161,14 @@ def test_help_lists_the_commands_and_errors_are_those_of_odocal(capsys):
     assert stopped.value.code == 0
     out = capsys.readouterr().out
     assert all(re.search(rf'^  {name} +\w', out, re.MULTILINE) for name in cli.COMMANDS)
-    assert ros2('odocal') == 2          # its help
+    assert ros2('odocal') == 2          # shows its help
     assert 'usage: odocal' in capsys.readouterr().out
     assert ros2('odocal', 'replay') == 2
     assert capsys.readouterr().err.startswith('odocal replay: ')
 
 
 def run(quiet=False):
-    """Return what goes to the output, and to the error stream, which is a terminal."""
+    """Return the text on stdout, and on stderr, which is a terminal."""
     master, slave = pty.openpty()
     child = subprocess.Popen([sys.executable, '-c', CODE.format(quiet=quiet)], text=True,
                              stdout=subprocess.PIPE, stderr=slave)
@@ -185,20 +185,20 @@ def run(quiet=False):
     return out, shown.decode()
 
 
-def test_a_terminal_shows_each_phase_and_is_left_clean():
+def test_a_terminal_shows_each_phase_and_the_line_is_erased():
     out, shown = run()
     assert out == 'the result\n'
     for part in ('reading town', '25 %', 'leg 2 of 2', '50 %', 'drawing the report'):
         assert part in shown, part
     *_, last = (line for line in shown.split('\r') if 'smoother' in line)
     assert '%' not in last
-    assert shown.split('\r')[-1].strip() == ''      # the line is wiped
+    assert shown.split('\r')[-1].strip() == ''      # the line is erased
     assert '\n' not in shown.replace('\r\n', '')
 
 
-def test_quiet_is_quiet_and_a_pipe_stays_clean():
+def test_quiet_and_pipes_show_no_progress():
     assert run(quiet=True)[1].count('reading') == 0
-    # a file or pipe as the error stream gets nothing at all
+    # nothing is written if stderr is a file or a pipe
     done = subprocess.run([sys.executable, '-c', CODE.format(quiet=False)], text=True,
                           capture_output=True, timeout=60)
     assert (done.stdout, done.stderr) == ('the result\n', '')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal compare: changes against sigmas, one line for what is no calibration."""
+"""odocal compare: changes relative to sigmas, and one line for an invalid calibration."""
 
 import copy
 import json
@@ -22,7 +22,7 @@ START = 10**18
 
 
 def content(scale=0.02, sigma=3e-6, yaw=0.01, verdict='accepted', start=START, **more):
-    """Return what a calibration.json holds, as far as it is read."""
+    """Return the parts of calibration.json that are read."""
     result = {'scale_factor': ENTRY | {'value': scale, 'sigma': sigma},
               'scale_ratio': {'value': scale / 0.019, 'sigma': sigma / 0.019, 'unit': '1',
                               'method': 'two_point'},
@@ -75,7 +75,7 @@ def test_a_change_is_measured_in_sigmas_of_the_difference(compare):
     assert whole['sentence'].endswith(CAUSES['scale'])
 
 
-def test_a_yaw_about_half_a_turn_changes_by_the_short_way(compare):
+def test_a_yaw_change_across_180_deg_is_the_smaller_angle(compare):
     _, _, found = changes(compare, content(yaw=math.pi - 1e-4),
                           content(yaw=1e-4 - math.pi, start=2 * START))
     assert found['yaw_mounting_angle'][1]['to_first']['change'] == pytest.approx(2e-4)
@@ -87,7 +87,7 @@ def test_a_yaw_about_half_a_turn_changes_by_the_short_way(compare):
     (0.02 - 2e-10, 0.0, '+0 % (+0.0 sigma)'),
     (0.02, 0.1, 'fix delay changed by +0.1 s'),
     (0.02, 0.1, 'a driver, bus or receiver has other settings')])
-def test_a_change_is_told_with_its_cause(compare, scale, delay, words):
+def test_a_change_is_reported_with_its_likely_cause(compare, scale, delay, words):
     def late(value, **more):
         one = content(**more)
         one['result']['gnss_delay'] = {'value': value, 'sigma': 1e-3, 'unit': 's',
@@ -107,7 +107,7 @@ def test_three_sigma_is_the_limit(compare, sigmas, code):
     assert ('no change beyond 3 sigma' in found[1]) == (code == 0)
 
 
-def test_the_first_and_the_one_before_are_told_apart(compare):
+def test_changes_since_the_first_and_since_the_previous_are_separate(compare):
     # a slow drift: each step 2.4 sigma, both together 4.7
     steps = [content(0.02 + i * 10e-6, start=(i + 1) * START) for i in range(3)]
     code, _, found = changes(compare, *steps)
@@ -120,8 +120,8 @@ def test_the_first_and_the_one_before_are_told_apart(compare):
     assert compare(*steps[:2])[0] == 0
 
 
-def test_what_shared_errors_would_take_off_is_told_but_not_taken(compare):
-    # sigma 0.004 each, 0.0032 of it the heading's: own 0.0024, of the difference 0.0034
+def test_sigmas_without_shared_errors_are_reported_but_not_used(compare):
+    # sigma 0.004 each, 0.0032 of it due to the heading: own 0.0024, difference 0.0034
     code, whole, found = changes(compare, content(), content(yaw=0.022, start=2 * START))
     change = found['yaw_mounting_angle'][1]['to_first']
     assert change['sigmas'] == pytest.approx(0.012 / (0.004 * 2**0.5))
@@ -136,7 +136,7 @@ def test_what_shared_errors_would_take_off_is_told_but_not_taken(compare):
     assert 'yaw mounting is 3.5 sigma if' in text
 
 
-def test_a_rejected_calibration_is_shown_and_not_judged(compare):
+def test_a_rejected_calibration_is_shown_but_not_compared(compare):
     bad = content(0.03, verdict='rejected', start=2 * START)
     code, whole, found = changes(compare, content(), bad, content(start=3 * START))
     assert code == 0
@@ -148,7 +148,7 @@ def test_a_rejected_calibration_is_shown_and_not_judged(compare):
     assert 'nothing to compare' in out
 
 
-def test_what_belongs_to_a_drive_or_another_nominal_mounting_is_not_compared(compare):
+def test_gyro_biases_and_yaws_of_other_nominal_mountings_are_not_compared(compare):
     first = content()
     turned = content(yaw=0.5, start=2 * START, config={'imu.mounting_rpy': [0.0, 0.0, 1.0]})
     for bias, one in ((1e-3, first), (2e-3, turned)):
@@ -160,12 +160,12 @@ def test_what_belongs_to_a_drive_or_another_nominal_mounting_is_not_compared(com
     assert 'imu.mounting_rpy differs' in whole['notes'][0]
 
 
-def test_one_drive_twice_is_said(compare):
+def test_two_calibrations_of_the_same_drive_are_reported(compare):
     assert 'the same drive' in compare(content(), content())[1]
     assert 'the same drive' not in compare(content(), content(start=2 * START))[1]
 
 
-def test_a_zero_or_unknown_sigma_is_no_judgement(compare):
+def test_a_zero_or_unknown_sigma_gives_no_number_of_sigmas(compare):
     for sigma in (0.0, None):
         pair = [content(start=START), content(0.021, start=2 * START)]
         for one in pair:
@@ -188,7 +188,7 @@ def test_every_compared_name_has_a_cause():
 
 
 def broken(path, value):
-    """Return a content with one place changed or, by ..., taken out."""
+    """Return a content with one entry changed, or removed if value is ``...``."""
     one = copy.deepcopy(content())
     *keys, last = path
     place = one
@@ -217,7 +217,7 @@ def broken(path, value):
     (json.dumps(content()).replace('3e-06', '1e999'), 'not a number'),
     (broken(['result', 'scale_factor', 'unit'], 3), 'unit'),
     (broken(['result', 'scale_factor', 'unit'], 'm/rad'), 'is in m/rad, in ')])
-def test_what_is_no_calibration_is_one_line_and_exit_2(compare, bad, word):
+def test_an_invalid_calibration_gives_one_line_and_exit_code_2(compare, bad, word):
     code, out, err = compare(content(), bad)
     assert code == 2
     assert out == ''
@@ -226,7 +226,7 @@ def test_what_is_no_calibration_is_one_line_and_exit_2(compare, bad, word):
     assert 'b.json' in err
 
 
-def test_a_device_is_not_read_without_end():
+def test_a_device_is_read_only_up_to_the_limit():
     with pytest.raises(LimitReached, match='/dev/zero: the text exceeds the limit'):
         read_stored(Path('/dev/zero'))
 
@@ -236,11 +236,11 @@ def test_a_device_is_not_read_without_end():
     (['methods', 'two_point', 'budget', 'initial_heading'], []),
     (['methods', 'two_point', 'budget', 'initial_heading', 'yaw_mounting_angle'], None),
     (['legs'], [3]), (['inputs'], [None]), (['result', 'scale_factor', 'method'], ['x'])])
-def test_what_is_only_helpful_may_be_missing(compare, path, value):
+def test_optional_entries_may_be_missing(compare, path, value):
     assert compare(content(), broken(path, value))[0] == 0
 
 
-def test_missing_files_and_single_ones(tmp_path, capsys):
+def test_missing_files_and_a_single_file_are_refused(tmp_path, capsys):
     assert main(['compare', str(tmp_path / 'a'), str(tmp_path / 'b')]) == 2
     assert 'No such file' in capsys.readouterr().err
     assert main(['compare', str(tmp_path), str(tmp_path)]) == 2
@@ -248,7 +248,7 @@ def test_missing_files_and_single_ones(tmp_path, capsys):
     (tmp_path / 'calibration.json').write_text(json.dumps(content()))
     assert main(['compare', str(tmp_path)]) == 2
     assert 'two or more' in capsys.readouterr().err
-    assert main(['compare', str(tmp_path), str(tmp_path)]) == 0      # a folder will do
+    assert main(['compare', str(tmp_path), str(tmp_path)]) == 0      # a folder
     (tmp_path / 'raw').write_bytes(b'\xff\xfe')
     assert main(['compare', str(tmp_path), str(tmp_path / 'raw')]) == 2
     assert capsys.readouterr().err.count('\n') == 1

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults that are not the user's, bags that attack by their names: one line, and what is left."""
+"""Internal errors, failing hardware, and bags with hostile names: one-line errors and files."""
 
 import errno
 import json
@@ -30,7 +30,7 @@ def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('bag') / 'bag', drive_topics(made))
 
 
-def test_a_method_that_breaks_leaves_a_trace_file(bag, tmp_path, monkeypatch, capsys):
+def test_a_method_with_an_internal_error_leaves_a_trace_file(bag, tmp_path, monkeypatch, capsys):
     def breaks(prepared, passed):
         raise ZeroDivisionError('by nothing')
     monkeypatch.setitem(leg_methods.METHODS, 'smoother', breaks)
@@ -46,7 +46,7 @@ def test_a_method_that_breaks_leaves_a_trace_file(bag, tmp_path, monkeypatch, ca
     assert 'in breaks' in trace
 
 
-def test_a_disk_that_cannot_give_a_page(bag, monkeypatch, capsys):
+def test_a_read_error_of_the_disk_is_reported_in_one_line(bag, monkeypatch, capsys):
     given, count = os.pread, [0]
 
     def pread(handle, size, at):
@@ -60,8 +60,8 @@ def test_a_disk_that_cannot_give_a_page(bag, monkeypatch, capsys):
     assert error == f'odocal: {bag}/bag.mcap: Input/output error'
 
 
-def test_memory_that_runs_out_is_called_so(bag):
-    """Not an empty bag, not a damaged one: the limit of the process is met while it is read."""
+def test_exhausted_memory_is_reported_as_such(bag):
+    """The error is neither an empty nor a damaged bag: memory is exhausted during reading."""
     script = ('import resource, sys\n'
               'from odocal_ros.offline.cli import main\n'
               'import odocal_ros.bagio.mcap_file as m, odocal_ros.offline.inspect_bag\n'
@@ -86,7 +86,7 @@ def evil(tmp_path_factory):
                       encode.fix('/a\ntouch ran\x1b[2J', made.fix)])
 
 
-def test_replay_of_a_bag_of_evil_names_writes_and_says_nothing_that_acts(
+def test_replay_escapes_hostile_names_in_output_and_files(
         evil, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(['replay', str(evil), *FIX, '--set', 'alignment.heading=0.7', '--set',
@@ -104,14 +104,14 @@ def test_replay_of_a_bag_of_evil_names_writes_and_says_nothing_that_acts(
     assert list(result) == ['/**']
 
 
-def test_what_is_said_of_it_is_one_line(evil, tmp_path, capsys):
+def test_errors_with_hostile_names_are_one_line(evil, tmp_path, capsys):
     for argv in (['replay', str(evil)], ['replay', str(evil), *FIX, '--imu-topic', '/no\x1b[2J'],
                  ['replay', str(evil.parent / 'no\nsuch\x1b[2J')],
                  ['inspect', str(evil / 'x\ny')]):
         assert main(argv) == 2
         out, err = capsys.readouterr()
         assert out == ''
-        first, *listed = err.splitlines()      # of the bag's topics, each on its line
+        first, *listed = err.splitlines()      # topics of the bag, one per line
         assert first.startswith('odocal: ')
         assert all(line.startswith('  /') for line in listed)
         assert err.replace('\n', '').isprintable()
@@ -122,7 +122,7 @@ def test_what_is_said_of_it_is_one_line(evil, tmp_path, capsys):
     assert '/a\\ntouch ran' in out
 
 
-def test_a_journal_that_names_an_evil_frame_is_refused_in_one_line(evil, tmp_path, capsys):
+def test_a_journal_with_a_hostile_frame_is_refused_in_one_line(evil, tmp_path, capsys):
     (evil / 'journal.yaml').write_text(
         '/**:\n  ros__parameters:\n    frames.imu: "x$(command y)"\n')
     try:

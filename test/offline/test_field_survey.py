@@ -63,7 +63,7 @@ def town(duration=240.0):
 
 
 def encoders(made, keep):
-    """Return the messages of a vehicle; keep: fields that are not left at zero."""
+    """Return the messages of a vehicle; keep: fields that are not set to zero."""
     kind, motor = (types().types[f'mycar_msgs/msg/{name}'] for name in ('Encoders', 'Motor'))
     left, right = made.odometer.value, made.odometer_right.value
     t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
@@ -100,7 +100,7 @@ def sigmas_off(content, name, truth):
     return abs(found['value'] - truth) / found['sigma']
 
 
-def test_two_counters_in_an_array_that_roll_over(tmp_path, capsys):
+def test_two_counters_of_an_array_are_found_across_rollovers(tmp_path, capsys):
     made = town(400.0)
     path = write(tmp_path / 'bag', made, encoders(made, ('ticks', 'speed_kmh')))
     found, text = inspected(path, capsys)
@@ -118,7 +118,7 @@ def test_two_counters_in_an_array_that_roll_over(tmp_path, capsys):
 @pytest.mark.parametrize(('field', 'quantity', 'factor'), [
     ('speed_kmh', 'rate', 1 / 3.6), ('delta', 'increment', None), ('motors', 'cumulative',
                                                                    1 / 0.31)])
-def test_a_field_of_each_meaning(tmp_path, capsys, field, quantity, factor):
+def test_rate_increment_and_cumulative_fields_are_found(tmp_path, capsys, field, quantity, factor):
     made = town()
     path = write(tmp_path / 'bag', made, encoders(made, (field,)))
     found, _ = inspected(path, capsys)
@@ -127,24 +127,24 @@ def test_a_field_of_each_meaning(tmp_path, capsys, field, quantity, factor):
     assert one['path'].startswith(field)
     assert one['quantity'] == quantity
     truth = factor or made.truth.wheel_scales[0]
-    assert one['scale'] == pytest.approx(truth, rel=0.02)      # the chords of cells of 4 s
+    assert one['scale'] == pytest.approx(truth, rel=0.02)      # chords of intervals of 4 s
     content = replayed(found['command'], tmp_path / 'out')
     assert content['result']['scale_factor']['value'] == pytest.approx(truth, rel=0.005)
 
 
-def test_a_plain_number_that_does_not_follow_gives_way_to_a_field(tmp_path, capsys):
+def test_a_field_is_preferred_to_a_number_that_does_not_follow_the_fixes(tmp_path, capsys):
     made = town()
     path = write(tmp_path / 'bag', made, encoders(made, ('delta',)) + [
         ('/battery_voltage', stamp, make.real(24.0 + np.sin(stamp * 1e-9), 'Float32'))
         for stamp in made.odometer.stamp_ns.tolist()])
     found, _ = inspected(path, capsys)
     assert found['mapping']['odometer'] == '/encoders'
-    # named by the user, it stays
+    # a topic named by the user is kept
     found, _ = inspected(path, capsys, '--odometer-topic', '/battery_voltage')
     assert found['mapping']['odometer'] == '/battery_voltage'
 
 
-def test_of_autoware_the_speed_is_the_odometer_and_the_steering_is_not(tmp_path, capsys):
+def test_the_speed_of_autoware_is_the_odometer_and_the_steering_is_not(tmp_path, capsys):
     made = drive(scenario='town', duration=300.0, seed=4, imu_grade='tactical', fix_noise='rtk',
                  odometer='speed')
     velocity, steering = (types().types[f'autoware_vehicle_msgs/msg/{name}Report']
@@ -189,7 +189,7 @@ def test_wheels_are_the_joints_that_follow_the_fixes(tmp_path, capsys):
         assert sigmas_off(content, f'scale_factor_{side}', truth / 0.05) < 4
 
 
-def test_the_search_is_bounded():
+def test_the_number_of_searched_fields_and_messages_is_limited():
     kind = types().types['mycar_msgs/msg/Encoders']
     motor = types().types['mycar_msgs/msg/Motor']
     message = kind(header=make.header(0), ticks=np.zeros(4, np.uint16), messages=0,
@@ -218,7 +218,7 @@ def plain(path, made, *more, **changes):
                             counter('/odometer', made.odometer), *more])
 
 
-def test_a_limit_that_drops_most_fixes_is_lifted(tmp_path, capsys):
+def test_the_command_removes_a_sigma_limit_that_rejects_most_fixes(tmp_path, capsys):
     path = plain(tmp_path / 'bag', drive(scenario='town', duration=200.0, seed=4, fix_sigma=1.0))
     assert 'gnss.max_sigma' not in inspected(path, capsys)[0]['command']
     found, _ = inspected(path, capsys, '--set', 'gnss.max_sigma=0.5')
@@ -242,7 +242,7 @@ def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
     assert found['not_following'] == ['/vel']
 
 
-def test_without_messages_nothing_is_said_of_standing(tmp_path, capsys):
+def test_without_odometer_and_imu_standstills_are_not_mentioned(tmp_path, capsys):
     made = drive(scenario='town', duration=200.0, seed=4)
     _, text = inspected(write_bag(tmp_path / 'bag', [fix('/fix', made.fix)]), capsys)
     assert 'stand' not in text
@@ -264,7 +264,7 @@ def numbers(path, made, values):
 
 
 @pytest.mark.parametrize('kind', ['distance', 'speed'])
-def test_a_float_is_a_distance_or_a_speed_by_the_fixes(tmp_path, capsys, kind):
+def test_the_fixes_decide_whether_a_float_is_a_distance_or_a_speed(tmp_path, capsys, kind):
     """By its type a std_msgs/Float64 is a speed; a trip meter has the same type."""
     made = town()
     trip = (made.odometer.value + made.odometer_right.value) / 2 * made.truth.scale

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal inspect: it tells the truth about made drives with known faults."""
+"""odocal inspect: findings on simulated drives with known faults."""
 
 import math
 import shlex
@@ -49,22 +49,22 @@ def test_a_good_drive_lacks_only_a_heading(inspect_drive):
 @pytest.mark.parametrize('rpy', [
     (math.pi, 0, 0), (math.pi / 2, 0, -math.pi / 2), (0, math.pi / 2, 0), (0, 0, math.pi / 2),
     (0, 0, math.pi), (math.pi, 0, math.pi / 2)])
-def test_axes_are_told(inspect_drive, capsys, rpy):
+def test_the_axes_of_the_imu_are_found(inspect_drive, capsys, rpy):
     C_bi = matrix_from_rpy(rpy)
-    small = matrix_from_rpy((0.0, 0.05, 0.08))    # what calibration is for must not confuse it
+    small = matrix_from_rpy((0.0, 0.05, 0.08))    # small mounting angles do not matter
     seen, _ = inspect_drive(drive(C_ib=C_bi.T @ small.T))
     assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
     assert seen['mounting']['needed']
     assert seen['mounting']['deviation'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
     setting = shlex.split(seen['command'])[-1]
     assert setting.startswith('imu.mounting_rpy=[')
-    # set as seen, nothing is left to say about the axes
+    # with this setting there is no finding on the axes
     seen, _ = inspect(seen['path'], capsys, '--set', setting)
     assert codes(seen) == {'YAW_NOT_SEPARABLE'}
     assert not seen['mounting']['needed']
 
 
-def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(inspect_drive):
+def test_an_imu_turned_over_during_the_drive_is_not_a_wrong_unit(inspect_drive):
     upright, over = drive(), drive(C_ib=np.diag([1.0, -1.0, -1.0]))
     half = len(upright) // 2
     seen, text = inspect_drive(upright[:half] + over[half:])
@@ -74,7 +74,7 @@ def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(inspect_drive):
 
 @pytest.mark.parametrize('rpy', [(0, 0, 0), (math.pi, 0, 0)])
 def test_a_counter_that_counts_down_does_not_turn_the_imu(inspect_drive, rpy):
-    """Nobody drives a whole recording backwards; the IMU would be set 180 deg off."""
+    """A whole recording is not driven backwards; the IMU would be set wrong by 180 deg."""
     C_bi = matrix_from_rpy(rpy)
     seen, _ = inspect_drive([(name, ns, make.whole(-message.data) if name == '/odometer'
                               else message)
@@ -89,7 +89,7 @@ def test_a_counter_that_counts_down_does_not_turn_the_imu(inspect_drive, rpy):
     ({'gyro': 180 / math.pi}, 'IMU_UNITS', f'--set imu.gyro_scale={math.pi / 180!r}'),
     ({'gyro': 2.0}, 'IMU_UNITS', 'IMU_UNITS: turns by the gyro are 2.'),
     ({'gyro': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN'), ({'accel': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN')])
-def test_units_and_signs(inspect_drive, capsys, wrong, code, remedy_text):
+def test_wrong_units_and_signs_are_found(inspect_drive, capsys, wrong, code, remedy_text):
     seen, text = inspect_drive(drive(**wrong))
     assert code in codes(seen)
     assert remedy_text in ' '.join(text.split())
@@ -104,7 +104,7 @@ def test_units_and_signs(inspect_drive, capsys, wrong, code, remedy_text):
     ('/imu/data', 'NO_IMU', 'sensor_msgs/msg/Imu'),
     ('/odometer', 'NO_ODOMETER', 'std_msgs/msg/Int64'),
     ('/fix', 'NO_FIX', 'sensor_msgs/msg/NavSatFix')])
-def test_a_topic_whose_messages_cannot_be_read_is_missing(inspect_drive, name, code, kind):
+def test_a_topic_with_unreadable_messages_is_reported_as_missing(inspect_drive, name, code, kind):
     seen, text = inspect_drive([(topic, ns, b'' if topic == name else m) for topic, ns,
                                 m in drive(60)],
                                types={name: kind})
@@ -113,14 +113,14 @@ def test_a_topic_whose_messages_cannot_be_read_is_missing(inspect_drive, name, c
     assert 'under open sky' not in text
 
 
-def test_counts_read_as_floats_are_no_motion(inspect_drive, recwarn):
+def test_counts_read_as_floats_give_no_warning(inspect_drive, recwarn):
     inspect_drive([(topic, ns, b'\0\1\0\0' + struct.pack('<q', m.data) if topic == '/odometer'
                     else m)
                    for topic, ns, m in drive(60)], types={'/odometer': 'std_msgs/msg/Float64'})
     assert not [one for one in recwarn if one.category is RuntimeWarning]
 
 
-def test_topics_that_cannot_be_combined(inspect_drive):
+def test_topics_without_common_time_are_reported(inspect_drive):
     rows = drive(60)
     for name, _, message in rows:
         if name == '/imu/data':
@@ -154,7 +154,7 @@ def test_stamps_without_the_fraction_of_a_second_are_reported(inspect_drive, nam
     assert text.count('all stamps are whole seconds') == 1
 
 
-def test_odd_stamps_and_gaps(inspect_drive):
+def test_odd_stamps_and_gaps_are_counted(inspect_drive):
     rows = drive()
     imu = [i for i, row in enumerate(rows) if row[0] == '/imu/data']
     rows[imu[100]][2].header.stamp = make.header(0).stamp
@@ -172,7 +172,7 @@ def test_odd_stamps_and_gaps(inspect_drive):
     assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(seen)
 
 
-def test_fixes_that_are_none(inspect_drive):
+def test_unusable_fixes_are_reported(inspect_drive):
     seen, text = inspect_drive(drive(status=-1))
     assert 'FIXES_UNUSABLE' in codes(seen)
     assert topic(seen, '/fix')['fix']['status'] == {'-1': 750}
@@ -183,11 +183,11 @@ def test_fixes_that_are_none(inspect_drive):
     seen, _ = inspect_drive([row for row in drive() if row[0] != '/fix'])
     assert [(f['text'], f['remedy']) for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
         ('no topic for the fixes', 'Record it, or name it with --fix-topic.')]
-    assert len(seen['standstills']) == 2            # seen without fixes too
+    assert len(seen['standstills']) == 2            # found without fixes
 
 
 @pytest.mark.filterwarnings('error')
-def test_fixes_off_the_earth(inspect_drive):
+def test_impossible_positions_are_not_counted(inspect_drive):
     rows = drive()
     fixes = (message for name, _, message in rows if name == '/fix')
     for latitude in (1e300, -1e308, np.inf, 91.0):
@@ -199,7 +199,7 @@ def test_fixes_off_the_earth(inspect_drive):
     ((0, 0, 0.6, 0.8), 1e-6, ''), ((0, 0, 0.6, 0.8), 0.01, 'uncertainty of 5.7 deg'),
     ((0, 0, 0.6, 0.8), 0.0, 'has no covariance'),
     ((0, 0, 0, 1), 0.0, 'publishes no orientation')])       # a default
-def test_orientation_as_heading(inspect_drive, q, variance, words):
+def test_an_orientation_is_a_heading_or_the_reason_is_given(inspect_drive, q, variance, words):
     def oriented(ns, m):
         w, f = ((v.x, v.y, v.z) for v in (m.angular_velocity, m.linear_acceleration))
         return make.imu(ns, w=w, f=f, q=q, covariance=np.append(np.zeros(8), variance))
@@ -210,7 +210,7 @@ def test_orientation_as_heading(inspect_drive, q, variance, words):
     assert words in ''.join(texts)
 
 
-def test_loops_short_drives_and_odd_values(inspect_drive):
+def test_loops_short_drives_and_invalid_values_are_reported(inspect_drive):
     seen, _ = inspect_drive(drive(loop=True))
     assert 'CHORD_TOO_SHORT' in codes(seen)
     assert seen['legs'][0]['chord'] < 5
@@ -225,7 +225,7 @@ def test_loops_short_drives_and_odd_values(inspect_drive):
     assert inspect_drive([row for row in drive(1) if row[1] < T0 + 3])[0]['messages'] == 3
 
 
-def test_two_wheels_on_two_topics_are_seen(inspect_drive):
+def test_two_wheels_on_two_topics_are_found(inspect_drive):
     seen, _ = inspect_drive([row for name, ns, m in drive() for row in (
         [('/ticks/left', ns, m), ('/ticks/right', ns, m)] if name == '/odometer'
         else [(name, ns, m)])])
@@ -233,12 +233,12 @@ def test_two_wheels_on_two_topics_are_seen(inspect_drive):
     assert seen['command'].endswith('--set odometer.left=topic --set odometer.right=topic')
 
 
-def test_topic_named_by_the_user(inspect_drive, capsys):
+def test_a_topic_named_by_the_user_is_used(inspect_drive, capsys):
     rows = drive(20) + [('/speed', T0 + i * 10**8, make.twist_stamped(T0 + i * 10**8, 1.0))
                         for i in range(200)]
     seen, _ = inspect_drive(sorted(rows, key=lambda row: row[1]))
     path = seen['path']
-    assert seen['mapping']['odometer'] == '/odometer'     # a counter before a speed
+    assert seen['mapping']['odometer'] == '/odometer'     # preferred to a speed
     assert '2 topics can be the odometer' in seen['replay_error']
     assert '--odometer-topic /odometer' in seen['command']
     seen, _ = inspect(path, capsys, '--odometer-topic', 'speed')
@@ -251,7 +251,7 @@ def test_topic_named_by_the_user(inspect_drive, capsys):
 
 
 def test_a_drive_is_screened_once(inspect_drive, capsys, monkeypatch):
-    """The legs are found in what was screened for the rest: with nothing to screen, the same."""
+    """The legs are found in samples already screened: without the screen nothing changes."""
     expected = inspect_drive(drive())
     assert expected[0]['legs']
     monkeypatch.setattr(find_legs, 'screen', None)

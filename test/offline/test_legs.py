@@ -44,7 +44,7 @@ def test_leg_is_parsed_to_the_nanosecond(text, span):
 
 @pytest.mark.parametrize('text', ['', '5', '1:2:3', 'a:b', '70:12', '5:5', 'nan:3', '1/x',
                                   '2015-05-21T10:00:00Z/2014-05-21T10:00:00Z'])
-def test_a_leg_that_is_none_is_refused_in_a_sentence(text):
+def test_an_invalid_leg_is_refused_in_one_sentence(text):
     with pytest.raises(BadUsage, match='--leg'):
         parse_leg(text)
 
@@ -88,7 +88,7 @@ def test_marks_of_each_run_are_found_and_cancelled_legs_are_not():
 
 
 def recorded(drive):
-    """Return a recorder fed with a drive, and a bag of its span."""
+    """Return a recorder fed with a drive, and a bag of its time span."""
     recorder = LegRecorder()
     for slot in ('imu', 'odometer', 'odometer_right', 'fix', 'heading'):
         recorder.feed(slot, getattr(drive, slot))
@@ -117,7 +117,7 @@ def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
     assert not moving(out_and_back, leg[1])
 
 
-def test_stamps_without_a_time_in_common(out_and_back):
+def test_stamps_without_common_time_are_refused(out_and_back):
     recorder, bag = recorded(out_and_back)
     late = LegRecorder()
     for slot in ('imu', 'odometer', 'fix'):
@@ -130,7 +130,7 @@ def test_stamps_without_a_time_in_common(out_and_back):
 
 
 @pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
-def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot):
+def test_a_topic_that_covers_half_of_the_recording_is_reported(out_and_back, slot):
     whole, _ = recorded(out_and_back)
     assert coverage_reasons(whole) == ()
     begin, end = out_and_back.imu.stamp_ns[[0, -1]]
@@ -148,7 +148,7 @@ def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot)
         assert f'{"ends" if early else "begins"} {missing:.0f} s' in reason.text
 
 
-def test_each_stop_splits_where_the_vehicle_stood(out_and_back):
+def test_each_stop_splits_the_recording_at_standstills(out_and_back):
     recorder, bag = recorded(out_and_back)
     legs = find_legs(recorder, bag, ['each-stop'], [], Config())
     assert len(legs) == 2
@@ -157,7 +157,7 @@ def test_each_stop_splits_where_the_vehicle_stood(out_and_back):
         assert not moving(out_and_back, edge - S)
 
 
-def test_marks_win_over_standstills_and_asked_legs_over_marks(out_and_back):
+def test_marks_take_precedence_over_standstills_and_options_over_marks(out_and_back):
     recorder, bag = recorded(out_and_back)
     mark = (bag.start_ns + 100 * S, bag.start_ns + 200 * S)
     assert find_legs(recorder, bag, [], [mark], Config()) == [mark]
@@ -171,13 +171,13 @@ def test_marks_win_over_standstills_and_asked_legs_over_marks(out_and_back):
                                    np.median(out_and_back.fix.stamp_ns[-5:]))
 
 
-def test_a_leg_outside_the_bag_is_refused_with_the_span_there_is(out_and_back):
+def test_a_leg_outside_the_bag_is_refused_with_the_span_of_the_bag(out_and_back):
     recorder, bag = recorded(out_and_back)
     with pytest.raises(BadUsage, match=r'runs from 0 to \d+\.\d s'):
         find_legs(recorder, bag, [parse_leg('5000:6000')], [], Config())
 
 
-def test_a_recording_that_broke_off_at_its_start_mark_says_so():
+def test_a_recording_that_ends_at_its_start_mark_is_reported():
     bag = SimpleNamespace(name='2026-01-02T03-04-05Z_leg_1')
     with pytest.raises(BadData, match='ended at the start mark.* drive it again'):
         _marked_spans([(10, 0)], 10, bag)

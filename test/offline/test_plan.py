@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal plan: its answers against the prediction, and bad input."""
+"""odocal plan: its output compared with the prediction, and bad input."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,7 @@ PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']
 STRAIGHT = ['--distance', '1000', '--speed', '15', '--imu-grade', 'industrial']
 
 
-def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
+def test_the_plan_of_the_paper_drive_agrees_with_closed_forms(capsys):
     answer = plan_of(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
                      *TWO_POINT)
     assert answer['drive']['distance'] == pytest.approx(11_200, rel=1e-9)
@@ -43,18 +43,18 @@ def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
         assert estimates[parameter]['sigma'] == pytest.approx(whole, rel=1e-9)
 
 
-def test_changes_are_computed_not_told(capsys):
+def test_suggested_changes_have_computed_sigmas(capsys):
     answer = plan_of(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
                      *TWO_POINT)
     before = answer['methods']['two_point']['estimates']
     scale, yaw = (before[n]['sigma'] for n in ('scale_factor', 'yaw_mounting_angle'))
     changes = {c['text']: c for c in answer['changes']}
     longer = next(c for text, c in changes.items() if 'straight ahead' in text)
-    assert longer['scale_factor'] == pytest.approx(scale / 2, rel=0.01)    # twice the way
-    # white fixes alone make the scale: RTK is 75 times better, the rest is below 0.04 ppm
+    assert longer['scale_factor'] == pytest.approx(scale / 2, rel=0.01)    # twice the path
+    # white fix noise dominates the scale: RTK is 75 times better, the rest is below 0.04 ppm
     assert changes['RTK fixes (0.02 m)']['scale_factor'] == pytest.approx(scale / 75, rel=0.05)
     other = changes['a second leg in the other direction']
-    # height is shared and small; the heading is shared and all; between both the scale walks
+    # height: shared, small; heading: shared, dominant; the scale drifts between the legs
     first = math.hypot(scale, Config().verdict.scale_drift_per_day * math.sqrt(
         answer['drive']['duration'] / 86400))
     assert other['scale_factor'] == pytest.approx(scale * first / math.hypot(scale, first),
@@ -74,7 +74,7 @@ def test_a_gyrocompass_heading_averages_down_over_legs(capsys):
 
 
 @pytest.mark.parametrize('drive', [['plan', *STRAIGHT], [*PAPER, *TWO_POINT]])
-def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
+def test_improvements_are_sorted_by_gain_and_fit_on_the_screen(capsys, drive):
     assert main(drive) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 45
@@ -85,12 +85,12 @@ def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
     assert len(after) > 2
     assert after == sorted(after)
     assert 'RTK' in lines[begin + 1]
-    # a better IMU has straighter axes too
+    # a better IMU has smaller axis errors, too
     expected_word = 'heading' if 'method=two_point' in drive else 'stop and go'
     assert any(expected_word in line for line in lines[end + 1:end + 3])
 
 
-def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
+def test_an_out_and_back_drive_needs_the_smoother(capsys):
     drive = ['--scenario', 'out_and_back', '--imu-grade', 'navigation']
     assert main(['plan', *drive, '--duration', '300']) == 0
     out = capsys.readouterr().out
@@ -108,11 +108,11 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     there = planned_drives.from_scenario('out_and_back', None).cut_at(
         stop - t[moving[0]] + 0.1, 30.0)
     expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
-    # the stop is 30 s here and there, cut to a tenth of a second
+    # both have a stop of 30 s, cut to a tenth of a second
     assert half['scale_factor'] == pytest.approx(expected.sigma('scale_factor'), rel=0.01)
 
 
-def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys):
+def test_the_plan_of_the_smoother_equals_its_prediction(capsys):
     answer = plan_of(capsys, *STRAIGHT, '--fix-noise', 'white', '--pulse', '0.02', '--sway', '0.1',
                      '--slip-walk', '0.005')
     assert list(answer['methods']) == ['smoother', 'two_point']
@@ -134,19 +134,19 @@ def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys
     stop = predict_smoother(add_stop_and_start(drive), sigmas)
     assert changes['one more stop and start']['yaw_mounting_angle'] == pytest.approx(
         stop.estimates['yaw_mounting_angle'].sigma, rel=1e-12)
-    # own errors are halved in variance, those shared by legs stay; of what is imperfect two legs
-    # together tell a little more, in the next digit
+    # own errors are halved in variance, errors shared by legs stay; two legs together determine
+    # the imperfections slightly better, in the next digit
     other = changes['a second leg in the other direction']['yaw_mounting_angle']
     yaw = expected.estimates['yaw_mounting_angle'].sigma
     assert yaw / math.sqrt(2) * 0.999 <= other < yaw
 
 
-def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
-    # two minutes of even driving, marked in motion
+def test_an_undetermined_yaw_is_reported_with_the_cause_and_the_remedy(tmp_path, capsys):
+    # two minutes of uniform driving, marked in motion
     path = str(gpx(tmp_path / 'a.gpx', rest=0.0, corner=0.0, count=60))
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
-    # an IMU whose axes are off by half a degree: without turns no pitch against the plane of them
+    # the axes of the IMU are wrong by half a degree: without turns the pitch is not observable
     assert '(result: scale from smoother, yaw and pitch unknown' in out
     plain_text = ' '.join(out.split())
     assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in plain_text
@@ -164,7 +164,7 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     ('auto', ['smoother', 'two_point'], 'smoother'), ('two_point', ['two_point'], 'two_point'),
     ('smoother', ['smoother', 'two_point'], 'smoother'),
     ('wheels', ['smoother', 'two_point'], 'smoother')])
-def test_the_methods_asked_for_are_planned(method, shown, by):
+def test_the_requested_methods_are_planned(method, shown, by):
     config = with_settings(Config(), {'method': method, 'alignment.heading_source': 'fixed',
                                       'alignment.heading_sigma': 0.002})
     drive = planned_drives.from_figures(15.0, 500.0, 10.0, 0, 1.0)
@@ -175,7 +175,7 @@ def test_the_methods_asked_for_are_planned(method, shown, by):
 
 @pytest.mark.core
 @pytest.mark.parametrize('begin', ['# Plan a drive', '## Small robots'])
-def test_the_page_shows_what_is_printed(begin, capsys):
+def test_the_page_shows_the_printed_output(begin, capsys):
     page = (Path(__file__).parents[2] / 'docs' / 'planning.md').read_text(encoding='utf-8')
     section = page.partition(begin)[2]
     command = next(line for line in section.splitlines() if line.startswith('odocal plan '))
@@ -185,7 +185,7 @@ def test_the_page_shows_what_is_printed(begin, capsys):
     assert len(shown) == len(printed)
     for one, other in zip(shown, printed, strict=True):
         if re.fullmatch(r'[\d.]+%?', one):
-            # another BLAS may round a last digit otherwise, of two
+            # another BLAS may round the last of two digits differently
             assert float(other.rstrip('%')) == pytest.approx(float(one.rstrip('%')), rel=0.06,
                                                              abs=1.1 if '%' in one else 0)
         else:
@@ -220,5 +220,5 @@ def test_the_page_shows_what_is_printed(begin, capsys):
     (['--distance', '4', '--speed', '2', '--standstill', '0', '--fix-rate', '0.1'],
      'less than one fix interval'),
     (['--gpx', '/nowhere/a.gpx'], 'cannot be read')])
-def test_bad_input_is_one_clear_sentence(capsys, argv, words):
+def test_bad_input_gives_one_sentence(capsys, argv, words):
     assert words in refused(capsys, *argv)

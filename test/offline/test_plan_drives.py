@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drives of odocal plan: figures, GPX tracks and bags, against their source."""
+"""Drives of odocal plan from figures, GPX tracks and bags, compared with their source."""
 
 import math
 
@@ -18,11 +18,11 @@ from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 pytestmark = pytest.mark.slow
 
 
-def test_a_drive_of_figures_has_those_figures():
+def test_a_drive_from_figures_has_these_figures():
     drive = planned_drives.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
     assert drive.distance == pytest.approx(3000.0, rel=1e-6)
     assert drive.speed.max() == pytest.approx(15.0)
-    # 2 * 15 s of ramp, 225 m of way in them
+    # two ramps of 15 s, 225 m in total
     assert drive.duration == pytest.approx(30 + (3000 - 225) / 15 + 20, abs=0.11)
     assert drive.standstills(2.0)[0][1] == pytest.approx(0.0, abs=0.11)
     assert np.ptp(drive.yaw) == pytest.approx(math.pi / 2, rel=0.02)
@@ -34,7 +34,7 @@ def test_a_drive_of_figures_has_those_figures():
 
 @pytest.mark.parametrize(('scenario', 'noise'), [('straight', 0.0), ('straight', 0.05),
                                                  ('town', 0.2)])
-def test_the_jerks_of_a_gpx_tell_no_heading(tmp_path, scenario, noise):
+def test_speed_steps_of_a_gpx_track_do_not_reduce_the_sigmas(tmp_path, scenario, noise):
     motion = motion_of(resolved(SimOptions(scenario=scenario)))
     t = np.arange(0.0, motion.duration, 0.05)
     step = motion.speed(t) * 0.05 * np.exp(1j * np.cumsum(motion.yaw_rate(t) * 0.05))
@@ -45,18 +45,18 @@ def test_the_jerks_of_a_gpx_tell_no_heading(tmp_path, scenario, noise):
     own, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
         planned_drives.from_scenario(scenario, None),
         planned_drives.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
-    # points 5 m apart hide how a start of 0.5 m/s^2 sets in, 4 s of it: of 25 s, a sixth, and
-    # noise adds to it; steps of speed at each point would halve the sigma of the straight drive
+    # points 5 m apart hide the first 4 s of a start with 0.5 m/s^2, a sixth of its 25 s, and noise
+    # adds to it; steps of speed at each point would halve the sigma of the straight drive
     for name in NAMES[:2]:
         assert drawn[name].sigma > 0.75 * own[name].sigma
 
 
-def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
+def test_a_gpx_track_gives_its_distance_speed_and_standstills(tmp_path, capsys):
     drive = planned_drives.from_gpx(gpx(tmp_path / 'a.gpx'))
-    assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # the corner is cut by a point
+    assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # one point cuts the corner
     assert np.median(drive.speed[drive.speed > 0]) == pytest.approx(10.0, rel=1e-3)
     rest = drive.standstills(2.0)
-    # a point a second, and 2 s at each end for a start that no car makes from 0 to 10 m/s at once
+    # one point per second, and a ramp of 2 s at each end: no car jumps from 0 to 10 m/s
     assert [b - a for a, b in rest] == pytest.approx([28.0, 28.0], abs=1.1)
     assert np.abs(np.diff(drive.speed) / np.diff(drive.t)).max() < 10.0 / 4.0 * 1.05
     assert drive.yaw[0] == pytest.approx(0.0, abs=1e-3)            # east
@@ -83,7 +83,7 @@ def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
      'not readable'),
     (b'<gpx><trkpt lat="1" lon="1"><time>2026-01-01T00:00:00Z</time></trkpt>'
      b'<trkpt lat="1" lon="1"><time>2026-01-01T00:01:00Z</time></trkpt></gpx>', 'never moves')])
-def test_a_gpx_that_cannot_be_used_is_refused(tmp_path, capsys, text, words):
+def test_an_unusable_gpx_file_is_refused(tmp_path, capsys, text, words):
     path = tmp_path / 'a.gpx'
     path.write_bytes(text)
     message = refused(capsys, '--gpx', str(path))
@@ -91,11 +91,11 @@ def test_a_gpx_that_cannot_be_used_is_refused(tmp_path, capsys, text, words):
     assert str(path) in message
 
 
-def test_a_gpx_without_an_end_is_refused(capsys):
+def test_an_endless_gpx_file_is_refused(capsys):
     assert 'exceeds the limit' in refused(capsys, '--gpx', '/dev/zero')
 
 
-def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
+def test_the_plan_of_a_bag_uses_its_drive_and_fixes(tmp_path, capsys):
     bag = tmp_path / 'drive'
     assert main(['simulate', '--scenario', 'straight', '--out', str(bag), '--duration', '200',
                  '--imu-rate', '50', '--fix-sigma', '0.5', '--fix-rate', '2', '--quiet']) == 0
@@ -118,6 +118,6 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     assert given['sigmas']['imu_grade'] == 'industrial'
 
 
-def test_a_drive_too_short_for_its_speed_brakes_from_a_lower_one(capsys):
+def test_a_drive_too_short_for_its_speed_brakes_from_a_lower_speed(capsys):
     assert main(['plan', '--distance', '10', '--speed', '30']) == 0
     assert '10.00 m in 36.3 s' in capsys.readouterr().out      # 30 s at each mark, 2 sqrt(10)

@@ -27,7 +27,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
-QUICK = ('--method', 'two_point')      # where the door is looked at, not what is found
+QUICK = ('--method', 'two_point')      # for tests of the command, not of the result
 
 
 @pytest.fixture(scope='module')
@@ -50,11 +50,11 @@ def known(drive):
 
 
 def replay(*argv, files='params'):
-    """Replay with so few files beside calibration.json; the report takes half of a replay."""
+    """Replay with few output files; the report takes half of the time of a replay."""
     return main(['replay', '--set', f'output.formats=[{files}]', *map(str, argv)])
 
 
-def test_the_two_point_method_waits_for_nothing_it_does_not_use(bag, tmp_path):
+def test_the_two_point_method_imports_no_unused_package(bag, tmp_path):
     """Neither scipy nor the message types of rosbags, which take longer than a short bag."""
     probe = ('import sys; from odocal_ros.offline.cli import main\n'
              f'main(["replay", {str(bag)!r}, "--method", "two_point", "--quiet", "--output", '
@@ -65,7 +65,7 @@ def test_the_two_point_method_waits_for_nothing_it_does_not_use(bag, tmp_path):
     assert (tmp_path / 'out' / 'calibration.yaml').exists()
 
 
-def test_the_verdict_does_not_wait_for_the_report(drive, bag, tmp_path, monkeypatch, capsys):
+def test_the_verdict_is_printed_before_the_report(drive, bag, tmp_path, monkeypatch, capsys):
     warnings = []
     given = files.report_or_error_page
     monkeypatch.setattr(files, 'report_or_error_page',
@@ -77,7 +77,7 @@ def test_the_verdict_does_not_wait_for_the_report(drive, bag, tmp_path, monkeypa
     assert 'written: ' in capsys.readouterr().out
 
 
-def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
+def test_a_closed_output_pipe_does_not_prevent_the_files(drive, bag, tmp_path):
     command = [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(bag), '--method',
                'two_point', '--output', str(tmp_path / 'out'), *known(drive)]
     read_end, pipe = os.pipe()
@@ -87,8 +87,8 @@ def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
     assert (tmp_path / 'out' / 'report.html').exists()
 
 
-def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, capsys):
-    """The bag's way through CDR and blocks changes no bit (but for the degrees of a NavSatFix)."""
+def test_replay_of_a_bag_equals_the_pipeline_on_the_samples(drive, bag, tmp_path, capsys):
+    """CDR and blocks of the bag change no bit, except for the degrees of a NavSatFix."""
     start, stop = drive.truth.start_ns, drive.truth.stop_ns
 
     def decimal(stamp):
@@ -133,14 +133,14 @@ def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
     assert min(single) / 3 < whole['sigma'] < min(single)
 
 
-def test_holdout_checks_on_what_was_not_fitted(drive, bag, tmp_path, capsys):
+def test_holdout_checks_the_part_that_is_not_fitted(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--holdout', '--json', '--output', tmp_path / 'out') == 0
     printed = json.loads(capsys.readouterr().out)
     replay(bag, *known(drive), *QUICK, '--holdout', '--output', tmp_path / 'again')
     assert 'last fifth' in capsys.readouterr().out
     whole = drive.truth.distance
     assert printed['check']['after']['rms'] < printed['check']['before']['rms']
-    # K0 is 6 % off and the mounting 1 deg: a fifth of the way strays by 6 % of it at its end
+    # K0 is wrong by 6 %, the mounting by 1 deg: after a fifth of the path the error is 6 % of it
     off = abs(1 / drive.truth.scale_ratio - 1) + abs(drive.truth.yaw)
     assert printed['check']['before']['end'] < off * whole / 5 + 20
 
@@ -155,7 +155,7 @@ def test_an_existing_result_is_not_replaced_without_force(bag, tmp_path, capsys)
     assert replay(bag, *QUICK, '--output', tmp_path, '--quiet', '--force') == 0
 
 
-def test_config_file_then_set_then_default(bag, tmp_path, capsys):
+def test_set_takes_precedence_over_the_config_file(bag, tmp_path, capsys):
     config = tmp_path / 'calibrator.yaml'
     config.write_text('/**/calibrator:\n  ros__parameters:\n    leg:\n      min_distance: 9000\n'
                       '    imu: {grade: tactical}\n')
@@ -173,7 +173,7 @@ def test_config_file_then_set_then_default(bag, tmp_path, capsys):
     (['--leg', '900000:900001'], 'runs from 0'),
     (['--imu-topic', '/other'], '/other'),
     (['--set', 'method=best'], 'method')])
-def test_wrong_requests_are_one_line_and_exit_2(argv, words, bag, tmp_path, capsys):
+def test_wrong_options_give_one_line_and_exit_code_2(argv, words, bag, tmp_path, capsys):
     assert replay(bag, '--output', tmp_path / 'out', *argv) == 2
     first, *listed = capsys.readouterr().err.splitlines()
     assert words in first
@@ -189,13 +189,13 @@ def accept(data_dir, name):
     return *truth['scale']['accept'], truth['odometer']['k0_m_per_pulse'], truth['scale']
 
 
-REAR = (1.0092 + 1.0096) / 2        # README of the drive: of its rear wheels, taken of the four
+REAR = (1.0092 + 1.0096) / 2        # README of the drive: the rear wheels, used of the four
 
 
 @pytest.mark.parametrize(('imu', 'odometer'), [
     ('/imu/data', '/odometer/pulses_derived'), ('/imu/data_flu', '/odometer/pulses_derived'),
     ('/imu/data_flu', '/vehicle/twist'), ('/imu/data_flu', '/wheel_states')])
-def test_rav4_scale_is_within_accept_and_yaw_is_refused(imu, odometer, data_dir, tmp_path, capsys):
+def test_rav4_scale_is_within_accept_and_yaw_is_unknown(imu, odometer, data_dir, tmp_path, capsys):
     low, high, k0, truth = accept(data_dir, 'comma2k19_rav4')
     nominal = k0 if 'pulses' in odometer else 1.0
     assert replay(data_dir / 'comma2k19_rav4/bag', '--imu-topic', imu, '--odometer-topic',
@@ -209,7 +209,7 @@ def test_rav4_scale_is_within_accept_and_yaw_is_refused(imu, odometer, data_dir,
     assert result['yaw_mounting_angle']['value'] is None
 
 
-def test_husky_loop_is_refused_by_its_ends_and_its_straight_parts_meet_accept(
+def test_two_point_rejects_the_husky_loop_and_its_straight_parts_meet_accept(
         data_dir, tmp_path, capsys):
     low, high, k0, _ = accept(data_dir, 'husky_parking_lot')
     common = [data_dir / 'husky_parking_lot/bag', '--imu-topic', '/imu/data_flu',
@@ -228,7 +228,7 @@ def test_husky_loop_is_refused_by_its_ends_and_its_straight_parts_meet_accept(
         edges = scale['value'] + np.array([-1.96, 1.96]) * scale['sigma']
         assert edges[0] <= high, leg
         assert edges[1] >= low, leg
-    # all fixes of the loop, not its ends only, tell the scale
+    # all fixes of the loop determine the scale, not only its end points
     assert replay(*common, '--output', tmp_path / 'whole') == 0
     found = json.loads(capsys.readouterr().out)['result']
     assert low <= found['scale_ratio']['value'] <= high

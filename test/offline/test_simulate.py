@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The simulate command: a real bag, its truth and its settings, or one sentence."""
+"""odocal simulate: a bag, its truth and its settings, or one error line."""
 
 import math
 
@@ -35,7 +35,7 @@ def settings_of(folder):
     return load(folder / 'calibrator.yaml')['/**/calibrator']['ros__parameters']
 
 
-def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
+def test_simulate_writes_a_bag_its_truth_and_its_settings(tmp_path, capsys):
     out = tmp_path / 'one' / 'drive'
     assert odocal(*SHORT, '--out', out, '--seed', 7) == 0
     assert files(out.parent) == ['calibrator.yaml', 'drive', 'truth.yaml']
@@ -61,7 +61,7 @@ def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
 
 
 def test_the_settings_are_settings_of_the_node(tmp_path):
-    """Each name and value passes the very checks of the pipeline."""
+    """Each name and value passes the checks of the pipeline."""
     from odocal_ros.settings.config import Config, flat, SETTINGS, with_settings
     assert odocal(*SHORT, '--out', tmp_path / 'drive', '--two-wheels', '--imu-grade', 'tactical',
                   '--antenna-lever-arm', 1.2, 0, 1.5, '--known-heading-sigma-deg', 0.06,
@@ -82,7 +82,7 @@ def test_the_settings_are_settings_of_the_node(tmp_path):
     assert 0 < abs(error) < 5 * math.radians(0.06)     # 5 sigma
 
 
-def test_perfect_sensors_go_by_the_best_grade(tmp_path):
+def test_perfect_sensors_have_the_best_grade(tmp_path):
     assert odocal(*SHORT, '--out', tmp_path / 'drive', '--imu-grade', 'perfect',
                   '--fix-sigma', 0, '--quiet') == 0
     groups = settings_of(tmp_path)
@@ -98,7 +98,7 @@ def test_perfect_sensors_go_by_the_best_grade(tmp_path):
      '--odometer-topic /odometer/left --odometer-right-topic /odometer/right'),
     (['--heading-sigma-deg', '0.2'], {'/imu/data', '/odometer', '/fix', '/heading'},
      '--imu-topic /imu/data --heading-topic /heading')])
-def test_replay_gets_the_topics_it_cannot_choose(tmp_path, capsys, options, topics, command):
+def test_the_replay_command_names_ambiguous_topics(tmp_path, capsys, options, topics, command):
     from rosbags.highlevel import AnyReader
     assert odocal(*SHORT, '--out', tmp_path / 'drive', *options) == 0
     assert command in capsys.readouterr().out
@@ -106,13 +106,13 @@ def test_replay_gets_the_topics_it_cannot_choose(tmp_path, capsys, options, topi
         assert {c.topic for c in reader.connections} == topics
 
 
-def test_nothing_is_replaced_unasked(tmp_path, capsys):
+def test_existing_files_are_not_replaced_without_force(tmp_path, capsys):
     out = tmp_path / 'drive'
     assert odocal(*SHORT, '--out', out, '--quiet') == 0
     first = (tmp_path / 'truth.yaml').read_text()
     assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
     assert 'truth.yaml already exists; give --force' in capsys.readouterr().err
-    # another bag has a truth of its own beside it, and leaves this one alone
+    # another bag has its own truth file and does not change this one
     for _ in range(2):
         assert odocal(*SHORT, '--out', tmp_path / 'other', '--seed', 2, '--force') == 0
     assert 'truth in ' + str(tmp_path / 'other.truth.yaml') in capsys.readouterr().out
@@ -128,7 +128,7 @@ def test_nothing_is_replaced_unasked(tmp_path, capsys):
     assert load(tmp_path / 'truth.yaml')['seed'] == 2
 
 
-def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
+def test_force_does_not_replace_settings_of_the_operator(tmp_path, capsys):
     (tmp_path / 'calibrator.yaml').write_text('mine: true\n')
     assert odocal(*SHORT, '--out', tmp_path / 'drive', '--force') == 2
     assert 'was not made by odocal simulate' in capsys.readouterr().err
@@ -149,7 +149,7 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
     (['--vehicle', 'real', '--odometer', 'speed'], 'has its own odometer'),
     (['--vehicle', 'clean', '--effect', 'squat'], 'omit one of them'),
     (['--vehicle', 'real', '--imu-grade', 'navigation'], 'required: one of consumer')])
-def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, wrong_options, printed):
+def test_wrong_usage_gives_one_line_and_exit_code_2(tmp_path, capsys, wrong_options, printed):
     assert odocal(*SHORT, '--out', tmp_path / 'drive', *wrong_options) == 2
     output = capsys.readouterr()
     assert output.out == ''
@@ -158,7 +158,7 @@ def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, wrong_options, pri
     assert files(tmp_path) == []
 
 
-def test_a_terminal_gets_a_bar_that_goes_away(tmp_path, capsys, monkeypatch):
+def test_a_terminal_shows_a_progress_bar_that_is_erased(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr('sys.stderr.isatty', lambda: True, raising=False)
     assert odocal(*SHORT, '--out', tmp_path / 'drive') == 0
     bar = capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_a_terminal_gets_a_bar_that_goes_away(tmp_path, capsys, monkeypatch):
     assert bar.split('\r')[-1].strip() == ''
 
 
-def test_a_vehicle_is_drawn_and_what_is_given_goes_before(tmp_path):
+def test_a_random_vehicle_is_drawn_and_given_values_take_precedence(tmp_path):
     out = tmp_path / 'drive'
     assert odocal(*SHORT, '--out', out, '--vehicle', 'real', '--seed', 5, '--yaw-deg', 2,
                   '--roll-deg', 0, '--outage', '50:60', '--real', 'vibration=0.25', '--quiet') == 0
@@ -184,7 +184,7 @@ def test_a_vehicle_is_drawn_and_what_is_given_goes_before(tmp_path):
         truth['options']['antenna_lever_arm'], real['antenna_arm_error'], strict=True)])
 
 
-def test_one_effect_or_one_figure_comes_alone(tmp_path):
+def test_a_single_effect_or_value_is_simulated_alone(tmp_path):
     from odocal_ros.sim.real import Real
     for name, words in (('effect', ['--effect', 'squat']), ('figure', ['--real', 'squat=0.002'])):
         assert odocal(*SHORT, '--out', tmp_path / name / 'drive', *words, '--quiet') == 0

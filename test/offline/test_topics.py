@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Topics by message type: one candidate is taken, several or none are an error with the remedy."""
+"""Topics by message type: one candidate is used, several or none give an error with the remedy."""
 
 import pytest
 
@@ -26,7 +26,7 @@ TWO = {'odometer__left': 'topic', 'odometer__right': 'topic'}
 
 
 def topics(**types):
-    """Return the base topics and more; a name's __ is a slash; None takes one away."""
+    """Return the base topics and more; __ in a name is a slash; None removes a topic."""
     named = BASE | {'/' + name.replace('__', '/'): t for name, t in types.items()}
     return {n: TopicInfo(n, t, 5) for n, t in named.items() if t}
 
@@ -39,11 +39,11 @@ def choose(found, overrides=None, **settings):
     return choose_topics(found, config, overrides or {})
 
 
-def test_one_of_each():
+def test_one_topic_of_each_type_is_used():
     expected = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
     assert choose(topics()) == expected
     assert choose(topics() | {n: TopicInfo(n, t, 5) for n, t in ODD.items()}) == expected
-    # without a message a topic is none
+    # a topic without messages is not a candidate
     assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == expected
 
 
@@ -51,14 +51,14 @@ def test_one_of_each():
     (topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'), {}, {},
      r'3 topics can be the odometer; choose one with --odometer-topic:\n  /odometer '
      r'\(std_msgs/msg/Int64\),\n  /speed'),
-    (topics(imu__raw=IMU, phone=FIX), {}, {},       # all at once
+    (topics(imu__raw=IMU, phone=FIX), {}, {},       # all errors
      r'can be the IMU.*--imu-topic:(?s:.*)\);\n2 topics can be the fix.*--fix-topic'),
     (topics(imu__data=None), {}, {}, r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag;\n'
      r'the bag has:\n  /odometer \(std_msgs/msg/Int64\),\n  /fix'),
     (topics(), {'heading': '/imu/data'}, {},
      r'no IMU \(a topic of sensor_msgs/msg/Imu besides /imu/data\) in the bag'),
     (topics(), {'fix': '/gps'}, {}, '--fix-topic /gps: no such topic; the bag has:\n  /imu/data'),
-    # not as if the others were missing, which it would be taken from
+    # the error does not report the other topics as missing
     (topics(), {'imu': '/fix'}, {}, '^--imu-topic /fix: the topic is of sensor_msgs/msg/NavSatFix'
      ', which cannot be used as IMU; the bag has:\n  /imu/data'),
     *((topics(), {slot: topic}, {}, 'which cannot be used as ') for slot, topic in (
@@ -70,7 +70,7 @@ def test_one_of_each():
     (topics(odometer=None, cmd_vel='geometry_msgs/msg/Twist'), {}, {}, 'no odometer'),
     (topics(imu__data=None, imu=IMU), {'imu': '/imu'}, BY_TOPIC, 'no heading'),
     (topics(), {}, BY_TOPIC, r'^no heading \(a topic of sensor_msgs/msg/Imu besides the IMU\) in '
-     'the bag;\nthe bag has:\n  /imu/data'),      # the IMU is there
+     'the bag;\nthe bag has:\n  /imu/data'),      # the IMU is listed
     (SIDES, {}, {}, 'odometer.left and odometer.right to topic'),
     (topics(), {}, TWO, 'no right odometer'),
     (topics(fix=None, slam__pose=POSE, prism=POINT), {}, {},
@@ -87,7 +87,7 @@ def test_one_of_each():
      'itself'),
     (topics(fix=None, odometer=None, odom=ODOM), {'fix': '/odom'}, {},
      r'^no odometer in the bag besides /odom, which is the position reference \(--fix-topic\)')])
-def test_what_cannot_be_chosen_is_told_with_the_option(found, overrides, settings, match):
+def test_ambiguous_or_missing_topics_are_reported(found, overrides, settings, match):
     with pytest.raises(BadUsage, match=match):
         choose(found, overrides, **settings)
 
@@ -117,11 +117,11 @@ def test_fixes_are_not_needed_when_the_ends_are_surveyed():
     assert 'fix' not in found
 
 
-def test_velocity_is_taken_where_its_name_is_the_receivers():
+def test_a_velocity_is_used_if_its_name_is_that_of_a_receiver():
     assert 'fix_velocity' not in choose(topics())
     assert choose(topics(gps__vel=TWIST))['fix_velocity'] == '/gps/vel'
     assert 'fix_velocity' not in choose(topics(gps__vel=TWIST), gnss__use_velocity=False)
-    # of two that of the node, else none
+    # of two, the one with the name of the node, else none
     assert choose(topics(gps__vel=TWIST, ublox__fix_velocity=TWIST))['fix_velocity'] == \
         '/ublox/fix_velocity'
     assert 'fix_velocity' not in choose(topics(gps__vel=TWIST, gnss__vel=TWIST))
@@ -130,16 +130,16 @@ def test_velocity_is_taken_where_its_name_is_the_receivers():
 @pytest.mark.parametrize('name', [
     'cmd_vel', 'vehicle__twist', 'vel', 'prefix__twist', 'gps__filtered_vel', 'fix_speed',
     'gps_car__wheel_twist', 'gnss__cmd_vel'])
-def test_other_twists_are_taken_for_a_velocity_only_by_name(name):
+def test_other_twists_are_used_as_velocity_only_if_the_user_names_them(name):
     found, topic = topics(**{name: TWIST}), '/' + name.replace('__', '/')
     ask = {'odometer': '/odometer'}
     assert 'fix_velocity' not in choose(found, ask)
     assert choose(found, ask | {'fix_velocity': topic})['fix_velocity'] == topic
 
 
-def test_heading():
+def test_the_heading_topic_is_chosen_by_its_name():
     found = topics(heading=IMU)
-    assert choose(found)['heading'] == '/heading'      # as the node, which tries it first
+    assert choose(found)['heading'] == '/heading'      # as the node does
     assert choose(found)['imu'] == '/imu/data'
     assert 'heading' not in choose(found, alignment__heading_source='course')
     found = topics(gnss__heading_imu=IMU)
@@ -147,7 +147,7 @@ def test_heading():
     assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
 
 
-def test_the_journal_of_a_namespaced_node_is_found():
+def test_the_topics_of_a_namespaced_node_are_found():
     found = {n: TopicInfo(n, t, 9) for n, t in {
         '/car/imu/data': IMU, '/car/odometer': INT, '/car/fix': FIX,
         '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
@@ -172,7 +172,7 @@ def test_a_pose_is_the_reference_where_there_is_no_fix(kind):
     assert choose(unused)['fix'] == '/slam/pose'
 
 
-def test_a_reference_that_is_named_is_taken_and_goals_are_none():
+def test_a_named_reference_is_used_and_goals_are_not_references():
     poses = topics(fix=None, slam__pose=POSE, prism=POINT)
     assert choose(poses, {'fix': '/prism'})['fix'] == '/prism'
     # goals and clicks are poses that a person sets
@@ -207,7 +207,7 @@ def test_wheels_are_preferred_to_estimates_at_higher_rates(right, wrong):
 
 @pytest.mark.parametrize('names', [('/encoders/left', '/encoders/right'),
                                    ('/left_wheel/rpm', '/right_wheel/rpm')])
-def test_topics_of_left_and_right_are_a_pair_beside_others(names):
+def test_left_and_right_topics_are_chosen_as_a_pair_among_others(names):
     kind = 'std_msgs/msg/Float64'
     found = {n: TopicInfo(n, t, 5) for n, t in (
         BASE | dict.fromkeys((*names, '/motor_current/left'), kind) | {'/odom': ODOM}).items()

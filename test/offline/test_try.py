@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal try: it takes the likeliest topics, says why, and its command gives the same result."""
+"""odocal try: it uses the likeliest topics with a reason, and its command repeats the result."""
 
 import argparse
 from dataclasses import replace
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def bag(tmp_path, monkeypatch):
-    """Write a drive whose counter is on two topics; work beside it."""
+    """Write a drive with its counter on two topics; change to its folder."""
     monkeypatch.chdir(tmp_path)
     made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
     write_bag(tmp_path / 'bag', [imu('/imu/data', made.imu), fix('/fix', made.fix),
@@ -66,7 +66,7 @@ def content_of(folder):
     return {key: value for key, value in content.items() if key != 'created'}
 
 
-def test_the_likeliest_topic_is_taken_and_the_command_gives_the_same(bag, tmp_path, capsys):
+def test_the_likeliest_topic_is_used_and_the_command_gives_the_same_result(bag, tmp_path, capsys):
     assert main(['try', bag, '--no-browser']) == 0
     out = capsys.readouterr().out
     assert 'odometer: /odometer, because it has the usual name; other candidates: /wheel/ticks ' \
@@ -80,7 +80,7 @@ def test_the_likeliest_topic_is_taken_and_the_command_gives_the_same(bag, tmp_pa
     assert content_of(tmp_path / 'odocal_bag') == first
 
 
-def test_a_person_at_a_terminal_is_asked(bag, replay_calls, monkeypatch, capsys):
+def test_the_user_selects_the_topic_at_a_terminal(bag, replay_calls, monkeypatch, capsys):
     at_a_terminal(monkeypatch, 'x\n3\n2\n')
     assert main(['try', bag, '--no-browser']) == 0
     out = capsys.readouterr().out
@@ -91,11 +91,11 @@ def test_a_person_at_a_terminal_is_asked(bag, replay_calls, monkeypatch, capsys)
     at_a_terminal(monkeypatch, '\n')
     assert main(['try', bag, '--no-browser', '--force']) == 0
     assert replay_calls[1].odometer_topic == '/odometer'
-    at_a_terminal(monkeypatch, '')      # closed
+    at_a_terminal(monkeypatch, '')      # closed stdin
     assert main(['try', bag, '--force']) == 130
 
 
-def test_what_the_user_asks_goes_on_to_the_replay(bag, tmp_path, capsys):
+def test_options_of_the_user_are_passed_to_the_replay(bag, tmp_path, capsys):
     assert main(['try', bag, '--no-browser', '--odometer-topic', '/wheel/ticks', '--leg', '5:195',
                  '--set', 'method=two_point', '--set', 'odometer.nominal_scale=0.02',
                  '--output', 'out']) in (0, 1)
@@ -128,7 +128,7 @@ def test_the_report_opens_where_there_is_a_display(bag, replay_calls, tmp_path, 
     assert opened == [report.as_uri()]
 
 
-def test_a_bag_without_the_inputs_shows_what_it_has(tmp_path, monkeypatch, capsys):
+def test_a_bag_without_odometer_and_fixes_shows_its_topics(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_bag(tmp_path / 'bag', [imu('/imu/data', drive(scenario='straight', duration=200.0).imu)])
     assert main(['try', 'bag']) == 2
@@ -140,7 +140,7 @@ def test_a_bag_without_the_inputs_shows_what_it_has(tmp_path, monkeypatch, capsy
     assert 'no odometer' not in out
 
 
-def test_a_fix_topic_without_messages_is_named(tmp_path, monkeypatch, capsys):
+def test_a_fix_topic_without_messages_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     made = drive(scenario='straight', duration=200.0)
     none = replace(made.fix, **{name: value[:0] for name, value in vars(made.fix).items()
@@ -177,8 +177,8 @@ def test_options_of_the_user_replace_the_suggested_ones():
 
 
 @pytest.mark.parametrize('name', ['comma2k19_rav4', 'husky_parking_lot'])
-def test_the_first_answer_of_a_real_drive_is_right(name, data_dir, tmp_path, capsys):
-    """Within the limits that the reference has; canedge_car_165 is not here: it takes 45 s."""
+def test_the_scale_of_real_drives_is_within_accept(name, data_dir, tmp_path, capsys):
+    """The limits are those of the reference; canedge_car_165 is omitted: it takes 45 s."""
     assert main(['try', str(data_dir / name / 'bag'), '--no-browser', '--output',
                  str(tmp_path / 'out')]) == 0
     assert 'imu.mounting_rpy=' in capsys.readouterr().out

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal inspect on lists of values: which of them roll, and which side each is on."""
+"""odocal inspect on lists of values: which of them are wheels, and on which side."""
 
 from itertools import count
 import json
@@ -30,7 +30,7 @@ def drive(message):
 
 @pytest.fixture
 def inspect_drive(tmp_path, capsys):
-    """Return a function: the findings on a drive with such an odometer, its wheels, the text."""
+    """Return a function that gives findings, wheels and text of a drive with an odometer."""
     def inspected(message):
         path = ros_bags.write(tmp_path / 'bag', drive(message))
         facts, text = inspect(path, capsys)
@@ -38,7 +38,7 @@ def inspect_drive(tmp_path, capsys):
     return inspected
 
 
-def test_unnamed_joints_are_told_apart_by_how_they_move(inspect_drive):
+def test_the_sides_of_unnamed_joints_are_found_from_their_motion(inspect_drive):
     names = ['j1', 'j2', 'j3']
     printed, wheels, text = inspect_drive(lambda ns, i, left, right: make.joints(
         ns, names, [0.4 * np.sin(i / 30), right, left]))
@@ -56,7 +56,7 @@ def test_four_unnamed_joints_are_a_list_of_axles(inspect_drive):
     assert found['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
 
 
-def test_the_sides_of_two_counters_are_told_and_their_replay_runs(inspect_drive, tmp_path, capsys):
+def test_the_sides_of_two_counters_are_found_and_replay_runs(inspect_drive, tmp_path, capsys):
     printed, wheels, _ = inspect_drive(lambda ns, i, left, right: (
         make.whole_array([int(right * 50), int(left * 50)])))
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
@@ -69,7 +69,7 @@ def test_the_sides_of_two_counters_are_told_and_their_replay_runs(inspect_drive,
     assert 'WHEELS_SWAPPED' not in stdout
 
 
-def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(inspect_drive):
+def test_wheels_found_by_their_names_are_shown_with_their_settings(inspect_drive):
     names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
     found, wheels, _ = inspect_drive(lambda ns, i, left, right: make.joints(
         ns, names, velocity=[0.1, left, 0.1, right]))
