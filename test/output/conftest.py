@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations made by hand, so that every field that is written is known."""
+"""Calibrations with constant values, so that every written field is known."""
 
 from dataclasses import replace
 
@@ -92,5 +92,5 @@ def nothing():
 
 @pytest.fixture
 def rejected(good):
-    """Return a calibration that was computed whole and is rejected for another reason."""
+    """Return a calibration that has all values and is rejected."""
     return replace(good, reasons=(*good.reasons, Reason(Code.GYRO_SIGN, 'gyro z is reversed')))

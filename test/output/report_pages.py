@@ -23,7 +23,7 @@ VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
 
 
 def evidence(rows=900, fixes=200):
-    """Return evidence of a drive of 6 km along an arc, with two fixes left out."""
+    """Return evidence of a drive of 6 km along an arc, with two unused fixes."""
     t = np.linspace(0.0, 600.0, rows)
     track = np.stack([3000 * np.sin(t / 300), 3000 * (1 - np.cos(t / 300)), 0 * t], -1)
     k = np.linspace(0, rows - 1, fixes).astype(int)
@@ -44,7 +44,7 @@ def drawn(calibration, **more):
 
 
 def three_methods(calibration):
-    """Return a calibration of two legs by three methods, one of which has what others lack."""
+    """Return a calibration of two legs by three methods, one of them with additional values."""
     base = calibration.methods['two_point']
     wheels = MethodResult('wheels', (), {
         'scale_factor': Estimate(0.05001, 2e-6, 'm/pulse'),
@@ -61,7 +61,7 @@ def three_methods(calibration):
 
 
 class Balance(HTMLParser):
-    """Fails on tags that do not match, collects text and ids."""
+    """Parser that fails on unbalanced tags and collects text and ids."""
 
     def __init__(self):
         super().__init__()
@@ -94,7 +94,7 @@ class Balance(HTMLParser):
 
 
 def page_of(calibration, config=None, inputs=INPUTS):
-    """Return the page, and what a parser makes of it; every page is held to the same rules."""
+    """Return page, text and parser of a report; check the rules for all pages."""
     config = config or Config()
     page = report_html(calibration, config, as_json(calibration, config, inputs, CREATED))
     parsed = Balance()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files for drive controllers, devices and noises, by those systems' own names."""
+"""Files for drive controllers and devices, and noise files, with the names of these systems."""
 
 from dataclasses import replace
 from math import tau
@@ -32,7 +32,7 @@ def wheels(good):
                           track_width=Estimate(1.53, 1e-3, 'm'))
 
 
-def test_every_key_is_one_of_the_system_it_goes_into(good):
+def test_every_key_exists_in_its_target_system(good):
     bias = {f'gyro_bias_{a}': Estimate(0.1, 1e-5, 'rad/s') for a in 'xyz'}
     whole = with_estimates(wheels(good), **bias)
     options = {'wheels__pulses_per_revolution': 40.0, 'odometer__track_width': 1.5,
@@ -54,7 +54,7 @@ def test_every_key_is_one_of_the_system_it_goes_into(good):
     assert foreign_keys.UBLOX_FACTOR_ID in written['wheel_input.txt']
 
 
-def test_every_file_says_where_it_goes(good):
+def test_every_file_names_its_target_system(good):
     written = texts(good, wheels__pulses_per_revolution=40.0)
     for name, word in (('calibration.yaml', '# for the node calibrator'),
                        ('vehicle_velocity_converter.param.yaml', '# for autoware vehicle_vel'),
@@ -65,8 +65,8 @@ def test_every_file_says_where_it_goes(good):
         assert word in written[name], name
 
 
-def test_devices_are_told_the_wheel_in_their_units(good):
-    # 0.05 m a pulse: 50 000 um, 20 pulses a metre; 40 pulses a turn: 2 m round
+def test_devices_get_the_wheel_in_their_units(good):
+    # 0.05 m per pulse: 50 000 um, 20 pulses per metre; 40 pulses per turn: 2 m circumference
     lines = texts(good, wheels__pulses_per_revolution=40.0)['wheel_input.txt'].splitlines()
     assert [line for line in lines if line and not line.startswith('#')] == [
         'CFG-SFODO-FACTOR = 50000', 'gain: 20.0', 'Pulses per metre = 20',
@@ -77,14 +77,14 @@ def test_devices_are_told_the_wheel_in_their_units(good):
 
 
 @pytest.mark.parametrize('pulses', [0.0, 40.5])
-def test_systems_that_count_turns_are_left_out_without_whole_ticks_a_turn(good, pulses):
+def test_systems_that_count_turns_are_omitted_without_whole_ticks_per_turn(good, pulses):
     text = texts(good, wheels__pulses_per_revolution=pulses)['wheel_input.txt']
     assert 'SETWHEELPARAMETERS' not in text
     assert 'WENC_RADIUS' not in text
     assert 'wheels.pulses_per_revolution' in text
 
 
-def test_each_wheel_has_its_multiplier_and_a_told_width_none(good):
+def test_each_wheel_has_a_multiplier_and_a_configured_track_width_has_none(good):
     found = controllers(good)
     assert found == {'diff_drive_controller': {'left_wheel_radius_multiplier': 1.25,
                                                'right_wheel_radius_multiplier': 1.25}}
@@ -100,14 +100,14 @@ def test_each_wheel_has_its_multiplier_and_a_told_width_none(good):
 @pytest.mark.parametrize(('unit', 'settings', 'radius'), [
     ('m/rad', {}, 0.05), ('m/pulse', {'wheels__pulses_per_revolution': 40.0}, 2 / tau),
     ('1', {'wheels__radius': 0.3}, 0.015)])
-def test_the_radius_follows_from_the_factor(good, unit, settings, radius):
+def test_the_radius_follows_from_the_scale_factor(good, unit, settings, radius):
     found = controllers(with_estimates(good, scale_factor=Estimate(0.05, 1e-6, unit)), **settings)
     for name, keys in foreign_keys.ROS2_CONTROLLERS.items():
         if name != 'diff_drive_controller':
             assert found[name] == pytest.approx(dict.fromkeys(keys, radius))
 
 
-def test_nothing_is_written_of_what_is_not_determined(good):
+def test_undetermined_values_are_not_written(good):
     lost = {n: Estimate(None, None, 'm/pulse') for n in ('scale_factor', 'scale_ratio')}
     written = texts(with_estimates(good, **lost))
     assert {'wheel_input.txt', 'ros2_controllers.yaml'}.isdisjoint(written)
@@ -119,7 +119,7 @@ def blocks(text):
     return {name: block['ros__parameters'] for name, block in yaml.safe_load(text).items()}
 
 
-def test_the_covariance_of_two_wheels_in_closed_form(smoothed):
+def test_the_covariance_of_two_wheels_agrees_with_the_closed_form(smoothed):
     """Two readings per interval, a walk, sigmas of scale and width; the drive turns on average."""
     found = blocks(texts(smoothed)[TWIST])['diff_drive_controller']
     assert list(found) == [foreign_keys.TWIST_COVARIANCE]
@@ -141,7 +141,7 @@ def with_details(smoothed, **changed):
     return replace(smoothed, legs=(replace(leg, methods={'smoother': method}),))
 
 
-def test_the_table_by_speed_and_turn_rate(smoothed):
+def test_the_table_depends_on_speed_and_turn_rate(smoothed):
     sliding = with_details(smoothed, sideslip={'value': 0.003, 'sigma': 0.0})
     table = blocks(texts(sliding)[TWIST])['wheel_odometry_covariance']
     assert table['period'] == 0.1
@@ -153,7 +153,7 @@ def test_the_table_by_speed_and_turn_rate(smoothed):
     assert slid[-1] == pytest.approx(expected[-1] - expected[1], rel=0.02)
 
 
-def test_of_a_speed_in_coarse_steps_only_the_grid_counts(smoothed):
+def test_the_covariance_of_a_coarse_speed_depends_only_on_its_step(smoothed):
     """The fit does not use the integral of such a speed: its travel noise is not estimated."""
     details = smoothed.legs[0].methods['smoother'].details
     coarse = with_details(
@@ -179,7 +179,7 @@ def test_two_point_results_have_no_noise_files(good):
     assert not {TWIST, IMU} & texts(good).keys()
 
 
-def test_only_errors_of_the_imu_that_the_drive_determined(smoothed):
+def test_only_imu_errors_that_the_drive_determined_are_written(smoothed):
     found = blocks(texts(smoothed)[IMU])['imu_errors']
     assert set(found) == {'gyro_scale_z', 'accelerometer_bias_x', *(
         f'gyro_bias_{axis}' for axis in 'xyz')}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result folders: one calibration or the other, never parts of two, whatever goes on beside."""
+"""Result folders contain one calibration, also after concurrent writes, failures and kills."""
 
 from contextlib import suppress
 import errno
@@ -38,13 +38,13 @@ def held(place):
 
 @pytest.fixture
 def refuse(monkeypatch):
-    """Return a function that makes the disk refuse the n-th step."""
+    """Return a function that makes the n-th disk operation fail."""
     def at(step, code=errno.ENOSPC):
         return Refusing(step, code).put_in(monkeypatch)
     return at
 
 
-def test_a_new_folder_an_empty_one_and_an_old_result(tmp_path):
+def test_a_result_is_written_to_a_new_an_empty_and_an_old_folder(tmp_path):
     place = tmp_path / 'deep' / 'out'
     put(place, 'one', force=False)
     assert held(place) == texts('one')
@@ -56,7 +56,7 @@ def test_a_new_folder_an_empty_one_and_an_old_result(tmp_path):
     assert sorted(p.name for p in (tmp_path / 'deep').iterdir()) == ['out']
 
 
-def test_what_is_not_ours_stays_and_the_folder_is_the_same(tmp_path):
+def test_other_files_and_the_folder_itself_are_kept(tmp_path):
     place = tmp_path / 'out'
     put(place, 'one')
     (place / 'mine').mkdir()
@@ -68,7 +68,7 @@ def test_what_is_not_ours_stays_and_the_folder_is_the_same(tmp_path):
     assert sorted(p.name for p in place.iterdir()) == ['main.json', 'mine']
 
 
-def test_the_folder_that_one_stands_in_and_a_link_to_it_stay(tmp_path, monkeypatch):
+def test_the_working_directory_and_a_link_to_the_folder_are_kept(tmp_path, monkeypatch):
     put(tmp_path / 'out', 'one')
     monkeypatch.chdir(tmp_path / 'out')
     put(Path('.'), 'two')
@@ -82,7 +82,7 @@ def test_the_folder_that_one_stands_in_and_a_link_to_it_stay(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize('foreign', [False, True])
-def test_a_result_is_refused_without_force(tmp_path, foreign):
+def test_an_existing_result_is_not_replaced_without_force(tmp_path, foreign):
     put(tmp_path / 'out', 'one')
     if foreign:
         (tmp_path / 'out' / 'mine').touch()
@@ -94,7 +94,7 @@ def test_a_result_is_refused_without_force(tmp_path, foreign):
 
 
 @pytest.mark.parametrize('old', [None, 'ours', 'foreign'])
-def test_a_disk_that_refuses_any_one_step_leaves_all_as_it_was(tmp_path, refuse, old):
+def test_any_failed_disk_operation_leaves_the_old_or_the_new_result(tmp_path, refuse, old):
     place = tmp_path / 'out'
     steps = 0
     while True:
@@ -117,7 +117,7 @@ def test_a_disk_that_refuses_any_one_step_leaves_all_as_it_was(tmp_path, refuse,
         after = held(place) if place.exists() else None
         mine = {'mine': 'keep'} if old == 'foreign' else {}
         whole_now = texts('two') | mine
-        # the last step tells the disk to keep the names: by then the new ones stand
+        # the last operation syncs the folder: the new names already exist
         assert after in (before, whole_now) or MAIN not in after, disk.steps[-1]
         assert not list(tmp_path.rglob('.*'))
     assert steps > 12
@@ -133,7 +133,7 @@ def write_many(place, tag, force, ready, out):
 
 
 @pytest.mark.parametrize('force', [False, True])
-def test_of_several_at_once_without_force_exactly_one_succeeds(tmp_path, force):
+def test_of_several_writers_without_force_exactly_one_succeeds(tmp_path, force):
     context = multiprocessing.get_context('fork')
     for turn in range(10):
         place, out, ready = tmp_path / str(turn), context.Queue(), context.Event()
@@ -152,7 +152,7 @@ def test_of_several_at_once_without_force_exactly_one_succeeds(tmp_path, force):
     assert sorted(os.listdir(tmp_path)) == sorted(map(str, range(10)))
 
 
-def test_a_file_added_late_goes_to_its_own_result_only(tmp_path):
+def test_a_late_file_is_added_only_to_its_own_result(tmp_path):
     first = put(tmp_path / 'out', 'one')
     assert first.add('late.html', 'one late')
     second = put(tmp_path / 'out', 'two')
@@ -161,20 +161,20 @@ def test_a_file_added_late_goes_to_its_own_result_only(tmp_path):
     assert held(tmp_path / 'out') == texts('two')
 
 
-def exchange_for_ever(place):
+def swap_repeatedly(place):
     for turn in range(10**6):
         put(place, turn, 'main.json', f'{"ab"[turn % 2]}.txt')
 
 
 @pytest.mark.parametrize('foreign', [False, True])
-def test_a_kill_leaves_one_result_or_none_and_the_next_clears_away(tmp_path, foreign):
+def test_a_kill_leaves_one_result_or_none_and_the_next_write_cleans_up(tmp_path, foreign):
     context = multiprocessing.get_context('fork')
     place = tmp_path / 'out'
     put(place, 0, 'main.json', 'a.txt')
     if foreign:
         (place / 'mine').touch()
     for turn in range(20):
-        one = context.Process(target=exchange_for_ever, args=(place,))
+        one = context.Process(target=swap_repeatedly, args=(place,))
         one.start()
         one.join(0.02 + 0.003 * turn)
         one.kill()
@@ -187,12 +187,12 @@ def test_a_kill_leaves_one_result_or_none_and_the_next_clears_away(tmp_path, for
         if MAIN in now:
             assert set(now) == {MAIN, f'{"ab"[int(tags.pop()) % 2]}.txt'}
         else:
-            assert foreign      # exchanged file by file: then nothing vouches for the others
+            assert foreign      # replaced file by file: no result without the main file
     put(place, 'last')
     assert not list(tmp_path.rglob('.*'))
 
 
-def test_without_an_exchange_in_one_step_it_is_done_in_two(tmp_path, monkeypatch):
+def test_without_an_atomic_swap_folders_are_replaced_in_two_steps(tmp_path, monkeypatch):
     class Old:
         renameat2 = None
     monkeypatch.setattr(atomic_files.ctypes, 'CDLL', lambda *_, **__: Old)
@@ -200,14 +200,14 @@ def test_without_an_exchange_in_one_step_it_is_done_in_two(tmp_path, monkeypatch
     put(tmp_path / 'out', 'two')
     assert held(tmp_path / 'out') == texts('two')
     assert os.listdir(tmp_path) == ['out']
-    # killed between the two steps: the next puts the old one back first
+    # killed between the two steps: the next write restores the old folder first
     (tmp_path / 'out').rename(tmp_path / f'.out.{"0" * 32}.part.old')
     with pytest.raises(BadUsage, match='exists'):
         put(tmp_path / 'out', 'three', force=False)
     assert held(tmp_path / 'out') == texts('two')
 
 
-def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
+def test_ctrl_c_waits_for_the_swap(tmp_path, monkeypatch):
     put(tmp_path / 'out', 'one')
     swap = atomic_files._swap
 
@@ -215,7 +215,7 @@ def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         swap(*paths)
     monkeypatch.setattr(atomic_files, '_swap', interrupted)
-    # a shell's background jobs have it ignored
+    # background jobs of a shell ignore SIGINT
     signal.signal(signal.SIGINT, signal.default_int_handler)
     one = ResultFolder(tmp_path / 'out', MAIN, OURS)
     with pytest.raises(KeyboardInterrupt):
@@ -226,7 +226,7 @@ def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_the_shield_of_ctrl_c_is_for_the_main_thread_only():
+def test_the_delay_of_ctrl_c_has_no_effect_in_other_threads():
     done = []
     thread = threading.Thread(
         target=lambda: [done.append(1) for _ in [atomic_files.uninterrupted()]])
@@ -235,7 +235,7 @@ def test_the_shield_of_ctrl_c_is_for_the_main_thread_only():
     assert done == [1]
 
 
-def test_a_write_that_breaks_off_leaves_the_old_file_and_no_litter(tmp_path, refuse):
+def test_a_failed_write_leaves_only_the_old_file(tmp_path, refuse):
     path = tmp_path / 'a.json'
     atomic_files.write_text(path, 'old')
     for step in range(1, 6):

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The track as a map shows it, and the table of legs."""
+"""The track in GeoJSON, and the table of legs."""
 
 import csv
 from dataclasses import replace
@@ -41,7 +41,7 @@ def with_leg(calibration, **changed):
     return replace(calibration, legs=(replace(calibration.legs[0], **changed),))
 
 
-def test_the_shape_is_that_of_rfc_7946(driven):
+def test_the_structure_conforms_to_rfc_7946(driven):
     whole = features(driven)
     assert whole['type'] == 'FeatureCollection'
     assert 'crs' not in whole            # RFC 7946, section 4: WGS 84 and nothing else
@@ -54,7 +54,7 @@ def test_the_shape_is_that_of_rfc_7946(driven):
         assert feature['properties']['leg'] == 1
 
 
-def test_longitude_comes_first_and_the_track_lies_where_it_was_driven(driven):
+def test_longitude_comes_first_and_positions_agree_with_the_track(driven):
     from pyproj import Geod
     line = np.array(of_kind(driven, 'corrected')[0]['geometry']['coordinates'])
     assert line[0].tolist() == [8.0, 50.0, 200.0]
@@ -82,7 +82,7 @@ def test_fixes_without_a_height_have_two_coordinates(driven):
     assert {len(p) for p in fixes['geometry']['coordinates']} == {2}
 
 
-def test_a_line_over_the_180th_meridian_is_cut_there(driven):
+def test_a_line_across_the_180th_meridian_is_cut_there(driven):
     track = driven.legs[0].track_n + [0.0, 0.0, 5.0]
     track[:, 1] = track[:, 0]           # to the north-east
     there = with_leg(driven, origin=(*np.deg2rad([-17.0, 179.9952]), 0.0), track_n=track)
@@ -95,13 +95,13 @@ def test_a_line_over_the_180th_meridian_is_cut_there(driven):
     assert (west[:, 0] > 179).all()
     assert (east[:, 0] < -179).all()
     assert len(west) + len(east) == 21 + 2
-    # the cut lies on the line: as far north as the way to the east asks, to the digits kept
+    # the cut is on the line: its latitude is interpolated by longitude, to the stored digits
     share = (180.0 - west[-2, 0]) / (east[1, 0] + 360.0 - west[-2, 0])
     assert 0.1 < share < 0.9
     assert west[-1, 1] == pytest.approx(west[-2, 1] + share * (east[1, 1] - west[-2, 1]), abs=2e-8)
 
 
-def test_a_long_leg_is_thinned_and_says_so(driven):
+def test_the_points_of_a_long_leg_are_thinned_and_counted(driven):
     rows = np.zeros((MOST * 3, 3))
     rows[:, 0] = np.arange(len(rows))
     fixes, = of_kind(with_leg(driven, reference_n=rows), 'fixes')
@@ -118,7 +118,7 @@ def rows_of(calibration):
     return list(csv.DictReader(io.StringIO(text['legs.csv'])))
 
 
-def test_the_table_has_a_row_a_leg_and_the_unit_in_the_head(good, nothing):
+def test_the_table_has_one_row_per_leg_and_units_in_the_header(good, nothing):
     lost = replace(nothing.legs[0], bag='a, "b"')
     first, second = rows_of(replace(good, legs=(good.legs[0], lost)))
     assert (first['leg'], second['leg'], second['bag']) == ('1', '2', 'a, "b"')
@@ -135,7 +135,7 @@ def test_the_table_has_a_row_a_leg_and_the_unit_in_the_head(good, nothing):
     assert (second['verdict'], second['reasons']) == ('rejected', 'NO_FIX')
 
 
-def test_the_table_gives_each_value_by_the_method_that_the_whole_takes(good):
+def test_the_table_has_each_value_of_the_method_used_for_the_result(good):
     leg = good.legs[0]
     other = replace(leg.methods['two_point'], name='smoother', estimates={
         'yaw_mounting_angle': replace(good.estimates['yaw_mounting_angle'], value=0.5)})

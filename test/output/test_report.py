@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""report.html: whole, valid, alone, with every number, and as a browser shows it."""
+"""report.html: complete, valid, self-contained, with every number."""
 
 from dataclasses import replace
 from html import unescape
@@ -25,7 +25,7 @@ MADE = '2026-01-02 03:04:05 UTC'
 FIGURES = ('Track', 'Residuals', 'Scale by section', 'Speed and turn rate', 'Fix quality')
 
 
-def test_a_leg_is_told_whole(good):
+def test_the_report_of_a_leg_is_complete(good):
     page, text, parsed = page_of(drawn(good))
     assert 'accepted : ready to use; scale factor 0.0500000 ± 0.0000012 m/pulse' in text
     for part in ('20.00000 ± 0.00048 pulses/m', '24 ppm', '+25.0000 ± 0.0030 %',
@@ -40,7 +40,7 @@ def test_a_leg_is_told_whole(good):
         assert words in text, words
 
 
-def test_every_number_of_the_result_is_there_in_full(good):
+def test_every_number_of_the_result_has_all_digits_in_the_report(good):
     third = {name: replace(e, value=e.value and e.value / 3, sigma=e.sigma and e.sigma / 3)
              for name, e in good.estimates.items()}
     good = replace(good, estimates=third)
@@ -54,7 +54,7 @@ def test_every_number_of_the_result_is_there_in_full(good):
         assert repr(number) in text, number
 
 
-def test_any_set_of_methods_stands_side_by_side(good):
+def test_methods_are_shown_side_by_side(good):
     _, text, parsed = page_of(three_methods(good))
     assert 'Methods and legs side by side' in text
     assert 'method two point smoother wheels' in text, 'the result is of the first'
@@ -86,7 +86,7 @@ def test_each_panel_of_the_comparison_has_the_rows_that_have_a_value(good):
     assert len(re.findall('>leg [12], smoother<', panels)) == 4
 
 
-def test_what_is_rejected_or_missing_renders_too(rejected, nothing, good):
+def test_rejected_and_missing_values_are_rendered(rejected, nothing, good):
     _, text, _ = page_of(rejected)
     assert 'rejected : do not use these values' in text
     assert text.index('GYRO_SIGN') < text.index('TOPIC_GAP')
@@ -107,7 +107,7 @@ def test_what_is_rejected_or_missing_renders_too(rejected, nothing, good):
 
 
 @pytest.mark.parametrize('rows', [0, 1, 2])
-def test_evidence_of_next_to_nothing_renders_too(good, rows):
+def test_evidence_of_very_few_rows_is_rendered(good, rows):
     few = evidence(max(rows, 1), 1)
     none = np.empty(0)
     few = replace(few, **{name: getattr(few, name)[:rows] for name in (
@@ -117,7 +117,7 @@ def test_evidence_of_next_to_nothing_renders_too(good, rows):
     page_of(replace(good, legs=(replace(good.legs[0], evidence=few),)))
 
 
-def test_names_from_outside_are_text_not_markup(good):
+def test_untrusted_names_are_text_not_markup(good):
     evil = '<script>alert("x")</script>&amp;\'--><b>'
     inputs = [{'bag': evil, 'sha256': 'cd' * 32, 'topics': {'imu': f'/{evil}'}}]
     config = with_settings(Config(), {'odometer.field': evil, 'imu.grade': 'tactical'})
@@ -127,7 +127,7 @@ def test_names_from_outside_are_text_not_markup(good):
     assert 'imu.grade tactical consumer' in text
 
 
-def test_many_legs_stay_within_the_size(good, monkeypatch):
+def test_the_report_of_many_legs_stays_within_the_size_limit(good, monkeypatch):
     # room for the figures of one leg and a half
     one = sum(len(drawing) for leg in report._draw_figures(drawn(good))[0]
               for *_, drawing in leg['figures'])
@@ -136,21 +136,21 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
     legs = tuple(replace(leg, start_ns=leg.start_ns + k * 10**12) for k in range(3))
     _, text, _ = page_of(replace(good, legs=legs))
     assert 'figures of the newest legs only, none of legs 1, 2.' in text
-    # one alone is shown however large it is: the newest
+    # the newest leg is always shown, whatever its size
     monkeypatch.setattr(report, 'MOST_BYTES', 10)
     reported, _, missing = report._draw_figures(replace(good, legs=legs))
     assert [bool(leg['figures']) for leg in reported] == [False, False, True]
     assert missing == [1, 2]
 
 
-def test_a_page_is_the_same_each_time_and_leaves_no_trace_in_matplotlib(good):
+def test_a_page_is_reproducible_and_does_not_change_matplotlib_settings(good):
     import matplotlib
     before = dict(matplotlib.rcParams)
     assert page_of(drawn(good))[0] == page_of(drawn(good))[0]
     assert dict(matplotlib.rcParams) == before
 
 
-def test_the_file_is_written_last_and_only_when_asked(good, nothing, tmp_path):
+def test_the_report_is_written_last_and_only_if_configured(good, nothing, tmp_path):
     written = write_results(drawn(good), Config(), tmp_path, INPUTS, CREATED)
     assert (written[0].name, written[-1].name) == ('calibration.json', 'report.html')
     assert '<svg' in written[-1].read_text()
@@ -161,7 +161,7 @@ def test_the_file_is_written_last_and_only_when_asked(good, nothing, tmp_path):
 
 
 @pytest.mark.parametrize('error', [ImportError('no', name='matplotlib'), ValueError('<odd>')])
-def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error):
+def test_a_failed_report_does_not_prevent_the_other_files(good, tmp_path, monkeypatch, error):
     def fail(*_):
         raise error
 
@@ -177,7 +177,7 @@ def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error)
     assert why in reported[0]
 
 
-def test_the_four_most_important_values_stand_under_the_verdict_of_a_result(good, nothing):
+def test_the_four_main_values_are_shown_below_the_verdict(good, nothing):
     page = page_of(good)[0]
     head = page.partition('class="headline"')[2].partition('</dl>')[0]
     assert re.findall(r'<dt>(.*?)</dt>', head)[:3] == [

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures of the report: what they mark, what is left out, how a browser shows them."""
+"""Figures of the report: their marks and omissions, and the layout in a browser."""
 
 from dataclasses import replace
 from html import unescape
@@ -28,7 +28,7 @@ FLAGS = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-
          '--hide-scrollbars', '--force-device-scale-factor=1')
 
 
-def test_what_is_odd_is_marked_on_the_track(good):
+def test_gaps_and_unused_fixes_are_marked_on_the_track(good):
     def words(found):
         smoothed = {'slips': [{'t': 50.0, 'duration': 1.0}]}
         with apply_style():
@@ -46,7 +46,7 @@ def test_what_is_odd_is_marked_on_the_track(good):
     assert '>no fix used<' in words(lost)
 
 
-def test_of_many_legs_the_newest_are_side_by_side(good, monkeypatch):
+def test_the_newest_of_many_legs_are_shown_side_by_side(good, monkeypatch):
     monkeypatch.setattr(scale_plots, 'MOST_LEGS', 2)
     with apply_style():
         result = replace(good, legs=good.legs[:1] * 3)
@@ -94,10 +94,10 @@ def shown(page, folder, *options):
 
 @pytest.mark.skipif(not CHROMIUM, reason='NO CHROMIUM FOUND: the report was not looked at in a '
                     'browser; apt-get install chromium')
-def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
+def test_a_browser_shows_the_figures_without_overflow(good, tmp_path):
     page = tmp_path / 'report.html'
     html, _, _ = page_of(three_methods(good))
-    # what only a browser knows: the layout, given in the title
+    # the browser returns the layout in the title
     probe = ('<script>addEventListener("load", () => { document.title = JSON.stringify({'
              'wide: document.documentElement.scrollWidth, view: innerWidth,'
              'figures: [...document.querySelectorAll("figure svg")].map(s => '
@@ -113,7 +113,7 @@ def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
              '</script></body>')
     page.write_text(html.replace('</body>', probe))
     import json
-    for width in (1280, 500):      # 500: the least that a headless window can be
+    for width in (1280, 500):      # 500: smallest headless window
         reported = shown(page, tmp_path, f'--window-size={width},900', '--dump-dom')
         layout = json.loads(unescape(re.search(r'<title>(.*?)</title>', reported).group(1)))
         assert layout['wide'] <= layout['view'], width

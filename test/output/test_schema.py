@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""calibration.json: its schema, its content, and how files come to the disk."""
+"""calibration.json: its schema, its content, and the written files."""
 
 import json
 from pathlib import Path
@@ -39,7 +39,7 @@ def content(legs, config):
     return json.loads(json.dumps(as_json(combine(legs, config), config, [], 'now')))
 
 
-def test_what_is_written_has_the_schema(validator):
+def test_written_results_conform_to_the_schema(validator):
     made = drive(scenario='straight', duration=200.0)
     config = settings(made)
     good = calibrate(made.leg(), config)
@@ -49,7 +49,7 @@ def test_what_is_written_has_the_schema(validator):
 
 
 @pytest.mark.parametrize('path', EARLIER, ids=lambda path: path.stem)
-def test_what_earlier_releases_wrote_is_read(path, validator, capsys):
+def test_results_of_earlier_releases_are_read(path, validator, capsys):
     stored = json.loads(path.read_text())
     version = '.'.join(re.findall(r'\d+', path.stem))
     assert stored['software'] == f'odocal_ros {version}'
@@ -65,7 +65,7 @@ def test_what_earlier_releases_wrote_is_read(path, validator, capsys):
     lambda c: c['result'].pop('scale_factor'),
     lambda c: c['result']['yaw_mounting_angle'].update(unit='deg'),
     lambda c: c['legs'][0].pop('start_ns'), lambda c: c['reasons'][0].update(code='odd one')])
-def test_a_break_of_the_contract_is_seen(spoil, validator):
+def test_the_schema_rejects_invalid_content(spoil, validator):
     stored = json.loads(EARLIER[0].read_text())
     spoil(stored)
     assert not validator.is_valid(stored)
@@ -110,7 +110,7 @@ def test_json_of_a_method_and_a_leg(good):
                                          'percent_of_distance': 1.8e-4}
 
 
-def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing, rejected):
+def test_json_has_null_instead_of_nan_for_unknown_values(good, nothing, rejected):
     content = as_json(good, Config(), [], CREATED)
     assert content['result']['pitch_mounting_angle']['value'] is None
     assert content['methods']['two_point']['odd'] is None
@@ -129,14 +129,14 @@ def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing, re
     assert kept['result']['scale_factor']['value'] == 0.05
 
 
-def test_write_returns_what_lies_there(good, tmp_path):
+def test_write_returns_the_written_files(good, tmp_path):
     written = write_results(good, Config(), tmp_path / 'deep' / 'out', INPUTS, CREATED)
     assert written[0].name == 'calibration.json'
     assert sorted(written) == sorted((tmp_path / 'deep' / 'out').iterdir())
     assert json.loads(written[0].read_text()) == as_json(good, Config(), INPUTS, CREATED)
 
 
-def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path):
+def test_a_folder_never_has_files_of_two_calibrations(good, nothing, tmp_path):
     (tmp_path / 'mine.txt').write_text('keep')
     write_results(good, Config(), tmp_path, INPUTS, CREATED)
     assert (tmp_path / 'imu_transform.urdf').exists()
@@ -145,7 +145,7 @@ def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path)
         'calibration.json', 'calibration.yaml', 'report.html', 'mine.txt'}
 
 
-def test_only_the_asked_formats_are_written_and_a_bad_folder_is_one_sentence(good, tmp_path):
+def test_only_configured_formats_are_written_and_a_bad_folder_is_refused(good, tmp_path):
     config = with_settings(Config(), {'output.formats': ()})
     written = write_results(good, config, tmp_path, INPUTS, CREATED)
     assert [p.name for p in written] == ['calibration.json']

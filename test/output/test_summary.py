@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The summary: figures, screen and sentence as people read them, and the budget."""
+"""The summary: numbers, screen text, sentence and error budget."""
 
 from dataclasses import replace
 import math
@@ -49,11 +49,11 @@ def test_the_largest_error_source_is_given_with_its_share_of_the_variance(good, 
     (0.5, None, '0.5'),
     (0.5, math.nan, '0.5'),
     (math.nan, 0.1, 'unknown')])
-def test_digits_stop_where_the_sigma_begins(value, sigma, text):
+def test_values_have_as_many_digits_as_their_sigma(value, sigma, text):
     assert with_sigma(value, sigma) == text
 
 
-def test_figures_have_the_digits_signs_and_units_asked_for():
+def test_numbers_have_the_required_digits_signs_and_units():
     assert with_sigma(0.0174533, 5e-5, math.degrees(1), signed=True) == '+1.0000 ± 0.0029'
     assert with_sigma(-0.0174533, None, math.degrees(1), signed=True) == '-1'
     assert [length_text(x) for x in (11200.3, 1004.2, 12.345, 0.09, 0.0, math.nan)] == [
@@ -69,7 +69,7 @@ def test_figures_have_the_digits_signs_and_units_asked_for():
     assert deviation_text(1.1, None) == '+10 %'
 
 
-def test_a_unit_stays_at_its_number():
+def test_a_line_break_does_not_separate_a_number_from_its_unit():
     text = 'uncertainty is 21 %, too large; the limit is 5 %, after 16.5 m, ± 0.2 m/s at t = 7 s'
     for width in range(12, 60):
         lines = wrapped(text, width=width)
@@ -77,7 +77,7 @@ def test_a_unit_stays_at_its_number():
         assert ' '.join(line.strip() for line in lines) == text
 
 
-def test_the_screen_says_it_all_in_few_lines(good):
+def test_the_screen_shows_all_values_in_fewer_than_30_lines(good):
     text = screen(good)
     for part in ('ACCEPTED', '1 leg, 11.20 km in 10 min 00 s',
                  '0.0500000 ± 0.0000012 m/pulse   (24 ppm)',
@@ -98,7 +98,7 @@ def test_the_most_severe_reasons_come_first(rejected):
     assert text.index('GYRO_SIGN') < text.index('notes') < text.index('TOPIC_GAP')
 
 
-def test_the_sentence_is_one_line_with_the_figures(good, rejected):
+def test_the_sentence_is_one_line_with_the_values(good, rejected):
     text = sentence(good)
     assert text == (
         'accepted: scale factor 0.0500000 ± 0.0000012 m/pulse (20.00000 ± 0.00048 pulses/m), '
@@ -106,13 +106,13 @@ def test_the_sentence_is_one_line_with_the_figures(good, rejected):
     assert sentence(rejected).startswith('rejected: scale factor 0.05')
 
 
-def test_colour_is_for_terminals_that_ask_for_it(good):
+def test_colours_are_used_only_if_requested(good):
     assert '\x1b' not in screen(good)
     assert screen(good, styled=True).startswith('\x1b[1;32mACCEPTED\x1b[0m: ready to use')
     assert screen(good, styled=True).count('\x1b') == 2
 
 
-def test_methods_stand_side_by_side_where_there_are_several(good):
+def test_several_methods_are_shown_side_by_side(good):
     assert 'method  ' not in screen(good)
     other = replace(good.methods['two_point'], name='smoother', estimates={
         'scale_factor': Estimate(0.05001, 2e-6, 'm/pulse')})
@@ -124,7 +124,7 @@ def test_methods_stand_side_by_side_where_there_are_several(good):
         ['smoother', '0.0500100', '±', '0.0000020', '-', '-', 'accepted']]
 
 
-def test_speeds_have_no_pulses(good):
+def test_pulses_per_metre_are_not_shown_for_speeds(good):
     speed = good.estimates | {'scale_factor': Estimate(0.98, 1e-3, '1')}
     calibration = replace(good, estimates=speed)
     assert 'scale factor 0.9800 ± 0.0010, yaw' in sentence(calibration)
@@ -134,7 +134,7 @@ def test_speeds_have_no_pulses(good):
     assert '2.0000 ± 0.0040 rad/m' in screen(joint)
 
 
-def test_nothing_found_is_said_without_nan(nothing, good):
+def test_undetermined_values_are_shown_without_nan(nothing, good):
     empty = Calibration((), {}, {}, ())
     broken = replace(good, estimates=good.estimates | {
         'scale_factor': Estimate(math.nan, math.nan, 'm/pulse'),
@@ -146,7 +146,7 @@ def test_nothing_found_is_said_without_nan(nothing, good):
     assert '0 of 1 leg usable' in sentence(nothing)
 
 
-def test_legs_pool_their_checks_over_fixes():
+def test_checks_of_legs_are_pooled_by_their_number_of_fixes():
     a, b = TrackCheck(1.0, 5.0, 0.5, 2.0, 0.1), TrackCheck(3.0, 4.0, 1.5, 3.0, 0.05)
     both = pooled_check([(a, 3), (None, 100), (b, 1)])
     assert both.rms == pytest.approx(math.sqrt((3 * 1.0 + 9.0) / 4), rel=1e-15)
@@ -156,7 +156,7 @@ def test_legs_pool_their_checks_over_fixes():
     assert pooled_check([]) is None
 
 
-def test_the_heading_error_of_wheels_is_said_to_hold_the_mounting(good):
+def test_the_heading_error_of_wheels_is_labelled_as_minus_yaw_mounting(good):
     more = {'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')}
     text = screen(replace(good, estimates=good.estimates | more))
     (line,) = (line for line in text.splitlines() if 'heading error' in line)
@@ -164,7 +164,7 @@ def test_the_heading_error_of_wheels_is_said_to_hold_the_mounting(good):
     assert line.endswith('heading error minus yaw mounting')
 
 
-def test_the_coordinates_of_a_lever_arm_share_a_line(good):
+def test_the_coordinates_of_a_lever_arm_are_on_one_line(good):
     arm = {f'odometer_lever_arm_{axis}': Estimate(value, sigma, 'm') for axis, value, sigma in (
         ('x', -0.0058, 0.0031), ('y', None, None), ('z', 0.25, 0.06))}
     lines = screen(replace(good, estimates=dict(good.estimates) | arm)).splitlines()
@@ -187,7 +187,7 @@ def whole(good):
                        'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')})
 
 
-def test_a_narrow_terminal_has_no_broken_lines(good):
+def test_lines_fit_a_narrow_terminal(good):
     text = screen(whole(good), width=80)
     assert max(len(line) for line in text.splitlines()) <= 80
     for part in ('0.0500000 ± 0.0000012 m/pulse', '-1.0000 ± 0.0029 deg', 'wheels', 'WHEEL_SLIP',
@@ -195,7 +195,7 @@ def test_a_narrow_terminal_has_no_broken_lines(good):
         assert part in text, part
 
 
-def test_a_low_terminal_leaves_the_lesser_things_to_the_report(good):
+def test_a_terminal_with_few_rows_omits_details_that_the_report_has(good):
     full = screen(whole(good), width=80).splitlines()
     fits = {rows: screen(whole(good), width=80, rows=rows) for rows in (99, len(full) - 1, 30)}
     assert fits[99].splitlines() == full
@@ -208,7 +208,7 @@ def test_a_low_terminal_leaves_the_lesser_things_to_the_report(good):
     assert 'Drive gently' in fits[30], 'what to do is never left out'
 
 
-def test_a_brief_screen_repeats_nothing_and_names_the_notes_only(good):
+def test_a_brief_screen_omits_details_and_only_names_the_notes(good):
     full, brief = screen(whole(good)), screen(whole(good), brief=True)
     assert len(brief.splitlines()) < len(full.splitlines()) - 15
     for part in ('error budget', 'under 1 %', 'method  ', 'leg  start', 'TOPIC_GAP: a gap'):
@@ -220,7 +220,7 @@ def test_a_brief_screen_repeats_nothing_and_names_the_notes_only(good):
     assert 'leg  start' in screen(several, brief=True)
 
 
-def test_positions_in_a_local_frame_have_no_antenna(good):
+def test_a_tracked_point_replaces_the_antenna_in_a_local_frame(good):
     arms = {f'antenna_lever_arm_{axis}': Estimate(0.5, 0.01, 'm', 'two_point') for axis in 'xyz'}
     seen = replace(whole(good), estimates=good.estimates | arms)
     note = (Reason(Code.LOCAL_FRAME, 'north is unknown'),)
@@ -234,8 +234,8 @@ def test_positions_in_a_local_frame_have_no_antenna(good):
     assert source_label('antenna_lever_arm') == 'antenna lever arm'
 
 
-def test_what_many_legs_say_in_other_figures_is_one_reason(good):
-    """Of 35 legs each is too short by its own way: one line, not 35, and each leg is in it."""
+def test_the_same_reason_of_many_legs_is_one_line(good):
+    """Many legs are too short, each with another length: one line names all of them."""
     reasons = [Reason(Code.LEG_TOO_SHORT, f'leg {n}: {60 + n} m between the marks')
                for n in range(1, 36) if n not in (4, 30)]
     reasons += [Reason(Code.WHEEL_SLIP, f'leg {n}: slip of {n} m') for n in (2, 9)]
@@ -247,8 +247,8 @@ def test_what_many_legs_say_in_other_figures_is_one_reason(good):
 @pytest.mark.parametrize(('error', 'sigma', 'shown'), [
     (0.012, 4e-4, 'gyro scale z        0.98800 ± 0.00040'), (0.004, 4e-4, None),
     (0.012, 5e-3, None)])
-def test_a_gyro_scale_far_from_one_is_said(good, error, sigma, shown):
-    """A gyro that turns 1.2 % too far is to be multiplied by 0.988; near 1, or unsure: nothing."""
+def test_a_gyro_scale_far_from_1_is_shown(good, error, sigma, shown):
+    """A gyro that reads 1.2 % too much needs a factor of 0.988; near 1 or uncertain: not shown."""
     method = good.methods['two_point']
     method = replace(method, details=method.details | {
         'gyro_scale_z': {'value': error, 'sigma': sigma}})
@@ -256,7 +256,7 @@ def test_a_gyro_scale_far_from_one_is_said(good, error, sigma, shown):
     assert (shown in text) if shown else ('gyro scale' not in text)
 
 
-def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
+def test_the_path_ratio_is_shown_with_the_scale(good):
     assert 'path ratio' not in screen(good)
     legs = tuple(replace(good.legs[0], path_ratio=ratio, distance=distance)
                  for ratio, distance in ((0.0505, 1000.0), (0.0508, 2000.0)))
@@ -265,8 +265,8 @@ def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
     assert line.endswith('fixes / odometer, +1.4 % from the scale factor')
 
 
-def test_the_ratio_of_a_truncated_speed_is_beside_the_factor_of_what_is_sent(good):
-    """The path over whole km/h is 0.9947: the factor as sent, 0.8 % above the exact speed's."""
+def test_the_path_ratio_of_a_truncated_speed_is_compared_with_the_factor_as_sent(good):
+    """The path ratio of whole km/h is 0.9947, the factor as sent, 0.8 % above the exact one."""
     estimates = {'scale_factor': Estimate(0.9867, 3e-4, '1'),
                  'scale_factor_as_sent': Estimate(0.9947, 3e-4, '1')}
     text = screen(replace(good, estimates=good.estimates | estimates,
@@ -275,7 +275,7 @@ def test_the_ratio_of_a_truncated_speed_is_beside_the_factor_of_what_is_sent(goo
     assert line.endswith('0.9947   fixes / odometer, +0.0 % from the factor of the raw speed')
 
 
-def test_each_source_has_its_size_and_share_in_the_units_people_use():
+def test_each_error_source_is_shown_with_size_and_share():
     head, fix, heading, small = budget_lines(TABLE, 0.02, 0.01)
     assert head.split() == ['error', 'budget', 'scale,', 'ppm', 'yaw,', 'deg', 'pitch,', 'deg']
     # 4e-5 of 0.02 is 2000 ppm; 3e-3 rad is 0.17 deg and 9 of 25 parts of the variance
@@ -283,7 +283,7 @@ def test_each_source_has_its_size_and_share_in_the_units_people_use():
     assert heading.split() == ['initial', 'heading', '-', '0.23', '64%', '-', 'shared', 'by',
                                'all', 'legs']
     assert small.split() == ['under', '1', '%:', 'quantisation']
-    # what is not determined shows no figure
+    # an undetermined value has no number
     lines = budget_lines(TABLE, 0.02, 0.01, {'yaw_mounting_angle'})
     assert '0.17' not in ''.join(lines)
     assert 'initial heading' in lines[-1]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A method's row follows the leg: its figures are shown, but not as good."""
+"""Verdicts in the table of methods: a method is not better than its legs."""
 
 from dataclasses import replace
 import json
@@ -37,16 +37,16 @@ def later(leg, hours, **changes):
     ((DEAD,), [(DEAD,)], 'rejected'),
     ((), [(SLIP,)], 'caution (leg)'),
     ((FAR,), [(SLIP,)], 'caution'),
-    ((), [(DEAD,), ()], 'accepted'),            # the good leg alone is in the figures
+    ((), [(DEAD,), ()], 'accepted'),            # only the good leg is used
     ((), [(DEAD,), (SLIP,)], 'caution (legs)'),
     ((), [(DEAD,), (DEAD,)], 'rejected (legs)')])
-def test_the_row_is_no_better_than_its_legs(good, of_method, of_legs, shown):
+def test_the_verdict_of_a_method_is_not_better_than_its_legs(good, of_method, of_legs, shown):
     method = replace(good.methods['two_point'], reasons=of_method)
     legs = tuple(later(good.legs[0], k, reasons=reasons) for k, reasons in enumerate(of_legs))
     assert shown_verdict(method, legs) == shown
 
 
-def test_screen_and_report_show_it(good):
+def test_screen_and_report_show_the_verdict_of_the_legs(good):
     method = good.methods['two_point']
     methods = {'two_point': method, 'smoother': replace(method, name='smoother')}
     leg = replace(good.legs[0], reasons=(DEAD,), methods=methods)
@@ -82,7 +82,7 @@ def test_one_bag_is_not_named_and_long_names_keep_the_width(good):
     assert f'legs 1 and 3: {names[0]}; leg 2:' in text
 
 
-def test_what_several_legs_share_is_said_once():
+def test_the_same_reason_of_several_legs_is_shown_once():
     slip, dead = Code.WHEEL_SLIP, Code.WHEEL_DEAD
     reasons = (Reason(slip, 'leg 1: it spun'), Reason(slip, 'leg 3: it spun'),
                Reason(slip, 'leg 2: it slid'), Reason(slip, 'it spun'),

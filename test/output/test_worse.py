@@ -16,7 +16,7 @@ from odocal_ros.settings.config import Config
 
 @pytest.fixture
 def stored_objection(tmp_path):
-    """Return a function: the objection to replacing a calibration by another, both as files."""
+    """Return a function that gives the objection to replacing a stored calibration by another."""
     def run(old, new):
         for name, one in (('old', old), ('new', new)):
             write_results(one, Config(), tmp_path / name, [], CREATED, force=True)
@@ -33,7 +33,7 @@ def next_drive(calibration, **estimates):
     return replace(calibration, legs=legs, estimates=calibration.estimates | estimates)
 
 
-def test_a_rejected_one_is_worse_than_a_good_one_and_anything_may_replace_it(
+def test_a_rejected_result_is_worse_than_a_good_one_and_replaced_by_any(
         stored_objection, good, rejected, nothing):
     assert stored_objection(good, next_drive(rejected)).startswith('the new result is rejected (')
     assert 'GYRO_SIGN' in stored_objection(good, next_drive(rejected))
@@ -60,7 +60,7 @@ def test_scales_of_two_vehicles_are_compared_by_their_relative_sigma(stored_obje
         old, value=old.value / 10, sigma=0.6 * old.sigma)))
 
 
-def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(stored_objection, good):
+def test_a_lost_value_is_worse_and_a_new_one_or_another_unit_is_not(stored_objection, good):
     lost = next_drive(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
     assert stored_objection(good, lost) == (
         'the new result has no yaw mounting angle, the old one has -1.0000 ± 0.0029 deg')
@@ -68,7 +68,7 @@ def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(stored_o
     assert stored_objection(good, next_drive(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
 
 
-def test_more_legs_know_better_even_with_a_larger_sigma(stored_objection, good):
+def test_more_legs_are_better_even_with_a_larger_sigma(stored_objection, good):
     wider = next_drive(good, scale_factor=Estimate(0.05, 1e-4, 'm/pulse'))
     both = replace(wider, legs=(*good.legs, *wider.legs))
     assert stored_objection(good, both) == ''
@@ -77,7 +77,7 @@ def test_more_legs_know_better_even_with_a_larger_sigma(stored_objection, good):
     assert stored_objection(good, replace(wider, legs=good.legs)) != ''
 
 
-def test_what_cannot_be_read_is_no_loss(stored_objection, good, tmp_path):
+def test_an_unreadable_result_may_be_replaced(stored_objection, good, tmp_path):
     stored_objection(good, good)
     (tmp_path / 'old' / 'calibration.json').write_text('{}')
     assert stored_in(tmp_path / 'old') is stored_in(tmp_path / 'gone') is None
@@ -86,7 +86,7 @@ def test_what_cannot_be_read_is_no_loss(stored_objection, good, tmp_path):
 
 
 def test_a_result_of_the_method_wheels_is_read_and_replaced(stored_objection, good):
-    """Older versions have such a method and estimate; it holds the result's own factors."""
+    """Older versions have such a method and estimates."""
     wheels = {'scale_factor_left': Estimate(0.0499, 1e-6, 'm/pulse', 'wheels'),
               'heading_error': Estimate(0.01, 1e-3, 'rad', 'wheels')}
     base = good.methods['two_point']

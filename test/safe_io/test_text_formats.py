@@ -32,7 +32,7 @@ BAGS = ['drive\ntouch x', 'drive\x1b]0;title\x07', 'drive -->', 'drive\udcff', '
 
 
 def calibration():
-    """Return one that writes every file a frame is in."""
+    """Return a calibration for which every file with a frame is written."""
     found = {'scale_factor': Estimate(0.05, 1e-6, 'm/pulse'), 'scale_ratio':
              Estimate(1.25, 1e-5, '1'), 'yaw_mounting_angle': Estimate(0.1, 1e-4, 'rad')}
     found |= {f'gyro_bias_{a}': Estimate(1e-5, 1e-6, 'rad/s') for a in 'xyz'}
@@ -48,7 +48,7 @@ def texts(frame='imu_link', bag='drive', config=None):
 
 
 @pytest.mark.parametrize('frame', ATTACKS)
-def test_a_frame_that_ros_would_not_take_is_replaced_and_said(frame):
+def test_a_frame_that_ros_refuses_is_replaced_and_reported(frame):
     made, written = texts(frame)
     assert [r.code for r in made.reasons] == [Code.FRAME_REPLACED]
     assert 'imu_link is written' in made.reasons[0].text
@@ -56,7 +56,7 @@ def test_a_frame_that_ros_would_not_take_is_replaced_and_said(frame):
     assert written == texts('imu_link')[1]
 
 
-def test_frames_that_ros_takes_pass_and_a_slash_of_ros_1_goes():
+def test_valid_frames_are_kept_and_a_leading_slash_is_removed():
     for frame in ('imu_link', 'car/imu-top.1', '3dm_gx5'):
         made, written = texts(frame)
         assert made.reasons == ()
@@ -67,7 +67,7 @@ def test_frames_that_ros_takes_pass_and_a_slash_of_ros_1_goes():
     assert texts('')[0].reasons == ()
 
 
-def test_a_frame_that_is_set_goes_before_the_one_sent():
+def test_a_configured_frame_takes_precedence_over_the_received_one():
     config = with_settings(Config(), {'frames.imu': 'top'})
     made, written = texts('$(command x)', config=config)
     assert made.reasons == ()
@@ -76,21 +76,21 @@ def test_a_frame_that_is_set_goes_before_the_one_sent():
 
 @pytest.mark.parametrize('frame', [*ATTACKS, '/base_link'])
 @pytest.mark.parametrize('name', ['frames.base', 'frames.imu', 'frames.local'])
-def test_a_setting_that_is_no_frame_is_refused(name, frame):
+def test_an_invalid_frame_setting_is_refused(name, frame):
     with pytest.raises(BadConfig, match=name) as error:
         with_settings(Config(), {name: frame})
     assert str(error.value).isprintable()
 
 
 @pytest.mark.parametrize('name', ['odometer.field', 'odometer.left', 'output.directory'])
-def test_text_that_cannot_be_seen_is_no_setting(name):
+def test_a_setting_with_invisible_characters_is_refused(name):
     for text in ('a\nb', 'a\x1b[2J', 'a\x00', 'a\udcff', 'a\u202eb'):
         with pytest.raises(BadConfig, match='invisible characters'):
             with_settings(Config(), {name: text})
     assert with_settings(Config(), {name: "ü $(x) 'y'"})
 
 
-def test_the_name_of_a_node_has_no_sign_that_ros_refuses():
+def test_the_name_of_a_node_has_only_characters_that_ros_accepts():
     node = ElementTree.fromstring(texts('car/imu-top.1')[1]['imu_transform.launch.xml'])[0]
     assert node.attrib['name'] == 'base_link_to_car_imu_top_1'
 
@@ -111,7 +111,7 @@ def test_the_name_of_a_bag_stays_within_its_comment(bag):
             assert shlex.split(text, comments=True) == shlex.split(plain[name], comments=True)
 
 
-def test_words_come_to_a_command_as_they_are():
+def test_arguments_reach_a_shell_command_unchanged():
     words = ['a b', "it's", '$(touch x)', '`x`', '', '-', 'ü']
     script = f'printf "%s\\0" {text_formats.for_shell(words)}'
     out = subprocess.run(['bash', '-c', script], text=True, stdout=subprocess.PIPE,
@@ -119,7 +119,7 @@ def test_words_come_to_a_command_as_they_are():
     assert out.split('\0')[:-1] == words
 
 
-def test_launch_substitutes_nothing():
+def test_launch_does_not_substitute_escaped_text():
     text = text_formats.for_launch(["$(command 'x')", '"', '\\'])
     # launch's grammar: $( begins a substitution unless a backslash stands before it
     assert '$(' not in text.replace('\\$(', '')
@@ -141,7 +141,7 @@ def test_a_terminal_shows_control_characters_and_keeps_the_style_of_the_verdict(
     assert text_formats.one_line('a\nb\udcff') == 'a\\nb\\udcff'
 
 
-def test_all_commands_print_through_one_door():
+def test_only_cli_py_calls_print():
     folder = Path(text_formats.__file__).parents[1] / 'offline'
     users = {path.name for path in folder.glob('*.py') if 'print(' in path.read_text()}
     assert users == {'cli.py'}
@@ -155,12 +155,12 @@ def test_no_cell_of_a_spreadsheet_is_a_formula():
     assert rows[2].startswith('2,drive,')
 
 
-def test_a_frame_that_nobody_names_leaves_all_as_it_is():
+def test_an_empty_frame_changes_nothing():
     made = calibration()
     assert with_imu_frame(made, Config(), '') == (made, Config())
 
 
-def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
+def test_foreign_colours_are_escaped_and_long_lines_are_cut():
     colours = '\x1b[1;31mstd_msgs/msg/Int64\x1b[0m'
     assert '\x1b' not in text_formats.for_terminal(colours)
     for text in ('x' * 2_000_000, '\x1b' * 2_000_000, '\n' * 2_000_000):
@@ -169,7 +169,7 @@ def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
     assert text_formats.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
 
 
-def test_folders_of_one_name_are_numbered_up_to_a_bound(tmp_path, monkeypatch):
+def test_folders_of_one_name_are_numbered_up_to_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic_files, 'MOST_SAME_NAME', 3)
     made = [atomic_files.new_folder(tmp_path / 'root', 'leg').name for _ in range(3)]
     assert made == ['leg', 'leg-2', 'leg-3']

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings from files and from --set: the same as the node reads, one sentence when wrong."""
+"""Settings from files and --set: read as the node reads them, one sentence per error."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def write(tmp_path):
 @pytest.mark.parametrize(('text', 'values'), [
     *((f'{key}:\n{DISTANCE}50.0\n', {'leg.min_distance': 50.0}) for key in (
         '/**', '/**/calibrator', '/calibrator', 'calibrator', '/*')),
-    # later blocks win, a key that comes again keeps its place, and namespaces may be nested
+    # later blocks take precedence, a repeated key keeps its place, namespaces may be nested
     (f'calibrator:\n{DISTANCE}1.0\n/**:\n{DISTANCE}2.0\n', {'leg.min_distance': 2.0}),
     (f'/**:\n{DISTANCE}2.0\ncalibrator:\n{DISTANCE}1.0\n/**:\n{DISTANCE}5.0\n',
      {'leg.min_distance': 1.0}),
@@ -43,18 +43,18 @@ def write(tmp_path):
      {'leg.min_distance': 50.0, 'leg.min_speed': 1.0, 'method': 'all',
       'gnss.lever_arm': (1.0, 0.0, 0.5)}),
     (BLOCK + '    leg.min_distance: 50\n', {'leg.min_distance': 50.0}),
-    # what a node dumps
+    # output of ros2 param dump
     (BLOCK + '    use_sim_time: true\n    result: {scale_factor: .nan, valid: false}\n'
      '    qos_overrides:\n      /imu/data:\n        subscription: {depth: 10}\n'
      '    start_type_description_service: true\n    method: all\n', {'method': 'all'})])
-def test_a_file_has_the_settings_of_the_node(write, text, values):
+def test_a_file_gives_the_settings_of_the_node(write, text, values):
     found = read_config_file(write(text))
     assert found == values
     assert [type(x) for x in found.values()] == [type(x) for x in values.values()]
 
 
 @pytest.mark.parametrize('key', ['/car1/calibrator', 'imu_driver', '/**/driver', '/calibrator2'])
-def test_blocks_of_other_nodes_are_named_not_taken(write, key):
+def test_blocks_of_other_nodes_are_named_but_not_used(write, key):
     path = write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n')
     with pytest.raises(BadConfig, match=r'no block for the calibrator; it has .*required: a top-'):
         read_config_file(path)
@@ -71,14 +71,14 @@ def test_blocks_of_other_nodes_are_named_not_taken(write, key):
     ('    odometer.left: 0\n', BadConfig, 'write it in quotes'),
     ('    method: [all\n', BadConfig, 'line 4: not valid YAML: '),
     ('    method: "a\x07b"\n', BadConfig, 'not valid YAML: ')])
-def test_what_is_wrong_is_told_with_its_line(write, text, error, match):
+def test_an_error_names_its_line(write, text, error, match):
     with pytest.raises(error, match=match) as caught:
         read_config_file(write(BLOCK + text))
     assert '\n' not in str(caught.value)
 
 
 @pytest.mark.parametrize('text', ['', 'just words\n', '- 1\n', 'leg:\n  min_distance: 5.0\n'])
-def test_a_file_of_something_else_is_refused(write, text):
+def test_a_file_without_settings_of_the_node_is_refused(write, text):
     with pytest.raises(BadConfig, match='no block for the calibrator'):
         read_config_file(write(text))
 
@@ -107,13 +107,13 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     ('odometer.signed=false', 'odometer.signed', False),
     ('verdict.min_legs=3', 'verdict.min_legs', 3),
     (' method = all ', 'method', 'all')])
-def test_set_takes_yaml_and_gives_the_settings_type(text, name, value):
+def test_set_reads_yaml_and_returns_the_type_of_the_setting(text, name, value):
     got = parse_set(text)
     assert got == (name, value)
     assert type(got[1]) is type(value)
 
 
-def test_set_takes_nan_where_a_setting_may_be_unset():
+def test_set_accepts_nan_if_a_setting_may_be_unset():
     assert math.isnan(parse_set('imu.nominal_yaw=nan')[1])
     with pytest.raises(BadConfig, match='NaN is not allowed'):
         parse_set('leg.min_distance=.nan')
@@ -133,7 +133,7 @@ def test_set_takes_nan_where_a_setting_may_be_unset():
     ('leg.max_gap={a: 1}', BadConfig, 'is not a number'),
     ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: the limit is 1e.09'),
     ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'the limit is')])
-def test_set_says_what_is_wrong(text, error, match):
+def test_set_reports_the_error_in_one_line(text, error, match):
     with pytest.raises(error, match=match) as caught:
         parse_set(text)
     assert '\n' not in str(caught.value)
@@ -160,14 +160,14 @@ rclpy.shutdown()
 
 
 def read_by_ros(path) -> dict[str, str]:
-    """Return what a node named calibrator gets from a parameter file, as reprs."""
+    """Return the parameters that a node named calibrator reads from a file, as reprs."""
     out = subprocess.run([sys.executable, '-c', READ_BY_ROS, str(path)], check=True, text=True,
                          capture_output=True, env=os.environ).stdout
     return json.loads(out)
 
 
 @pytest.mark.parametrize('keys', BLOCKS.values(), ids=BLOCKS)
-def test_blocks_count_as_they_do_for_a_node(write, keys):
+def test_blocks_take_precedence_as_in_a_node(write, keys):
     pytest.importorskip('rclpy')
     path = write(''.join(
         f'{key}:\n  ros__parameters:\n    leg.min_distance: {n}.0\n    leg.max_gap: 0.{n}\n'
@@ -177,7 +177,7 @@ def test_blocks_count_as_they_do_for_a_node(write, keys):
         k: by_ros[k] for k in ('leg.min_distance', 'leg.max_gap')}
 
 
-def test_plain_values_are_typed_as_ros_types_them(write):
+def test_plain_values_get_the_same_types_as_in_ros(write):
     pytest.importorskip('rclpy')
     path = write('/**:\n  ros__parameters:\n' + ''.join(
         f'    s{i}: {text}\n' for i, text in enumerate(SCALARS)))
