@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading mcap by columns and message by message: identical bytes, or identical sentences."""
+"""Reading mcap by columns and message by message: identical bytes, or identical errors."""
 
 import random
 import shutil
@@ -28,7 +28,7 @@ MCAPS = ['mcap', 'zstd', 'messages', 'journal']
 
 
 def read(path):
-    """Return what a bag gives: each topic's times and messages, notes, or what is wrong."""
+    """Return topics, times and messages, and notes of a bag, or the error."""
     found = {}
     try:
         with open_bag(path) as bag:
@@ -54,7 +54,7 @@ def clean(tmp_path_factory):
 
 @pytest.fixture
 def walked(monkeypatch):
-    """Count the chunks that had to be walked over."""
+    """Return a list with one entry per chunk that is scanned record by record."""
     count = []
     given = McapFile._messages_by_scan
     monkeypatch.setattr(
@@ -62,7 +62,7 @@ def walked(monkeypatch):
     return count
 
 
-def test_recorded_bags(data_dir, monkeypatch):
+def test_both_readers_agree_on_recorded_bags(data_dir, monkeypatch):
     bags = {p.parent for p in data_dir.rglob('*.mcap')}
     assert len(bags) > 6
     for path in sorted(bags):
@@ -71,7 +71,7 @@ def test_recorded_bags(data_dir, monkeypatch):
 
 
 @pytest.mark.parametrize('name', MCAPS)
-def test_simulated_bags(clean, monkeypatch, name):
+def test_both_readers_agree_on_simulated_bags(clean, monkeypatch, name):
     by_columns, one_by_one = both(clean.bag(name), monkeypatch)
     assert by_columns == one_by_one
     assert sum(map(len, by_columns[1].values())) > 2000
@@ -79,7 +79,7 @@ def test_simulated_bags(clean, monkeypatch, name):
 
 @pytest.mark.parametrize('form', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('lengths', [1, 7])
-def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
+def test_both_readers_agree_on_overlapping_chunks(tmp_path, monkeypatch, walked, form, lengths):
     monkeypatch.setattr(mcap_columns, 'BLOCK', 4000)
     if form != 'zstd':
         monkeypatch.setattr(mcap_write, '_packed', lambda records: (
@@ -101,7 +101,7 @@ def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
         assert found[topic] == sorted(in_turn, key=lambda row: row[0])
 
 
-def test_sound_chunks_are_not_walked_over(clean, walked):
+def test_undamaged_chunks_are_not_scanned_record_by_record(clean, walked):
     with open_bag(clean.bag('mcap')) as bag:
         messages = sum(len(raws) for batch in bag._batches(bag.topics)
                        for _, raws in batch.values())
@@ -111,7 +111,7 @@ def test_sound_chunks_are_not_walked_over(clean, walked):
 
 @pytest.mark.parametrize('large', [False, True])
 @pytest.mark.parametrize('indexed', [False, True])
-def test_rows_of_a_database_of_any_size_and_order(tmp_path, large, indexed):
+def test_rows_of_a_database_are_read_in_any_size_and_order(tmp_path, large, indexed):
     rng = np.random.default_rng(5)
     rows = [('/t', T0 + int(rng.integers(0, 50)), b'\0\1\0\0' + rng.bytes(int(n)))
             for n in rng.integers(0, 60_000 if large else 400, 700)]
@@ -130,7 +130,7 @@ def test_rows_of_a_database_of_any_size_and_order(tmp_path, large, indexed):
 
 
 @pytest.mark.parametrize('another', [True, False], ids=['of another', 'of none'])
-def test_a_message_index_that_lies(tmp_path, monkeypatch, walked, another):
+def test_both_readers_agree_on_a_wrong_message_index(tmp_path, monkeypatch, walked, another):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(60.0))
     file = path / 'bag.mcap'
     data = bytearray(file.read_bytes())
@@ -149,10 +149,10 @@ def test_a_message_index_that_lies(tmp_path, monkeypatch, walked, another):
     by_columns, one_by_one = both(path, monkeypatch)
     assert by_columns == one_by_one
     assert walked
-    assert by_columns[2] == ()          # nothing is lost by it
+    assert by_columns[2] == ()          # no message is lost
 
 
-def test_mutated_bags(clean, tmp_path, monkeypatch):
+def test_both_readers_agree_on_mutated_bags(clean, tmp_path, monkeypatch):
     rng = random.Random(20261123)
     read = 0
     for number in range(MUTATED):
@@ -168,7 +168,7 @@ def test_mutated_bags(clean, tmp_path, monkeypatch):
     assert read > MUTATED / 3
 
 
-def test_types_of_many_layouts_come_as_they_lie(tmp_path, monkeypatch):
+def test_both_readers_agree_on_types_with_many_layouts(tmp_path, monkeypatch):
     rows = [('/odometer', T0 + i, make.joints(T0 + i, ['a' * (1 + i % 5)], [float(i)]))
             for i in range(300)]
     path = ros_bags.write(tmp_path / 'bag', rows)

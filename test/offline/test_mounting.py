@@ -16,9 +16,9 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 
-def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
+def test_an_unobservable_forward_axis_is_assumed_or_left_open():
     t = np.arange(0, 100, 0.02)
-    travel = Travel(t, 10.0 * t, 0.0)               # steady: no push anywhere
+    travel = Travel(t, 10.0 * t, 0.0)               # steady: no acceleration
     rng = np.random.default_rng(1)
     w_i = rng.normal(0, 1e-3, (len(t), 3))
     for up, rpy in (((0, 0, G), [0, 0, 0]), ((0, 0, -G), [math.pi, 0, 0]), ((0, G, 0), None)):
@@ -35,7 +35,7 @@ def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
             np.eye(3)[:, [0, 2]], atol=1e-8)
 
 
-def test_axes_far_from_quarter_turns_are_stated_as_measured():
+def test_axes_far_from_quarter_turns_are_reported_as_measured():
     t, v, w, a = planar()
     C_bi = matrix_from_rpy([0.0, 0.0, math.radians(45)])
     f_b = np.stack([a, v * w, np.full(len(t), G)], -1)

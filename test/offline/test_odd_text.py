@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of any kind in metadata.yaml, journal.yaml and options: one sentence."""
+"""Text of any kind in metadata.yaml, journal.yaml and options: at most one error line."""
 
 from contextlib import suppress
 import random
@@ -36,7 +36,7 @@ def bag(tmp_path_factory):
 
 
 def output(capsys, *argv):
-    """Run a command: 0, 1 or 2, and no more than one line on stderr from exit 2; return both."""
+    """Run a command; require exit code 0, 1, or 2 with one line on stderr; return both."""
     code = main([*map(str, argv)])
     errors = capsys.readouterr().err
     assert code in (0, 1, 2), errors
@@ -44,8 +44,8 @@ def output(capsys, *argv):
     return code, errors
 
 
-def test_metadata_of_any_type(tmp_path, bag, capsys):
-    """Each value of the tree in turn is something else, or gone."""
+def test_metadata_of_any_type_give_at_most_one_error_line(tmp_path, bag, capsys):
+    """Each value of the tree in turn is replaced by an odd one."""
     path = shutil.copytree(bag, tmp_path / 'bag')
     whole = yaml.safe_load((bag / 'metadata.yaml').read_text())
 
@@ -67,7 +67,7 @@ def test_metadata_of_any_type(tmp_path, bag, capsys):
             output(capsys, 'inspect', path)
 
 
-def test_metadata_and_journals_of_any_text(tmp_path, bag, capsys):
+def test_metadata_and_journals_of_any_text_give_at_most_one_error_line(tmp_path, bag, capsys):
     path = shutil.copytree(bag, tmp_path / 'bag')
     for text in TEXTS:
         (path / 'metadata.yaml').write_text(f'rosbag2_bagfile_information: {text}')
@@ -80,7 +80,7 @@ def test_metadata_and_journals_of_any_text(tmp_path, bag, capsys):
             output(capsys, 'replay', path, *QUICK, '--output', tmp_path / 'out', '--force')
 
 
-def test_settings_of_any_text(tmp_path, bag, capsys):
+def test_settings_of_any_text_raise_only_expected_errors(tmp_path, bag, capsys):
     for text in [*TEXTS, '[' * DEEP + ']' * DEEP]:
         for name in ('leg.min_distance', 'imu.lever_arm', 'frames.imu', 'wheels.levels',
                      'output.formats', 'method', 'reference.start', 'no.such'):
@@ -96,7 +96,7 @@ def test_settings_of_any_text(tmp_path, bag, capsys):
     output(capsys, 'inspect', bag, '--config', config)
 
 
-def test_legs_of_any_text():
+def test_legs_of_any_text_raise_only_expected_errors():
     for text in ('1e400:2', ':1e400', '1e999999999:', '-1e30:', 'nan:', 'inf:inf',
                  '9' * 5000 + ':', '1:2:3', '9999-12-31/', '0001-01-01T00:00:00+23:59/', '٣:٤',
                  '\0:', '1_0:2e', '/', '//', 'each-stop:'):
@@ -106,6 +106,6 @@ def test_legs_of_any_text():
                        for edge in (span.start_ns, span.stop_ns)), text
 
 
-def test_a_sentence_ends_somewhere(capsys):
+def test_the_length_of_an_error_line_is_limited(capsys):
     _, errors = output(capsys, 'inspect', 'x' * 50_000)
     assert len(errors) < 2200

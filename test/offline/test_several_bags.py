@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal replay with several bags, and what it says when --force or Ctrl+C ends a result."""
+"""odocal replay with several bags, and its messages after --force or Ctrl+C."""
 
 import json
 import shutil
@@ -45,7 +45,7 @@ def replayed(bags, names, out, *options):
                  'two_point', '--set', 'output.formats=[params]', *options])
 
 
-def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path, capsys):
+def test_each_unusable_bag_is_named_before_any_bag_is_read(bags, tmp_path, capsys):
     names = ['one', 'cut.mcap', 'nofix', 'wheels', 'foreign.txt', 'nosuch']
     assert replayed(bags, names, tmp_path / 'out') == 2
     printed = capsys.readouterr()
@@ -59,7 +59,7 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
     assert not (tmp_path / 'out').exists()
 
 
-def test_an_empty_leg_and_a_speed_beside_counts_are_errors_of_their_bag(bags, tmp_path, capsys):
+def test_an_empty_leg_and_mixed_odometer_units_are_errors_with_the_bag(bags, tmp_path, capsys):
     assert replayed(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
     assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 contains no data' in \
         capsys.readouterr().err
@@ -76,7 +76,7 @@ def test_two_vehicles_are_rejected(bags, tmp_path, capsys):
     assert '  leg 1: one; leg 2: other' in stdout.splitlines()
 
 
-def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
+def test_a_truncated_bag_is_accepted_with_a_complete_one(bags, tmp_path, capsys):
     assert replayed(bags, ['other', 'cut.mcap'], tmp_path / 'out', '--json') == 0
     printed = json.loads(capsys.readouterr().out)
     codes = {r['code'] for r in printed['reasons']}
@@ -85,8 +85,8 @@ def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
     assert 'BAG_TRUNCATED' in {r['code'] for r in printed['legs'][1]['reasons']}
 
 
-def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys, monkeypatch):
-    """A leg that was dropped says nothing, its settings neither."""
+def test_the_settings_of_the_last_used_bag_apply(bags, tmp_path, capsys, monkeypatch):
+    """A dropped leg is not used, and neither are its settings."""
     for name, limit in (('one', 3), ('other', 5), ('dropped', 7)):
         shutil.copytree(bags / name.replace('dropped', 'one'), tmp_path / name)
         (tmp_path / name / JOURNAL).write_text(
@@ -106,7 +106,7 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
     assert 'not the same' not in notes['one dropped'] + notes['one']
 
 
-def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
+def test_bags_with_the_same_name_are_named_by_their_paths(bags, tmp_path, capsys):
     for name in ('one', 'other'):
         shutil.copytree(bags / name, tmp_path / name / 'bag')
     names = ['one/bag', 'other/bag']
@@ -131,12 +131,12 @@ class Args:
 
 
 @pytest.mark.parametrize('quiet', [False, True])
-def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
+def test_a_replaced_better_calibration_is_reported(tmp_path, capsys, quiet):
     write_results(result.Calibration((), {}, {}, ()), Config(), tmp_path, [], CREATED)
     args = Args()
     args.quiet = quiet
     worse = result.Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
-    # the second time a rejected one goes: nothing is lost
+    # the second time a rejected one is replaced: no loss
     for is_stated in (not quiet, False):
         assert replay._report(Calibration(worse), tmp_path, args,
                               replay._TerminalListener(args)) == 1
@@ -158,8 +158,7 @@ def interrupted(*_, **__):
      'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.screen', 'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.sentence', 'the results are in {out}/\n')])
-def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where,
-                                               last_line):
+def test_ctrl_c_reports_the_written_files(bag, tmp_path, capsys, monkeypatch, where, last_line):
     monkeypatch.setattr(where, interrupted)
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 130
     assert capsys.readouterr().err.endswith(last_line.format(out=tmp_path / 'out'))
