@@ -91,7 +91,7 @@ def results(tmp_path_factory):
 
 
 def meant_to_be_typed(line):
-    """Return whether a text is a command line, not a mention (odocal compare A B ...)."""
+    """Return True if a text is a command line, not a mention (odocal compare A B ...)."""
     words = shlex.split(line)
     return len(words) > 2 and not any(word.isupper() or word == '...' for word in words)
 

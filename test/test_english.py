@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Printed text and docs use the terms of CONTRIBUTING.md, not the words that these replace."""
+"""Texts, docs and tests use the terms of CONTRIBUTING.md, not the words that these replace."""
 
 import ast
 from functools import cache
@@ -51,7 +51,7 @@ WORDS = {
     r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words'}
 UNUSED = re.compile(r'(?<![\w/.`:-])(?:(?i:' + '|'.join(WORDS) + r')|Imus?)(?![\w/`-])')
 MODULES = [path for folder in (
-            'odocal_ros', 'reproductions/odocal_reproductions', 'benchmarks', 'tools', 'examples')
+            'odocal_ros', 'reproductions', 'benchmarks', 'tools', 'examples', 'test')
            for path in sorted((ROOT / folder).rglob('*.py'))]
 PAGES = [*sorted(ROOT.glob('*.md')), *sorted((ROOT / 'docs').rglob('*.md'))]
 SETTING_FILES = [path for folder in ('config', 'launch')
@@ -153,6 +153,15 @@ def test_docstrings_and_comments_are_plain():
     # 'name : meaning' and 'name=value' name parameters
     found = [f'{where}: {words}' for where, text in remarks()
              if (words := unused(re.sub(r'\b\w+ :|\b\w+=', ' ', text)))]
+    assert not found, '\n'.join(found)
+
+
+def test_names_of_tests_are_plain():
+    found = [f'{path.relative_to(ROOT)}: {words}: {node.name}'
+             for folder in ('test', 'reproductions/test') for path in (ROOT / folder).rglob('*.py')
+             for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+             if isinstance(node, ast.ClassDef | ast.FunctionDef)
+             and (words := unused(node.name.replace('_', ' ')))]
     assert not found, '\n'.join(found)
 
 

@@ -34,7 +34,7 @@ def at_rest(made):
 
 
 def turning(made, samples):
-    """Return which rows are within the U turn of out_and_back, which is to the left."""
+    """Return a mask of the rows in the U turn of out_and_back, which is to the left."""
     times = np.linspace(0, made.options.duration, 30_000)
     left = times[made.motion.yaw_rate(times) > 0.01]
     t = seconds(made, samples)

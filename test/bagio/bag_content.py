@@ -44,7 +44,7 @@ def file_of(path):
 
 
 def chunks_of(data):
-    """Return where the chunk records of an mcap file stand, and their sizes."""
+    """Return the positions and sizes of the chunk records of an mcap file."""
     at, found = 8, []
     while data[at] != 0x02:
         size = int.from_bytes(data[at + 1:at + 9], 'little')

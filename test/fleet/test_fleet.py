@@ -44,7 +44,7 @@ def table_of(output, name='vehicles'):
 
 
 def computed(client, jobs, **more):
-    """Return how many bags were computed, and the rows' states."""
+    """Return the number of computed bags, and the states of the rows."""
     ended = [done for _, done in computed_rows(client, jobs, **more)]
     return sum(done.computed for done in ended), [done.status for done in ended]
 

@@ -49,7 +49,7 @@ def ends_of(status: dict) -> tuple[int, int]:
 
 
 def within(found: dict, true: float, sigmas: float = 4.0) -> bool:
-    """Return whether a value of a result is the true one; 1 in 16 000 is beyond 4 sigmas."""
+    """Return True if a value is within 4 sigmas of the truth; 1 in 16 000 is not."""
     return abs(found['value'] - true) < sigmas * found['sigma']
 
 

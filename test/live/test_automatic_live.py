@@ -93,7 +93,7 @@ def _a_day_later(found, node, client):
 
 
 def near(status, true):
-    """Return whether the scale of a status agrees with the true one."""
+    """Return True if the scale of a status agrees with the true one."""
     value, sigma = (float(status[f'scale_factor{end}']) for end in ('', '_sigma'))
     return within({'value': value, 'sigma': sigma}, true)
 

@@ -32,7 +32,7 @@ ALL = {'gnss.use_velocity': True, 'odometer.left': 'topic', 'odometer.right': 't
 
 
 def has_field(msgtype, fields):
-    """Return whether a message type has a number at a path of fields."""
+    """Return True if a message type has a number at a path of fields."""
     kind = msgtype
     for field in fields:
         inner = message_class(kind).get_fields_and_field_types()
@@ -94,7 +94,7 @@ def test_the_inputs_have_the_fields_that_the_layouts_plot(topic, fields):
 
 
 def allowed(enclave):
-    """Return what a policy allows: kind -> names, as sros2 expands them."""
+    """Return the names that a policy allows, by kind, as sros2 expands them."""
     policy = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml').getroot()
     profile, = policy.findall(f'enclaves/enclave[@path="{enclave}"]/profiles/profile')
     found = {kind: set() for kind in NAMES}
