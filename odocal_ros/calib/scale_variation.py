@@ -36,8 +36,7 @@ LEG_PARTS, FEWEST_WINDOWS = 8, 12
 LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
 SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
 FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
-# judgement: spread of the speeds over their mean, below which an offset is not separable
-LEAST_SPREAD = 0.1
+LEAST_SPREAD = 0.1    # judgement: of speeds over their mean; below it no offset is separable
 NO_ROWS = np.empty((0, 4))    # definition: no bins, or no windows
 
 
@@ -145,12 +144,12 @@ def _residual_properties(n: int) -> Floats:
     return np.array(table).T
 
 
-def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tuple[Reason,
-                                                                                          ...]:
+def counter_change_reasons(parts: Sections, t_fix: Floats,
+                           distance: Floats) -> tuple[Reason, ...]:
     """
     Return TRACK_MISMATCH if the scale of sections changes once and is constant otherwise.
 
-    parts : scale by section.   t_fix, fix_distance : (k,) times of the fixes, s, and path length
+    parts : scale by section.   t_fix, distance : (k,) times of the fixes, s, and path length
     there, m. The section with the change may have any scale.
     """
     known = np.flatnonzero(np.isfinite(parts.ratio) & (parts.ratio > 0))
@@ -167,7 +166,7 @@ def counter_change_reasons(parts: Sections, t_fix: Floats, fix_distance: Floats)
     if not candidates:
         return ()
     _, k, factor = min(candidates)
-    begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], fix_distance, t_fix)
+    begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
     if not 1 / MOST_DECODING < factor < MOST_DECODING:
         return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
@@ -252,8 +251,7 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     duration, path = np.diff(t), np.diff(distance[knots])
     chord, dead = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, dead_n))
     rolled = np.diff(travel.at(t))
-    half = 0.5        # s before and after a knot, for the mean speed there
-    speed = (travel.at(t + half) - travel.at(t - half)) / (2 * half)
+    speed = travel.at(t + 0.5) - travel.at(t - 0.5)       # mean of 1 s about each knot
     straight = dead > 0.8 * path      # judgement: in tighter turns a chord is too short
     fine = travel.at(t[:-1, None] + duration[:, None] * np.arange(0.0, 1.0, 0.1))
     step = np.diff(fine, axis=1)
@@ -273,8 +271,7 @@ def _fit_cells(length: Floats, rolled: Floats, duration: Floats, change: Floats
                ) -> tuple[tuple[tuple[float, float], ...], Bools]:
     """Return factor, offset and lag of cells, () if not determined, and a mask of used ones."""
     used: Bools = np.ones(len(length), bool)
-    mean_speed = length / duration
-    scale = float(length.sum() / rolled.sum())
+    mean_speed, scale = length / duration, length.sum() / rolled.sum()
     X = np.stack([rolled, duration, scale * change], -1)
     for _ in range(3):      # iterations of outlier rejection
         x, *_ = np.linalg.lstsq(X[used], length[used], rcond=None)
@@ -295,8 +292,8 @@ def _bins(length: Floats, rolled: Floats, duration: Floats) -> Floats:
     order, scale = np.argsort(rolled / duration, kind='stable'), float(length.sum() / rolled.sum())
     rows = []
     for part in np.array_split(order, min(BINS, len(order) // 4)):
-        travel = rolled[part].sum()
-        ratio, n = float(length[part].sum() / travel), len(part)
+        travel, n = rolled[part].sum(), len(part)
+        ratio = float(length[part].sum() / travel)
         square = np.sum((length[part] - ratio * rolled[part])**2)
         rows.append((scale * float(travel / duration[part].sum()), ratio,
                      float(np.sqrt(square * n / (n - 1)) / travel), n))

@@ -15,7 +15,7 @@ the force. Rotations are prefix products, the other values cumulative sums, in c
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TypeVar
+from typing import Self
 
 import numpy as np
 
@@ -33,8 +33,7 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.strapdown import prefix_product
 
-# judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
-STEPS_AT_A_TIME = 2048
+STEPS_AT_A_TIME = 2048    # judgement: they stay in the cache; 256 double the time of a pass
 # definition: indices of the signals that errors of gyro and accelerometer multiply, of: 1, turn
 # rate (3), specific force (3), x and y of the force with its bias. The g-sensitivity of the gyro
 # has the latter, so that an accelerometer bias does not turn the attitude
@@ -42,12 +41,26 @@ OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 
 @dataclass(frozen=True, eq=False)
-class Intervals:
-    """
-    Sums over K intervals, in the axes of b at their starts, and their derivatives.
+class _Sums:
+    """Arrays with a row for each interval or point."""
 
-    R, dv, dp and S are those of docs/method.md (S4); g, a : constants GYRO, ACCEL, M_g and M_a of
-    (S3). A derivative by an accelerometer error has the name A or F, that of dp a double letter.
+    def take(self, rows: slice | Ints) -> Self:
+        """Return the sums of some rows."""
+        return type(self)(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    @classmethod
+    def joined(cls, parts: list[Self]) -> Self:
+        """Return the rows of all parts."""
+        return parts[0] if len(parts) == 1 else cls(**{
+            f.name: np.concatenate([getattr(x, f.name) for x in parts]) for f in fields(cls)})
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals(_Sums):
+    """
+    Sums over K intervals, (S4), in the axes of b at their starts; g, a : constants GYRO, ACCEL.
+
+    A derivative by an accelerometer error has the name A or F, that of dp a double letter.
     """
 
     T: Floats        # (K,) s, length
@@ -70,13 +83,9 @@ class Intervals:
     mean_force: Floats    # (K, 3) m/s^2, measured specific force minus its bias
     longest_step: Floats  # (K,) s, longest time between IMU samples
 
-    def take(self, rows: slice) -> 'Intervals':
-        """Return the intervals of a slice."""
-        return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
-
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class Points(_Sums):
     """Sums from the start of an interval to m times in it; see ``Intervals``."""
 
     interval: Ints   # (m,)
@@ -96,13 +105,6 @@ class Points:
     rate_change: Floats    # (m, 3) rad/s^2, its rate of change
     measured: Floats    # (m, 6) turn rate and specific force minus their biases, means of the step
 
-    def take(self, index: Ints) -> 'Points':
-        """Return the points selected by an index."""
-        return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-
-Some = TypeVar('Some', Intervals, Points)
-
 
 def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
                  travel: Callable[[Floats], Floats], forward: Floats, t_points: Floats,
@@ -115,8 +117,7 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     sorted times between the first and the last keyframe.   constants : (M,), errors GYRO and ACCEL
     of which are subtracted.
     """
-    out: list[Intervals] = []
-    points: list[Points] = []
+    out, points = [], []
     t, K = imu.t, len(imu.key) - 1
     interval = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
     size = max(1, int(STEPS_AT_A_TIME * K / len(t)))
@@ -129,19 +130,12 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
         out.append(chunk.intervals(travel, forward))
         points.append(chunk.points(t_points[inside], steps, interval[inside] - first, first))
         release_mapped_memory()
-    return _joined(Intervals, out), _joined(Points, points)
-
-
-def _joined(cls: type[Some], parts: list[Some]) -> Some:
-    return parts[0] if len(parts) == 1 else cls(**{
-        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+    return Intervals.joined(out), Points.joined(points)
 
 
 def _cross(a: Floats, M: Floats) -> Floats:
     """Return [a x] M: (n, 3), (n, 3, 3)."""
-    x, y, z = (a[:, i, None] for i in range(3))
-    return np.stack([y * M[:, 2] - z * M[:, 1], z * M[:, 0] - x * M[:, 2],
-                     x * M[:, 1] - y * M[:, 0]], axis=1)
+    return np.cross(a[:, :, None], M, axis=1)
 
 
 def _times(step: Floats, signals: Floats) -> Floats:
@@ -155,8 +149,8 @@ class _Chunk:
 
     Of n steps, in the axes of b at the start of their interval: R, v, p : attitude, velocity and
     position at the start of the step.   step_v, step_p : single and double integral of the force
-    over it.   mean, twice : the same of R.   since : s, time to it.   Of K intervals: R_end, dv,
-    dp.
+    over it.   mean, twice : the same of R.   since : s, time to it.   Of intervals: R_end, dv, dp.
+    by_gyro, by_accel : M_g and M_a of docs/method.md (S3).
     """
 
     def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
@@ -171,7 +165,6 @@ class _Chunk:
         # integrals over each step of the signals of OF_GYRO and OF_ACCEL
         self.signals = np.concatenate([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]],
                                       axis=1)
-        # M_g and M_a of docs/method.md (S3)
         self.by_gyro, self.by_accel = np.zeros((3, 5)), np.zeros((3, 3))
         if constants is not None:
             self.by_gyro[layout.GYRO_AXIS, layout.GYRO_SIGNAL] = constants[layout.GYRO]
@@ -219,10 +212,6 @@ class _Chunk:
         start = before[self.key[:-1]]
         return before - start[self.interval], total[self.key[1:] - 1] - start
 
-    def _sum(self, step: Floats) -> Floats:
-        """Return the sum of each interval."""
-        return np.add.reduceat(step, self.key[:-1])
-
     def steps_of(self, t: Floats, interval: Ints) -> Ints:
         """Return the step that each time lies in."""
         return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
@@ -233,8 +222,7 @@ class _Chunk:
         Sum the effects of IMU errors in the steps up to each cut: interval starts and ``steps``.
 
         An error in a step acts on the rest of the interval: a rotation on the rest of dv and dp, a
-        force for the remaining time. Terms that depend on the end are factors of the sums
-        (``_effects``).
+        force for the remaining time. ``_effects`` has the factors that depend on the end.
         """
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
         dt, signals = self.dt[:, None], self.signals
@@ -268,21 +256,21 @@ class _Chunk:
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
-        T, ds = np.diff(self.t[self.key]), np.diff(travel(self.t))[:, None]
+        T, begin, ds = np.diff(self.t[self.key]), self.key[:-1], np.diff(travel(self.t))[:, None]
         S = self.mean * ds[:, :, None]      # of each step
         path_before, path = self._running(S @ forward)
         path_after = path[self.interval] - path_before - S @ forward
         turn_x, forward_x = skew(self.turn), skew(forward)
         in_step = forward_x / 2 + (turn_x @ forward_x + skew(np.cross(self.turn, forward))) / 6
-        S_by_gyro = self._sum(_times(
+        S_by_gyro = np.add.reduceat(_times(
             _cross(path_after, self.mean) + self.R @ in_step * ds[:, :, None],
-            self.signals[:, OF_GYRO]))
+            self.signals[:, OF_GYRO]), begin)
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
-            self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
-        measured = self._sum(self.signals[:, 1:7]) / T[:, None]
+            begin, self.key[1:], self.dv, self.dp, T[:, None, None])
+        rate, force = np.hsplit(np.add.reduceat(self.signals[:, 1:7], begin) / T[:, None], 2)
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
-                         dp_by_gyro, self._sum(S), self._gyro(S_by_gyro), measured[:, :3],
-                         measured[:, 3:], np.maximum.reduceat(self.longest, self.key[:-1]))
+                         dp_by_gyro, np.add.reduceat(S, begin), self._gyro(S_by_gyro),
+                         rate, force, np.maximum.reduceat(self.longest, begin))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
         """Return the sums to times t in steps j: rate and force change uniformly in a step."""

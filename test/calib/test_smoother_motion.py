@@ -100,16 +100,16 @@ def test_tyres_and_springs_depend_on_the_axle_acceleration_for_any_imu_position(
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         _, problem, state = at_truth(imu_lever_arm=arm)
-        pushes = Equations(problem, state).factors['motion'].motion.lean_accelerations[:, :2]
-        found.append((pushes, Axle(problem, state).acceleration(), problem))
-    (at_axle, ahead, problem), (pushed, faster, _) = found
+        signals = Equations(problem, state).factors['motion'].motion.lean_accelerations[:, :2]
+        found.append((signals, Axle(problem, state).acceleration(), problem))
+    (at_axle, along, problem), (elsewhere, along_elsewhere, _) = found
     change = np.abs(np.diff(problem.rate_b[:, 2])).max()
     assert change > 0.15
     # a turn that starts within the 0.1 s of a mean rate: a quarter of 0.05 s of its change is
     # missing at both ends, 0.9 m from the axle
-    most = 2 * 0.9 * change * 0.05 / 4
-    assert np.abs(pushed - at_axle).max() < most
-    assert np.abs(faster - ahead).max() < most
+    limit = 2 * 0.9 * change * 0.05 / 4
+    assert np.abs(elsewhere - at_axle).max() < limit
+    assert np.abs(along_elsewhere - along).max() < limit
 
 
 def test_turn_rate_noise_is_not_a_side_force():
@@ -117,11 +117,11 @@ def test_turn_rate_noise_is_not_a_side_force():
     _, problem, state = at_truth(imu_lever_arm=(3.4, 0.0, 0.0))
     noise = 2e-3 * np.random.default_rng(3).standard_normal(len(state.t))
     noisy = replace(problem, rate_b=problem.rate_b + np.outer(noise, state.C_bv[:, 2]))
-    pushes, others = (Equations(one, state).factors['motion'].motion.lean_accelerations[:, 1]
-                      for one in (problem, noisy))
-    assert np.abs(pushes).max() > 0.5
+    left, noisy_left = (Equations(one, state).factors['motion'].motion.lean_accelerations[:, 1]
+                        for one in (problem, noisy))
+    assert np.abs(left).max() > 0.5
     # a path of 7 mm/s to the side, at more than 0.1 m/s, in the mean of the bank
-    assert np.abs(others - pushes).max() < 1e-4
+    assert np.abs(noisy_left - left).max() < 1e-4
 
 
 def test_lean_axes_are_level_with_a_rolled_imu():
@@ -139,16 +139,16 @@ def test_lean_axes_are_level_with_a_rolled_imu():
     assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
 
 
-def _left_by_lean(real, axis, columns):
-    """Return the rms displacement without and with constants of the lean."""
+def _rms_after_lean(real, axis, columns):
+    """Return the rms error along an axis, without and with fitted columns of BODY_LEAN."""
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
-    off, by = along_axis(problem, state, axis, layout.BODY_LEAN)
-    rests = [off - by[:, c] @ np.linalg.lstsq(by[:, c], off, rcond=None)[0] for c in columns]
-    return [np.sqrt((one**2).mean()) for one in (off, *rests)]
+    error, by = along_axis(problem, state, axis, layout.BODY_LEAN)
+    rests = [error - by[:, c] @ np.linalg.lstsq(by[:, c], error, rcond=None)[0] for c in columns]
+    return [np.sqrt((one**2).mean()) for one in (error, *rests)]
 
 
 def test_axle_slides_by_speed_times_turn_rate():
-    whole, rest = _left_by_lean(Real(sideslip=0.005), 1, [[0, 1]])
+    whole, rest = _rms_after_lean(Real(sideslip=0.005), 1, [[0, 1]])
     # the mean of a product over 1 s is not the product of means; a difference of velocities
     # left 3 %
     assert rest < 1e-3 * whole
@@ -156,7 +156,7 @@ def test_axle_slides_by_speed_times_turn_rate():
 
 def test_body_lean_is_delayed():
     """At least a third of the remaining squat is proportional to the change of acceleration."""
-    whole, rest, with_change = _left_by_lean(Real(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
+    whole, rest, with_change = _rms_after_lean(Real(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
     assert rest < 0.3 * whole
     assert with_change < 0.7 * rest
 

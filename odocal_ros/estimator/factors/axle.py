@@ -91,9 +91,8 @@ class Axle:
         bank, m/s^2, and their rates of change, m/s^3.
         """
         T, speed = np.diff(self.state.t), self._forward_speed(self.v_n)
-        # to the left by speed and turn rate: a difference of velocities of the axle contains the
-        # noise of two turn rates times its distance from the IMU, and then looks like less
-        # sideslip (docs/decisions/0009)
+        # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
+        # times its distance from the IMU, which reduces the estimated sideslip (decisions/0009)
         left = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
         left += G * self._bank(self.state.C_nb[:, 2] @ self.state.C_bv[:, 1], left)
         force = np.stack([np.diff(speed) / T + G * self._slope(), left], -1)

@@ -47,9 +47,8 @@ class PointRows(Factor):
     keyframe after, or None.
     """
 
-    # columns of the residuals that each level applies to, as a factor on their stated variances
-    level_columns: ClassVar[dict[str, slice]]
-    source: ClassVar[str]                     # name in the budget
+    level_columns: ClassVar[dict[str, slice]]     # residuals of each level, a variance factor
+    source: ClassVar[str]                         # name in the budget
     k: Ints                         # (m,) the keyframes before
     raw: Floats                     # (m, d) residuals
     share: Floats | None = None     # (m,) weight of the correlated error of the keyframe after
@@ -227,8 +226,7 @@ def rows_per_independent(rows: PointRows) -> float:
     scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN
     r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
     r = r - r.mean(axis=0)
-    power = (r**2).mean()
-    count, length = 1.0, 2
+    power, count, length = (r**2).mean(), 1.0, 2
     while len(r) >= 12 * length and power > 0:      # 12 bins: their variance has a sigma of 20 %
         bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
         count = max(count, float(length * (bins.mean(axis=1)**2).mean() / power))

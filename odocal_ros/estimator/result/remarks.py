@@ -42,8 +42,7 @@ SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or 
 # judgement: variance factor of a bias walk above which it has a step. Steps have 480 and more, 60
 # drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
-# relative or rad, judgement: smaller changes of the scale or of an angle are not reported
-LEAST_CHANGE = 3e-4
+LEAST_CHANGE = 3e-4     # relative, rad; judgement: smaller ones of scale or angle are not reported
 # judgement: share and number of outliers among the fixes above which they are reported
 OUTLIER_SHARE, LEAST_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
