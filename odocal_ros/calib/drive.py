@@ -58,9 +58,14 @@ def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
         return distance, reasons
     top_speed = float(np.abs(rate_over_second(t, s)).max())
     if top_speed < leg.min_speed:
-        reasons += (Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
-                           f'{top_speed:.2f} m/s; the limit is {leg.min_speed:g} m/s'),)
+        reasons += (speed_reason(top_speed, leg.min_speed),)
     return distance, reasons
+
+
+def speed_reason(top_speed: float, limit: float) -> Reason:
+    """Return SPEED_TOO_LOW of a highest mean speed over 1 s and its limit, m/s."""
+    return Reason(Code.SPEED_TOO_LOW, f'the highest speed (mean over 1 s) is {top_speed:.2f} m/s; '
+                  f'the limit is {limit:g} m/s')
 
 
 def rate_over_second(t: Floats, x: Floats) -> Floats:

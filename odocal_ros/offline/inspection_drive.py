@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
-from odocal_ros.calib.drive import motion_reasons, path_and_chord
+from odocal_ros.calib.drive import motion_reasons, path_and_chord, speed_reason
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.two_point import LEAST_CHORD_SHARE
@@ -263,9 +263,7 @@ def missing_input_reasons(content: dict[str, Any], mapping: dict[str, str],
             reasons.append(Reason(code, count_text + 'the leg {start:.1f}:{stop:.1f} s '.format(
                 **affected[0]) + template.format(**affected[0])))
     if 0 < drive['fastest'] < config.leg.min_speed:
-        reasons.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
-                              f'{drive["fastest"]:.1f} m/s; the limit is '
-                              f'{config.leg.min_speed:g} m/s'))
+        reasons.append(speed_reason(drive['fastest'], config.leg.min_speed))
     return reasons + _heading_reasons(content, mapping, config)
 
 

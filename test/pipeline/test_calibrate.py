@@ -58,7 +58,7 @@ def test_printed_speeds_use_the_calibrated_scale(town):
     result = calibrate(leg, drives.settings(town, heading_sigma=None, method='smoother',
                                             leg__min_speed=50.0, gnss__max_sigma=0.0))
     text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
-    highest_speed = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
+    highest_speed = float(text.split('the highest speed (mean over 1 s) is ')[1].split(' m/s')[0])
     t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
     path_length = town.odometer.value * town.truth.scale
     fastest = (np.interp(t + 0.5, t, path_length) - np.interp(t - 0.5, t,
