@@ -46,7 +46,7 @@ def unsigned(leg, rng):
     return replace(leg, odometer=replace(leg.odometer, value=np.cumsum(step)))
 
 
-def held_up(leg, rng):
+def delayed_in_bursts(leg, rng):
     """Hold messages of the counter up for 0.1 to 0.5 s, ten times; then they come at once."""
     stamp = leg.odometer.stamp_ns.copy()
     for at in rng.choice(stamp[100:-100], 10, replace=False):
@@ -93,7 +93,7 @@ FAULTS: dict = {
                                 None),
     'FIXES_SMOOTHED': ('first order, 0.6 s', 'town', {}, {'receiver_lag': 0.6}, {}, None),
     'DELAY_SEEN': ('fixes 0.3 s late', 'town', {'fix_delay': 0.3}, {}, {}, None),
-    'ODOMETER_LATE': ('ten bursts, 0.1 to 0.5 s', 'town', {}, {}, {}, held_up),
+    'ODOMETER_LATE': ('ten bursts, 0.1 to 0.5 s', 'town', {}, {}, {}, delayed_in_bursts),
     'SPEED_COARSE': ('whole km/h', 'town', {'odometer': 'speed', 'scale': 1.01},
                      {'speed_step': 1 / 3.6}, {}, None),
     'COUNTER_COARSE': ('0.5 m a pulse', 'town', {'scale': 0.5}, {}, {}, None),
@@ -143,8 +143,8 @@ def run_drive(seed, duration):
         options = {'two_wheels': k % 2 == 1} | (RTK if k // 2 % 2 else {})
     else:
         _, kind, options, real, settings, change = FAULTS[code]
-    own = CHEAP | {'duration': duration} | options
-    made, _ = draw_vehicle(seed, kind, own.get('imu_grade', grade), (), real=real, **own)
+    drawn = CHEAP | {'duration': duration} | options
+    made, _ = draw_vehicle(seed, kind, drawn.get('imu_grade', grade), (), real=real, **drawn)
     drive = simulate(made)
     config = with_settings(configured(drive), settings)
     leg = drive.leg() if change is None else change(drive.leg(), np.random.default_rng(seed))
@@ -159,13 +159,13 @@ def table(rows):
     clean = [r for r in rows if r['code'] == 'clean']
     print(f'{"":25}{"fault":42}{"said":>9}{"clean":>9}  beside')
     for code, (what, *_) in FAULTS.items():
-        own = [r for r in rows if r['code'] == code]
-        if not own:
+        with_reason = [r for r in rows if r['code'] == code]
+        if not with_reason:
             continue
-        beside = Counter(c for r in own for c in r['codes']
+        beside = Counter(c for r in with_reason for c in r['codes']
                          if c != code and c not in NEVER_FALSE | BY_KIND.get(r['kind'], set()))
-        said, false = (sum(code in r['codes'] for r in some) for some in (own, clean))
-        print(f'{code:25}{what:42}{f"{said}/{len(own)}":>9}{f"{false}/{len(clean)}":>9}  '
+        said, false = (sum(code in r['codes'] for r in some) for some in (with_reason, clean))
+        print(f'{code:25}{what:42}{f"{said}/{len(with_reason)}":>9}{f"{false}/{len(clean)}":>9}  '
               + ', '.join(f'{c} {n}' for c, n in beside.most_common(4)))
     other = Counter(c for r in clean for c in r['codes'] if c not in FAULTS
                     and c not in NEVER_FALSE | BY_KIND.get(r['kind'], set()))

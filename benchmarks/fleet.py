@@ -8,7 +8,7 @@ python benchmarks/fleet.py found FLEET RESULT            result of a run compare
 python benchmarks/fleet.py kills FLEET                   SIGKILL of workers, scheduler, command
 python benchmarks/fleet.py identical FLEET               1, 2, 4 workers and TCP: the same rows
 python benchmarks/fleet.py cost FLEET                    against plain replay, overhead a bag
-python benchmarks/fleet.py spoilt FLEET                  a bag bomb and a bag that hangs
+python benchmarks/fleet.py bad_bags FLEET                a bag bomb and a bag that hangs
 
 FLEET: a folder of odocal simulate --fleet.
 """
@@ -189,12 +189,12 @@ def by_engine(fleet, folder, method):
                    for name in ('first', 'out'))
     with engine(None, 2, 2**31, 3) as client:
         list(computed_rows(client, first[:4]))      # what is imported once
-        began, own = time.monotonic(), time.process_time()
+        began, cpu = time.monotonic(), time.process_time()
         before = sum(client.run(time.process_time).values())
         done = [one for _, one in computed_rows(client, jobs)]
-        wall, own = time.monotonic() - began, time.process_time() - own
+        wall, cpu = time.monotonic() - began, time.process_time() - cpu
         assert all(one.computed for one in done)
-        return wall, sum(client.run(time.process_time).values()) - before, own
+        return wall, sum(client.run(time.process_time).values()) - before, cpu
 
 
 def cost(args):
@@ -222,10 +222,10 @@ def silent_server():
         yield f'ftp://127.0.0.1:{server.getsockname()[1]}/drive.mcap'
 
 
-def spoilt(args):
+def bad_bags(args):
     """Put a bag that unpacks to 2 GiB and one that hangs among a fleet's; compare the others."""
     from odocal_ros.safe_io.limits import zstd_module
-    folder = Path(tempfile.mkdtemp(prefix='fleet_spoilt_'))
+    folder = Path(tempfile.mkdtemp(prefix='fleet_bad_bags_'))
     packer = zstd_module().ZstdCompressor()
     (folder / 'bomb.mcap').write_bytes(
         b''.join([packer.compress(bytes(2**20)) for _ in range(2048)]) + packer.flush())
@@ -235,7 +235,7 @@ def spoilt(args):
     rows = {}
     with silent_server() as url:
         bad = [good[0] | {'bag': str(folder / 'bomb.mcap')}, good[0] | {'bag': url}]
-        for name, bags in (('clean', good), ('spoilt', good[:60] + bad + good[60:])):
+        for name, bags in (('clean', good), ('bad_bags', good[:60] + bad + good[60:])):
             (folder / name).mkdir()
             with open(folder / name / 'manifest.csv', 'w', newline='') as file:
                 table = csv.DictWriter(file, list(good[0]))
@@ -246,8 +246,8 @@ def spoilt(args):
                                                 '2', '--task-timeout', str(args.every))).returncode
             rows[name] = rows_in(folder / name / 'out')
             print(f'{name}: {len(bags)} bags, {time.monotonic() - began:.0f} s, exit {code}')
-    failed = [row for row in rows['spoilt'].values() if row.status == 'failed']
-    same = sum(rows['spoilt'].get(bag) == row for bag, row in rows['clean'].items())
+    failed = [row for row in rows['bad_bags'].values() if row.status == 'failed']
+    same = sum(rows['bad_bags'].get(bag) == row for bag, row in rows['clean'].items())
     print(f'{same} of {len(rows["clean"])} rows the same to the last bit; {len(failed)} failed:')
     for row in failed:
         print(f'  {Path(row.bag).name}: {row.reason}')
@@ -258,7 +258,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_subparsers(required=True)
-    for function in (found, kills, identical, cost, spoilt):
+    for function in (found, kills, identical, cost, bad_bags):
         sub = what.add_parser(function.__name__)
         sub.set_defaults(run=function)
         sub.add_argument('--seed', type=int, default=1)
@@ -269,7 +269,7 @@ def main():
         if function is cost:
             sub.add_argument('--rounds', type=int, default=3)
             sub.add_argument('--method', default='two_point')
-        if function in (kills, spoilt):
+        if function in (kills, bad_bags):
             sub.add_argument('--every', type=float, default=20.0)
             sub.add_argument('--patience', type=float, default=120.0)
     args = parser.parse_args()

@@ -87,12 +87,12 @@ def main():
         with engine(None, args.workers, 2**31, 3) as client:
             before, began = used()[1], time.monotonic()
             vehicles = compute_vehicles(client, jobs, folder / 'out', False)
-            took, own = time.monotonic() - began, used()[1] - before
+            took, cpu = time.monotonic() - began, used()[1] - before
             workers = list(client.run(used).values())
         size = sum(path.stat().st_size for path in folder.glob('*.parquet'))
     core, told = sum(c for _, c in workers), sum(bool(json.loads(v['changes'])) for v in vehicles)
     print(f'{n * EACH} legs of {n} vehicles: {took:.0f} s; of a core {core:.0f} s the workers '
-          f'({1e3 * core / n:.1f} ms a vehicle), {own:.0f} s the command; most memory '
+          f'({1e3 * core / n:.1f} ms a vehicle), {cpu:.0f} s the command; most memory '
           f'{max(m for m, _ in workers):.0f} MiB a worker, {used()[0]:.0f} MiB the command; rows '
           f'{size / 2**20:.0f} MiB; {told} of {-(-n // 10)} vehicles changed')
 

@@ -61,7 +61,7 @@ def options_of(seed):
     from odocal_ros.sim.noise import make_rng
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_KIND)
     rng = make_rng(seed, 'robot')
-    own = {'duration': round(float(rng.uniform(30, 180)), 1),
+    options = {'duration': round(float(rng.uniform(30, 180)), 1),
            'track_width': float(rng.uniform(0.15, 0.6)),
            'wheel_difference': float(rng.normal(0, 0.01)),
            'imu_lever_arm': tuple(map(float, rng.normal(0, 0.05, 3))),
@@ -69,14 +69,15 @@ def options_of(seed):
     robot, _, reference = KINDS[e].partition('_') if e >= len(REFERENCES) else ('', '', KINDS[e])
     if robot == 'fused':
         side = 1 if k % 4 < 2 else -1       # of both grades
-        own['real'] = {'receiver_odometer': side * float(rng.uniform(0.02, 0.05)),
+        options['real'] = {'receiver_odometer': side * float(rng.uniform(0.02, 0.05)),
                        'receiver_odometer_time': float(rng.uniform(5.0, 20.0))}
     elif robot == 'omni':
-        own['wheels'] = 3 + k % 2
+        options['wheels'] = 3 + k % 2
     if robot in PLANAR:       # the first sideways move of a robot ends within a minute
-        own |= PLANAR[robot] | {'imu': False, 'duration': max(own['duration'], SHORTEST[robot])}
-    return draw_vehicle(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
-                        slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0),
+        options |= PLANAR[robot] | {
+            'imu': False, 'duration': max(options['duration'], SHORTEST[robot])}
+    return draw_vehicle(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **options,
+                        nominal_scale=8.9e-5, slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0),
                         antenna_lever_arm=(0.0, 0.0, 0.0), slip_walk=SLIP, reference=reference,
                         **dict.fromkeys(('fix_rate', 'fix_noise', 'fix_sigma')))[0]
 
@@ -130,13 +131,13 @@ def _ratio_sigma(methods, left, right):
 def table(rows):
     """Print by kind how far values are off, and what is said."""
     for kind in KINDS:
-        own = [row for row in rows if row['kind'] == kind]
-        if not own:
+        of_kind = [row for row in rows if row['kind'] == kind]
+        if not of_kind:
             continue
-        print(f'{kind}: {len(own)} drives, {dict(Counter(row["verdict"] for row in own))}')
+        print(f'{kind}: {len(of_kind)} drives, {dict(Counter(row["verdict"] for row in of_kind))}')
         for key, unit, size in FIGURES:
-            print_errors(key, unit, size, own)
-        print(f'    {dict(Counter(code for row in own for code in row["codes"]))}')
+            print_errors(key, unit, size, of_kind)
+        print(f'    {dict(Counter(code for row in of_kind for code in row["codes"]))}')
 
 
 def main():

@@ -225,8 +225,8 @@ def _run(command, clock):
     read, write = os.pipe()
     began = time.perf_counter()
     # what is installed has its bytecode beside it
-    own = {k: v for k, v in os.environ.items() if k != 'PYTHONDONTWRITEBYTECODE'}
-    pid = os.posix_spawn(command[0], command, own, file_actions=[
+    environment = {k: v for k, v in os.environ.items() if k != 'PYTHONDONTWRITEBYTECODE'}
+    pid = os.posix_spawn(command[0], command, environment, file_actions=[
         (os.POSIX_SPAWN_DUP2, write, 1), (os.POSIX_SPAWN_CLOSE, read)])
     os.close(write)
     with os.fdopen(read) as pipe:

@@ -61,7 +61,7 @@ class Run:
 
 
 def fused(error, seconds):
-    """Return the row of a receiver with an odometer of its own."""
+    """Return the row of a receiver with an odometer of its of_run."""
     return Run({'receiver_odometer': error, 'receiver_odometer_time': seconds},
                names=('FIXES_FOLLOW_ODOMETER',))
 
@@ -190,29 +190,30 @@ def table(rows):
           '| cause named | false WHEEL_SLIP |\n|---|---|---|---|---|---|---|---|---|')
     by_run = {name: [row for row in rows if row['run'] == name and not row['holds']]
               for name in RUNS}
-    for name, own in by_run.items():
-        if own:
-            print_row(name, own)
-    for name, own in by_run.items():
-        if own:
-            print(f'{name}: {len(own)} drives, {dict(Counter(row["verdict"] for row in own))}')
+    for name, of_run in by_run.items():
+        if of_run:
+            print_row(name, of_run)
+    for name, of_run in by_run.items():
+        if of_run:
+            verdicts = Counter(row['verdict'] for row in of_run)
+            print(f'{name}: {len(of_run)} drives, {dict(verdicts)}')
             for key, unit, size in FIGURES[:3]:
-                print_errors(key, unit, size, own)
-            print(f'    {dict(Counter(code for row in own for code in row["codes"]))}')
+                print_errors(key, unit, size, of_run)
+            print(f'    {dict(Counter(code for row in of_run for code in row["codes"]))}')
     print_false(by_run)
 
 
-def print_row(name, own):
+def print_row(name, of_run):
     """Print a row of the table."""
     names = set(RUNS[name].names)
-    given = [row for row in own if 'scale_sigma' in row and row['verdict'] != 'rejected']
+    given = [row for row in of_run if 'scale_sigma' in row and row['verdict'] != 'rejected']
     z = {row['seed']: abs(row['scale_error']) / row['scale_sigma'] for row in given}
     accepted = [z[row['seed']] for row in given if row['verdict'] == 'accepted']
     moved = [row for row in given if abs(row.get('effect', 0.0)) > row['scale_sigma']]
-    named = f'{share(own, names)}, moved {share(moved, names)}' if names else ''
-    slip = '' if 'WHEEL_SLIP' in names else sum('WHEEL_SLIP' in row['codes'] for row in own)
+    named = f'{share(of_run, names)}, moved {share(moved, names)}' if names else ''
+    slip = '' if 'WHEEL_SLIP' in names else sum('WHEEL_SLIP' in row['codes'] for row in of_run)
     every = np.array(list(z.values()) or [np.nan])
-    print(f'| {name} | {len(given)} of {len(own)} | {100 * (every <= WITHIN).mean():.0f} % '
+    print(f'| {name} | {len(given)} of {len(of_run)} | {100 * (every <= WITHIN).mean():.0f} % '
           f'| {np.sqrt((every**2).mean()):.2f} | {every.max():.1f} | {len(accepted)}, '
           f'{sum(x > BEYOND for x in accepted)} '
           f'| {np.median([1e6 * row["scale_sigma"] for row in given] or [np.nan]):.0f} | {named} '
@@ -227,13 +228,13 @@ def share(rows, names):
 def print_false(by_run):
     """Print by reason its false alarms and their rows."""
     false: dict[str, Counter] = {}
-    for name, own in by_run.items():
+    for name, of_run in by_run.items():
         true = {*RUNS[name].names, *RUNS[name].also}
-        for row in own:
+        for row in of_run:
             for code in {*row['codes']} - true - NEVER_FALSE - BY_KIND.get(row['kind'], set()):
                 false.setdefault(code, Counter())[name] += 1
     for code, where in sorted(false.items(), key=lambda item: -item[1].total()):
-        without = sum(len(own) for name, own in by_run.items()
+        without = sum(len(of_run) for name, of_run in by_run.items()
                       if code not in {*RUNS[name].names, *RUNS[name].also})
         print(f'false {code}: {where.total()} of {without} {dict(where)}')
 

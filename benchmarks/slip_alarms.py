@@ -128,8 +128,8 @@ def run_drive(seed, duration):
     options, change, kinds = RUNS[run]
     effects = tuple(n for n in EFFECTS if n not in NOT_OF_ZOO) if run == 'zoo' else ()
     kind, (grade, fixes) = kinds[k % len(kinds)], VEHICLES[k % len(VEHICLES)]
-    own = CHEAP | fixes | {'duration': duration} | options
-    made, _ = draw_vehicle(seed, kind, grade, effects, **own)
+    settings = CHEAP | fixes | {'duration': duration} | options
+    made, _ = draw_vehicle(seed, kind, grade, effects, **settings)
     drive = simulate(made)
     config = configured(drive)
     leg = drive.leg() if change is None else change(
@@ -147,13 +147,13 @@ def table(rows):
     print(f'{"":28}{"drives":>7}{"".join(f"{code:>15}" for code in codes)}{"z rms":>7}'
           f'{"most":>6}{"acc.":>6}{"sigma":>7}  verdicts, other reasons')
     for run in RUNS:
-        own = [row for row in rows if row['run'] == run and not row['holds']]
-        if own:
-            said = ''.join(f'{sum(code in row["codes"] for row in own):15}' for code in codes)
-            other = Counter(code for row in own for code in row['codes'] if code not in codes
+        of_run = [row for row in rows if row['run'] == run and not row['holds']]
+        if of_run:
+            said = ''.join(f'{sum(code in row["codes"] for row in of_run):15}' for code in codes)
+            other = Counter(code for row in of_run for code in row['codes'] if code not in codes
                             and code not in NEVER_FALSE | BY_KIND.get(row['kind'], set()))
-            print(f'{run:28}{len(own):7}{said}{errors(own)}  '
-                  f'{dict(Counter(row["verdict"] for row in own))} {dict(other)}')
+            print(f'{run:28}{len(of_run):7}{said}{errors(of_run)}  '
+                  f'{dict(Counter(row["verdict"] for row in of_run))} {dict(other)}')
 
 
 def errors(rows):

@@ -121,9 +121,9 @@ def _starts(simulated, seed, grade, noise, worst):
     # (levels differ from fit to fit, so that a difference of equals may be below zero)
     more = [max(late.estimates[n].sigma**2 - usual.estimates[n].sigma**2,
                 (0.1 * late.estimates[n].sigma)**2) for n in NAMES]
-    apart = [late.estimates[n].value - usual.estimates[n].value for n in NAMES]
+    differences = [late.estimates[n].value - usual.estimates[n].value for n in NAMES]
     _keep(worst, f'starts in motion or whole, of the difference, {grade} {noise}',
-          np.array(apart) / np.sqrt(more))
+          np.array(differences) / np.sqrt(more))
 
 
 def _in_motion(drive, config):

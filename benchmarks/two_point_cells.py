@@ -151,12 +151,12 @@ def main() -> None:
     seeds = {number: [FIRST_SEED + SEEDS_A_CELL * number + k for k in range(args.drives)]
              for number in wanted}
     have = {row['seed']: row for row in run_missing(
-        run_drive, [seed for own in seeds.values() for seed in own], read_rows(args.file),
+        run_drive, [seed for cell in seeds.values() for seed in cell], read_rows(args.file),
         args.file, args.processes, block=BLOCK)}
     print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"RMS/sigma":>11}'
           f'{"within 95 %":>13}')
-    for number, own in seeds.items():
-        _print_cell(' '.join(CELLS[number]), [have[seed] for seed in own])
+    for number, of_cell in seeds.items():
+        _print_cell(' '.join(CELLS[number]), [have[seed] for seed in of_cell])
 
 
 def _print_cell(name, rows):

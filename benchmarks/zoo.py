@@ -89,9 +89,9 @@ def compact(options):
     """Return the drawn values that differ from a plain drive, to four digits."""
     from odocal_ros.sim.options import resolved, SimOptions
     plain = asdict(resolved(SimOptions(scenario=options.scenario, odometer=options.odometer)))
-    own = asdict(options)
-    plain, own = plain | plain.pop('real'), own | own.pop('real')
-    return {name: short(value) for name, value in own.items()
+    drawn = asdict(options)
+    plain, drawn = plain | plain.pop('real'), drawn | drawn.pop('real')
+    return {name: short(value) for name, value in drawn.items()
             if value != plain[name] and name not in ('seed', 'scenario', 'imu_grade')}
 
 

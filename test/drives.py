@@ -91,7 +91,7 @@ def changed(samples, **columns):
     return type(samples)(**arrays)
 
 
-def spoilt(leg, slot, **columns):
+def with_columns(leg, slot, **columns):
     """Return a leg with columns of a topic ``changed``."""
     return leg.with_rows(**{slot: changed(leg.rows(slot), **columns)})
 
@@ -137,10 +137,10 @@ def two_point(leg, config, **more):
     return calibrate(leg, config, **more).methods['two_point']
 
 
-def everything_said(result):
-    """Return all reasons of a leg, by code."""
-    said = [*result.reasons, *(r for m in result.methods.values() for r in m.reasons)]
-    return {r.code: r.text for r in said}
+def reason_texts(result):
+    """Return the texts of all reasons of a leg, by code."""
+    reasons = [*result.reasons, *(r for m in result.methods.values() for r in m.reasons)]
+    return {r.code: r.text for r in reasons}
 
 
 def errors_in_sigmas(result, truth):
@@ -164,11 +164,11 @@ def off(found, made, *names):
 
 def rejecting(result):
     """Return the codes for which a leg is rejected."""
-    return {c for c in everything_said(result) if c.severity.value == 'rejected'}
+    return {c for c in reason_texts(result) if c.severity.value == 'rejected'}
 
 
-def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
-    """Return rows that arrive over a line with interruptions, and which rows are delayed."""
+def delayed_in_bursts(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
+    """Return odometer rows over an interrupted line, and which rows are delayed."""
     t = (samples.stamp_ns - samples.stamp_ns[0]) * 1e-9
     free = np.where(t % every_s < how_long_s, t - t % every_s + how_long_s, t)
     for k in range(1, len(free)):        # one after the other

@@ -13,7 +13,7 @@ import json
 import re
 
 import drives
-from drives import kept, rejecting, seconds, settings, spoilt, without
+from drives import kept, rejecting, seconds, settings, with_columns, without
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ def run(leg, made, **changes):
     config = settings(made, **changes)
     result = calibrate(leg, config)
     whole = combine([result], config)
-    said = drives.everything_said(result)
+    said = drives.reason_texts(result)
     if whole.verdict.value == 'rejected':
         assert rejecting(result), 'rejected without a reason'
     for code, text in said.items():
@@ -43,7 +43,7 @@ def run(leg, made, **changes):
 
 def sound(result, truth, sigmas=5.0):
     """Check that values are within their sigmas."""
-    assert result.verdict.value != 'rejected', drives.everything_said(result)
+    assert result.verdict.value != 'rejected', drives.reason_texts(result)
     z = drives.errors_in_sigmas(result, truth)
     assert all(abs(x) < sigmas for x in z.values()), z
 
@@ -57,34 +57,35 @@ def first(a):
 
 
 UNUSABLE = [
-    (partial(spoilt, slot='imu', w_i=lambda a: a * np.nan), Code.NO_IMU,
+    (partial(with_columns, slot='imu', w_i=lambda a: a * np.nan), Code.NO_IMU,
      'none of the 10001 IMU messages is usable'),
-    (partial(spoilt, slot='imu', stamp_ns=lambda a: 0 * a), Code.NO_IMU,
+    (partial(with_columns, slot='imu', stamp_ns=lambda a: 0 * a), Code.NO_IMU,
      'none of the 10001 IMU messages is usable: 10001 have no stamp (0)'),
-    (partial(spoilt, slot='odometer', value=lambda a: a * np.nan), Code.NO_ODOMETER,
+    (partial(with_columns, slot='odometer', value=lambda a: a * np.nan), Code.NO_ODOMETER,
      'none of the 4000 odometer messages is usable'),
-    (partial(spoilt, slot='fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,
+    (partial(with_columns, slot='fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,
      'none of the 1000 fix messages is usable'),
     (partial(without, slot='imu'), Code.NO_IMU, 'no IMU message between the marks'),
     (partial(without, slot='odometer'), Code.NO_ODOMETER, 'no odometer message between the marks'),
     (partial(without, slot='fix'), Code.NO_FIX, 'no fix message between the marks'),
     (partial(kept, slot='fix', rows=slice(500, 501)), Code.NO_FIX,
      '1 usable fix between the marks'),
-    (partial(spoilt, slot='imu', w_i=lambda a: 0 * a), Code.NO_IMU, 'all turn rates are zero'),
-    (partial(spoilt, slot='imu', w_i=lambda a: a * [1.0, 1.0, 0.0]), Code.NO_IMU,
+    (partial(with_columns, slot='imu', w_i=lambda a: 0 * a), Code.NO_IMU,
+     'all turn rates are zero'),
+    (partial(with_columns, slot='imu', w_i=lambda a: a * [1.0, 1.0, 0.0]), Code.NO_IMU,
      'angular_velocity.z is always zero'),
-    (partial(spoilt, slot='imu', w_i=sideways, f_i=sideways), Code.IMU_AXES,
+    (partial(with_columns, slot='imu', w_i=sideways, f_i=sideways), Code.IMU_AXES,
      'gravity is on +x (up should be +z)'),
     (lambda leg: replace(leg, stop_ns=leg.start_ns + 14 * 10**9), Code.LEG_TOO_SHORT,
      'm between the marks; the limit is 100 m'),
     (lambda leg: replace(leg, stop_ns=leg.start_ns), Code.LEG_TOO_SHORT,
      'the stop mark is not after the start mark'),
-    (partial(spoilt, slot='fix', latitude=first, longitude=first), Code.LEG_TOO_SHORT,
+    (partial(with_columns, slot='fix', latitude=first, longitude=first), Code.LEG_TOO_SHORT,
      'the odometer counts, but the fixes do not move')]
 AT_REST = [
     (partial(drives.shifted, start=-55.0, stop=-145.0), Code.LEG_TOO_SHORT,
      'the vehicle did not move'),
-    (partial(spoilt, slot='odometer', value=first), Code.ODOMETER_STILL,
+    (partial(with_columns, slot='odometer', value=first), Code.ODOMETER_STILL,
      'the fixes move, but the odometer does not')]
 
 
@@ -100,7 +101,7 @@ def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text,
 
 def test_two_counters_on_one_topic_are_reported_as_the_cause(made, leg):
     half_ns = int(np.diff(leg.odometer.stamp_ns).min()) // 2
-    two = spoilt(leg, 'odometer', value=lambda a: a + 10**6, stamp_ns=lambda a: a + half_ns,
+    two = with_columns(leg, 'odometer', value=lambda a: a + 10**6, stamp_ns=lambda a: a + half_ns,
                  received_ns=lambda a: a + half_ns)
     both = join([leg.odometer, two.odometer])
     order = np.argsort(both.stamp_ns, kind='stable')
@@ -162,7 +163,7 @@ def test_a_gap_of_increments_or_speeds_increases_the_sigma(made, leg, kind):
 
 @pytest.mark.parametrize('heading_sigma', [1e-3, None])
 def test_a_counter_that_counts_down_is_reported(made, leg, heading_sigma):
-    down = spoilt(leg, 'odometer', value=lambda a: -a)
+    down = with_columns(leg, 'odometer', value=lambda a: -a)
     result, _ = run(down, made, heading_sigma=heading_sigma)
     assert Code.ODOMETER_REVERSED in rejecting(result)
     assert 'odometer.reversed' in Code.ODOMETER_REVERSED.remedy
@@ -172,8 +173,10 @@ def test_a_counter_that_counts_down_is_reported(made, leg, heading_sigma):
 
 
 @pytest.mark.parametrize(('drive', 'spoil', 'setting', 'value'), [
-    ('made', partial(spoilt, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale', 9.80665),
-    ('town', partial(spoilt, slot='imu', w_i=np.degrees), 'imu.gyro_scale', 0.017453292519943295)])
+    ('made', partial(with_columns, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale',
+     9.80665),
+    ('town', partial(with_columns, slot='imu', w_i=np.degrees), 'imu.gyro_scale',
+     0.017453292519943295)])
 def test_units_other_than_si_are_reported_with_a_setting(request, drive, spoil, setting, value):
     made = request.getfixturevalue(drive)
     leg = spoil(made.leg())
@@ -185,7 +188,7 @@ def test_units_other_than_si_are_reported_with_a_setting(request, drive, spoil, 
 
 
 def test_degrees_on_a_straight_road_are_found_from_the_noise_at_rest(made, leg):
-    leg = spoilt(leg, 'imu', w_i=np.degrees)
+    leg = with_columns(leg, 'imu', w_i=np.degrees)
     result, said = run(leg, made)
     assert 'so its unit is probably deg/s' in said[Code.IMU_WORSE_THAN_GRADE]
     assert 'imu.gyro_scale' in Code.IMU_WORSE_THAN_GRADE.remedy
@@ -198,7 +201,7 @@ def test_degrees_on_a_straight_road_are_found_from_the_noise_at_rest(made, leg):
 def test_an_imu_with_z_down_is_detected_and_used(town):
     def down(a):
         return a * [1.0, -1.0, -1.0]
-    result, said = run(spoilt(town.leg(), 'imu', w_i=down, f_i=down), town)
+    result, said = run(with_columns(town.leg(), 'imu', w_i=down, f_i=down), town)
     assert 'forward-right-down is assumed' in said[Code.IMU_LOOKS_Z_DOWN]
     assert result.verdict.value == 'caution'
     sound(result, town.truth)
@@ -213,12 +216,12 @@ def test_an_imu_with_z_down_is_detected_and_used(town):
 
 
 def test_a_gyro_with_the_wrong_sign_is_reported(town):
-    _, said = run(spoilt(town.leg(), 'imu', w_i=lambda a: a * [1.0, 1.0, -1.0]), town)
+    _, said = run(with_columns(town.leg(), 'imu', w_i=lambda a: a * [1.0, 1.0, -1.0]), town)
     assert set(said) == {Code.GYRO_SIGN}, 'one cause, and nothing that follows from it'
 
 
 def test_a_rotation_by_90_deg_is_reported_with_the_setting_for_it(town):
-    result, _ = run(spoilt(town.leg(), 'imu', w_i=sideways, f_i=sideways), town)
+    result, _ = run(with_columns(town.leg(), 'imu', w_i=sideways, f_i=sideways), town)
     (reason,) = (r for r in result.reasons if r.code is Code.IMU_AXES)
     rpy = json.loads(re.search(r"--set 'imu.mounting_rpy=(\[.*?\])'", reason.remedy)[1])
     np.testing.assert_allclose(matrix_from_rpy(rpy), [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-8)
@@ -227,12 +230,12 @@ def test_a_rotation_by_90_deg_is_reported_with_the_setting_for_it(town):
 
 
 def test_outlier_fixes_do_not_change_the_distance_of_a_rejected_leg(town):
-    leg = spoilt(town.leg(), 'imu', f_i=lambda a: a[:, [2, 1, 0]])       # on its side
+    leg = with_columns(town.leg(), 'imu', f_i=lambda a: a[:, [2, 1, 0]])       # on its side
     plain, _ = run(leg, town)
 
     def with_outliers(latitude):
         latitude[[400, 401, 900]] += np.deg2rad([4.0, 4.0, -0.01])      # 445 km, 1.1 km
-    result, said = run(spoilt(leg, 'fix', latitude=with_outliers), town)
+    result, said = run(with_columns(leg, 'fix', latitude=with_outliers), town)
     assert Code.IMU_AXES in said
     assert result.distance == pytest.approx(plain.distance, rel=0.01)
 
@@ -245,7 +248,7 @@ def test_an_odometer_that_stops_counting_rejects_the_leg(made, leg):
         def value(counts):
             here = counts[(t >= begin) & (t < end)]
             return np.where(t < end, np.minimum(counts, here[0]), counts - np.ptp(here))
-        return run(spoilt(leg, 'odometer', value=value), made)
+        return run(with_columns(leg, 'odometer', value=value), made)
     result, said = stands(40.0, np.inf)
     assert rejecting(result) == {Code.ODOMETER_STILL}
     assert re.fullmatch(r'the fixes move by \d+ m from t = 40 s to \d+ s, but the odometer does '
@@ -294,5 +297,6 @@ def test_fixes_at_both_standstills_only_are_sufficient(made, leg):
 
 @pytest.mark.parametrize('at', [250, 300, 310, 500, 700])    # one exactly at the start mark
 def test_one_outlier_fix_does_not_change_the_result(made, leg, at):
-    wild = spoilt(leg, 'fix', latitude=(at, leg.fix.latitude[at] + 0.05), height=(at, 9000.0))
+    wild = with_columns(leg, 'fix', latitude=(at, leg.fix.latitude[at] + 0.05),
+                        height=(at, 9000.0))
     sound(run(wild, made)[0], made.truth)

@@ -132,7 +132,7 @@ def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
 
 @pytest.mark.parametrize('room', ROOMS)
 def test_a_package_uses_only_those_in_the_table(room):
-    used = {own for p in _modules() if _part(p) == room for own in _own_parts(p)}
+    used = {part for p in _modules() if _part(p) == room for part in _own_parts(p)}
     assert used - COMMON - {room} == set(ROOMS[room].split())
 
 

@@ -67,9 +67,9 @@ def segment(drive, tmp_path_factory):
     put(log, 'IMU/gyro', t=t, value=drive.imu.w_i)
     put(log, 'IMU/gyro_uncalibrated', t=t, value=drive.imu.w_i + 0.067)
     # the accelerometer has its own times, a third of a step earlier, and one row less
-    own = t[1:] - 0.006
-    put(log, 'IMU/accelerometer', t=own, value=np.stack([
-        np.interp(own, t, column) for column in drive.imu.f_i.T], -1))
+    t_accelerometer = t[1:] - 0.006
+    put(log, 'IMU/accelerometer', t=t_accelerometer, value=np.stack([
+        np.interp(t_accelerometer, t, column) for column in drive.imu.f_i.T], -1))
     t = boot(drive.odometer.stamp_ns)
     put(log, 'CAN/speed', t=t, value=drive.odometer.value[:, None])
     put(log, 'CAN/wheel_speed', t=t, value=np.outer(drive.odometer.value, [1.0, 1.0, 0.99, 1.01]))

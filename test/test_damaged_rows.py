@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 import warnings
 
-from drives import drive, everything_said, seconds, settings, spoilt
+from drives import drive, reason_texts, seconds, settings, with_columns
 import numpy as np
 import pytest
 
@@ -57,9 +57,9 @@ def test_a_block_of_garbage_is_never_accepted(made, config, seed, share):
     wrong = partial(garbage, rng, first, first + int(n * share))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        result = calibrate(spoilt(made.leg(), 'imu', w_i=wrong, f_i=wrong), config)
+        result = calibrate(with_columns(made.leg(), 'imu', w_i=wrong, f_i=wrong), config)
     assert result.verdict is not Verdict.ACCEPTED
-    assert Code.ROWS_DAMAGED in everything_said(result)
+    assert Code.ROWS_DAMAGED in reason_texts(result)
 
 
 def test_rows_near_impossible_ones_are_excluded_with_them(made, config):
@@ -69,14 +69,14 @@ def test_rows_near_impossible_ones_are_excluded_with_them(made, config):
     def wrong(column):
         column[4000:4600] += rng.normal(0, 0.05, (600, 3))
         column[4000:4600:20] = 1e200
-    result = calibrate(spoilt(made.leg(), 'imu', w_i=wrong), config)
+    result = calibrate(with_columns(made.leg(), 'imu', w_i=wrong), config)
     assert result.imu_samples <= len(made.imu.stamp_ns) - 600
     assert result.verdict is not Verdict.ACCEPTED
 
 
 def test_occasional_nan_of_a_driver_is_not_damage(made):
-    leg = spoilt(made.leg(), 'imu', w_i=(slice(None, None, 50), np.nan))
-    said = everything_said(calibrate(leg, settings(made)))
+    leg = with_columns(made.leg(), 'imu', w_i=(slice(None, None, 50), np.nan))
+    said = reason_texts(calibrate(leg, settings(made)))
     assert Code.BAD_ROWS_DROPPED in said
     assert Code.ROWS_DAMAGED not in said
 
@@ -85,8 +85,8 @@ def test_occasional_nan_of_a_driver_is_not_damage(made):
 def test_several_impossible_rows_give_a_caution_at_any_place(made, config, rows, accepted):
     """Eight far apart were next to undetected wrong ones: a yaw error of 17 sigmas."""
     at = np.linspace(500, len(made.imu.stamp_ns) - 500, rows).astype(int)
-    result = calibrate(spoilt(made.leg(), 'imu', w_i=(at, 1e200)), config)
-    assert (Code.ROWS_DAMAGED not in everything_said(result)) == accepted
+    result = calibrate(with_columns(made.leg(), 'imu', w_i=(at, 1e200)), config)
+    assert (Code.ROWS_DAMAGED not in reason_texts(result)) == accepted
     assert (result.verdict is Verdict.ACCEPTED) == accepted
 
 
@@ -98,8 +98,8 @@ def test_impossible_and_slightly_wrong_rows_are_one_group(made):
     def wrong(column):
         column[[at, at + 3, at + 24]] = 1e200
         column[at + 4, 2], column[at + 5, 0] = 0.78, 0.21
-    result = calibrate(spoilt(leg, 'imu', w_i=wrong), settings(made))
-    assert Code.ROWS_DAMAGED in everything_said(result)
+    result = calibrate(with_columns(leg, 'imu', w_i=wrong), settings(made))
+    assert Code.ROWS_DAMAGED in reason_texts(result)
     assert result.verdict is not Verdict.ACCEPTED
 
 
@@ -120,7 +120,7 @@ def test_exact_zeros_that_are_rotated_twice_are_not_damage(made, yaw):
     def upright(column):
         column[:] = column * [0.0, 0.0, 1.0] @ C @ C_again
         assert 0 < np.abs(column[column != 0]).min() < 1e-50
-    sound(spoilt(made.leg(), 'imu', w_i=upright, f_i=upright), made)
+    sound(with_columns(made.leg(), 'imu', w_i=upright, f_i=upright), made)
 
 
 def test_a_filtered_speed_that_fades_at_rest_is_zero(made):
@@ -158,8 +158,8 @@ BAD_COVARIANCES = [
 def test_invalid_covariances_are_not_used(made, config, whole):
     def some(covariance):
         covariance[::len(covariance) // 8][:8] = BAD_COVARIANCES
-    result = calibrate(spoilt(made.leg(), 'fix', covariance_n=some), config)
-    assert Code.METHOD_FAILED not in everything_said(result)
+    result = calibrate(with_columns(made.leg(), 'fix', covariance_n=some), config)
+    assert Code.METHOD_FAILED not in reason_texts(result)
     for name in ('smoother', 'two_point'):
         mine, other = (r.methods[name].estimates['scale_factor'] for r in (result, whole))
         assert mine.value == pytest.approx(other.value, abs=other.sigma)   # eight fixes of many

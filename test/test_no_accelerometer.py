@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import cached, drive, everything_said, off, settings
+from drives import cached, drive, off, reason_texts, settings
 import numpy as np
 import pytest
 
@@ -48,7 +48,7 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
     calibration = combine([result], config)
     scale_alone(made, calibration)
     assert calibration.estimates['scale_factor'].method == 'smoother'
-    said = everything_said(result)
+    said = reason_texts(result)
     assert Code.NO_IMU not in said
     assert 'need an accelerometer' in said[Code.NO_ACCELEROMETER]
     # no value that requires an accelerometer
@@ -70,7 +70,7 @@ def test_accelerations_that_cannot_be_levelled_are_not_used(w, g, why):
     config = settings(made, heading_sigma=None, method='auto')
     result = calibrate(replace(leg, imu=part), config)
     scale_alone(made, combine([result], config))
-    said = everything_said(result)
+    said = reason_texts(result)
     assert why in said[Code.NO_ACCELEROMETER]
     assert not {Code.IMU_AXES, Code.IMU_UNITS, Code.NO_IMU} & set(said)
 

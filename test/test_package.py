@@ -67,9 +67,9 @@ def test_all_files_have_the_same_version():
 
 
 def test_each_source_file_has_a_copyright_and_a_licence():
-    own, = SPDX.file_headers
-    words = own.format(copyright='Copyright 2026 odocal_ros maintainers')
-    head = '\n'.join(f'# {line}' for line in words.splitlines())
+    header, = SPDX.file_headers
+    text = header.format(copyright='Copyright 2026 odocal_ros maintainers')
+    head = '\n'.join(f'# {line}' for line in text.splitlines())
     assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
     assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
     rooms = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, kept, seconds, settings, spoilt, without
+from drives import changed, drive, kept, seconds, settings, with_columns, without
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -36,7 +36,7 @@ def clean(made):
 
 
 def with_right(made, change, **more):
-    return replace(spoilt(made.leg(), 'odometer_right', value=change), **more)
+    return replace(with_columns(made.leg(), 'odometer_right', value=change), **more)
 
 
 @pytest.mark.parametrize('span', [65536, 4096, 256, 10_000, 9000])
@@ -54,7 +54,7 @@ def test_a_hidden_span_is_found_and_unwrapped_exactly(made, clean, span, signed)
 
 
 def test_a_hidden_span_is_reported_with_wheel_and_first_time(made):
-    leg = spoilt(made.leg(), 'odometer', value=lambda a: a % 32768)
+    leg = with_columns(made.leg(), 'odometer', value=lambda a: a % 32768)
     rolled = np.flatnonzero(np.diff(leg.odometer.value) < 0)
     _, said = screened(leg, made)
     text = said[Code.WHEEL_COUNTERS_DIFFER]
@@ -64,7 +64,7 @@ def test_a_hidden_span_is_reported_with_wheel_and_first_time(made):
 
 
 def test_a_hidden_span_of_both_wheels_is_unwrapped_in_both(made, clean):
-    leg = spoilt(with_right(made, lambda a: a % 4096), 'odometer', value=lambda a: a % 4096)
+    leg = with_columns(with_right(made, lambda a: a % 4096), 'odometer', value=lambda a: a % 4096)
     inputs, _ = screened(leg, made)
     assert np.array_equal(inputs.travel.s, clean.travel.s)
 
@@ -155,7 +155,7 @@ def test_a_right_wheel_that_sends_no_number_is_dead(made):
 def test_wheels_with_other_rates_and_ends_are_used_where_both_have_rows(made, clean):
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
     # a row stamped early by 7 ms: as a wheel read 7 ms late
-    leg = spoilt(kept(made.leg(), 'odometer_right', slice(101, 5001, 2)), 'odometer_right',
+    leg = with_columns(kept(made.leg(), 'odometer_right', slice(101, 5001, 2)), 'odometer_right',
                  stamp_ns=lambda a: a - 7_000_000)
     inputs, _ = screened(leg, made)
     t, sent = inputs.travel.t, seconds(leg, leg.odometer_right)

@@ -37,9 +37,9 @@ def test_rotation_increments_are_those_of_the_strapdown(uneven):
     rng = np.random.default_rng(1)
     t = 1000.0 + np.cumsum(0.01 * (1 + uneven * rng.uniform(-1, 1, 200)))
     w = np.cumsum(rng.standard_normal((200, 3)), axis=0)
-    own = [attitude.rotation_increment(t.tolist(), w.tolist(), k) for k in range(199)]
+    increments = [attitude.rotation_increment(t.tolist(), w.tolist(), k) for k in range(199)]
     # both do the same sums in the same order
-    np.testing.assert_array_equal(np.transpose(own), rotation_increments(t, w))
+    np.testing.assert_array_equal(np.transpose(increments), rotation_increments(t, w))
 
 
 @pytest.mark.core

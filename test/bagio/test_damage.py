@@ -103,11 +103,11 @@ def test_unusable_metadata_is_reported_and_the_files_are_read(tmp_path, plain, e
 
 def test_files_that_are_shorter_than_listed_missing_or_empty_are_reported(tmp_path, plain):
     path = ros_bags.write(tmp_path / 'drive', ros_bags.drive(4.0))
-    own = (path / 'metadata.yaml').read_text()
+    metadata = (path / 'metadata.yaml').read_text()
     shutil.copy(plain / 'metadata.yaml', path)
     assert '6.0 s at the end, listed in metadata.yaml,' in truncated(read(path)[1])
     (path / 'metadata.yaml').write_text(
-        own.replace('- drive.mcap\n', '- drive.mcap\n  - b_1.mcap\n'))
+        metadata.replace('- drive.mcap\n', '- drive.mcap\n  - b_1.mcap\n'))
     assert '1 of 2 files named in metadata.yaml are missing (b_1.mcap)' in truncated(
         read(path)[1])
     (path / 'b_1.mcap').write_bytes(b'')

@@ -251,7 +251,7 @@ def test_nested_yaml_aliases_are_not_expanded(tmp_path):
 @pytest.mark.parametrize(('text', 'what'), [
     ('#' * 2**22, 'bytes'), (''.join(f'k{n}: {n}\n' for n in range(38_000)), 'values')])
 def test_metadata_that_are_too_long_or_have_too_many_keys_are_not_used(tmp_path, text, what):
-    path = metadata(tmp_path, lambda own: own + text)
+    path = metadata(tmp_path, lambda content: content + text)
     with open_bag(path) as bag:
         assert any('exceeds the limit of' in note and what in note for note in bag.notes)
 

@@ -44,7 +44,7 @@ class Toy:
         constants[since:, 0] += change
         return self.draw(rng, constants)
 
-    def border(self, j, about=None):
+    def marginal(self, j, about=None):
         """Return the marginal information of a leg at a linearisation point."""
         A, B, b = self.A[j], self.B[j], self.b[j]
         about = TRUTH + 0.1 * j if about is None else about
@@ -52,31 +52,31 @@ class Toy:
         return MarginalInformation(NAMES, np.array(about, float), free.T @ free,
                                    free.T @ (b - B @ about), np.zeros(len(NAMES)), PRIOR, PRIOR)
 
-    def borders(self):
-        return [self.border(j) for j in range(len(self.A))]
+    def marginals(self):
+        return [self.marginal(j) for j in range(len(self.A))]
 
-    def batch(self, steps=STEPS, own=()):
+    def batch(self, steps=STEPS, leg_errors=()):
         """
         Return value and covariance of the constants of the last leg by one dense fit of all rows.
 
-        own : (index, sigma) of constants with a separate error in each leg.
+        leg_errors : (index, sigma) of constants with a separate error in each leg.
         """
         J, R, n = self.A.shape
         z, k, d = J * n, J * n + len(NAMES) - 1, J * n + len(NAMES) - 1 + J
-        whole = np.zeros((J * R, d + J * len(own)))
+        whole = np.zeros((J * R, d + J * len(leg_errors)))
         for j in range(J):
             rows = slice(j * R, (j + 1) * R)
             whole[rows, j * n:(j + 1) * n] = self.A[j]
             whole[rows, z:k] = self.B[j, :, 1:]
             whole[rows, k + j] = self.B[j, :, 0]
-            for i, (which, _) in enumerate(own):
-                whole[rows, d + j * len(own) + i] = self.B[j, :, which]
-        more = np.zeros((len(PRIOR) - 1 + J - 1 + J * len(own), whole.shape[1]))
+            for i, (which, _) in enumerate(leg_errors):
+                whole[rows, d + j * len(leg_errors) + i] = self.B[j, :, which]
+        more = np.zeros((len(PRIOR) - 1 + J - 1 + J * len(leg_errors), whole.shape[1]))
         more[range(4), range(z, k)] = 1 / PRIOR[1:]
         for j, step in enumerate(np.maximum(steps, 1e-7)):
             more[4 + j, [k + j, k + j + 1]] = -1 / step, 1 / step
-        last = np.arange(J * len(own))
-        more[4 + J - 1 + last, d + last] = 1 / np.tile([s for _, s in own], J)
+        last = np.arange(J * len(leg_errors))
+        more[4 + J - 1 + last, d + last] = 1 / np.tile([s for _, s in leg_errors], J)
         whole = np.concatenate([whole, more])
         Q, T = np.linalg.qr(whole)
         inverse = np.linalg.inv(T)
@@ -95,9 +95,9 @@ NO_SCATTER = 1e-9, 1e-9, 1e-9       # sigma of the change of ln K, yaw and pitch
 
 def moved(result, name, by):
     """Return a result with one constant of its marginal information shifted."""
-    border = result.marginal
-    at = np.arange(len(border.names)) == border.names.index(name)
-    return replace(result, marginal=replace(border, point=border.point + by * at))
+    marginal = result.marginal
+    at = np.arange(len(marginal.names)) == marginal.names.index(name)
+    return replace(result, marginal=replace(marginal, point=marginal.point + by * at))
 
 
 def leg_result(method, number, *codes):

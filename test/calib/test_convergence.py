@@ -60,9 +60,9 @@ def test_first_iteration_with_fitted_signals_is_not_shortened(monkeypatch):
             passes.append((args[4], False))
             super().__init__(*args)
 
-    def damp_step(solved, taken, own=fit.damp_step):
+    def damp_step(solved, taken, original=fit.damp_step):
         passes[-1] = passes[-1][0], bool(taken.any())
-        return own(solved, taken)
+        return original(solved, taken)
     monkeypatch.setattr(fit, 'Equations', Watched)
     monkeypatch.setattr(fit, 'damp_step', damp_step)
     calibrate(drive.leg(), configured(drive))
@@ -160,11 +160,11 @@ def test_start_sums_follow_a_gyro_bias_change_to_first_order():
         sums, C = change_gyro_bias(sums, change)
         return sums.R, sums.dv, sums.S[:, :, 0], C
     change, none = np.array([0.01, -0.02, 0.015]), np.zeros(3)
-    apart = []
+    differences = []
     for delta in (change, change / 2):
-        apart.append([np.abs(x - y).max() for x, y in zip(
+        differences.append([np.abs(x - y).max() for x, y in zip(
             of_bias(none, delta), of_bias(delta, none), strict=True)])
     # the remainder is of second order, in intervals of 1 s
-    assert (np.divide(*apart) > 3.5).all()
+    assert (np.divide(*differences) > 3.5).all()
     force_and_speed = np.array([1.0, 10.0, 20.0 / leg.rough_scale])
-    assert (apart[0][:3] < force_and_speed * (change @ change)).all()
+    assert (differences[0][:3] < force_and_speed * (change @ change)).all()

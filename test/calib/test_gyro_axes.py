@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
-from drives import changed, drive, everything_said, rejecting, settings
+from drives import changed, drive, reason_texts, rejecting, settings
 import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
@@ -61,7 +61,7 @@ X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])}
     (Y_MIRRORED, Code.IMU_AXES, 'negate linear_acceleration.y')], ids=[*AXES, 'f x', 'f y'])
 def test_wrong_axis_rejects_the_leg_and_names_the_correction(changes, code, do):
     result = calibrate(with_imu(town(), **changes), settings(town()))
-    assert rejecting(result) == {code} == set(everything_said(result))
+    assert rejecting(result) == {code} == set(reason_texts(result))
     assert do in next(r.do for r in result.reasons)
 
 
@@ -85,7 +85,7 @@ def test_wrong_axes_hidden_by_flat_ground_are_reported_as_accelerometer_skew(nam
     found = {}
     for axes in (np.eye(3), AXES[name]):
         result = calibrate(with_imu(made, axes), config)
-        found[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in everything_said(result)
+        found[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in reason_texts(result)
     assert found == {False: (Verdict.ACCEPTED, False), True: (Verdict.CAUTION, True)}
 
 

@@ -79,9 +79,9 @@ def test_constant_turn_equals_its_closed_form(rate):
         want = integrals(tau)
         np.testing.assert_allclose(R, want[0], atol=BENT)
         # the force is linear within a step; its curvature is 0.6^2 T^2 / 12 of it
-        bent = loose + 4 * SECOND * max(STEP, 1 / rate)**2
-        np.testing.assert_allclose(dv, want[1] @ FORCE, atol=bent)
-        np.testing.assert_allclose(dp, want[2] @ FORCE, atol=bent)
+        tolerance = loose + 4 * SECOND * max(STEP, 1 / rate)**2
+        np.testing.assert_allclose(dv, want[1] @ FORCE, atol=tolerance)
+        np.testing.assert_allclose(dp, want[2] @ FORCE, atol=tolerance)
 
 
 def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
@@ -92,13 +92,13 @@ def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
     one = np.ones((len(t), 1))
     _, sums, points = summed(samples(t, one * BIAS, one * FORCE_BIAS), [1.23, 3.91], constants)
     # second order in the turn by the bias within a step
-    bent = (np.linalg.norm(BIAS) * STEP)**2 * np.linalg.norm(FORCE_BIAS)
+    tolerance = (np.linalg.norm(BIAS) * STEP)**2 * np.linalg.norm(FORCE_BIAS)
     for found in (sums, points):
         np.testing.assert_allclose(found.R - np.eye(3), 0.0, atol=1e-12)
         for zero in (found.F, found.R_by_gyro[:, :, 3:][:, :, by_rate]):
             np.testing.assert_allclose(zero, 0.0, atol=1e-12)
         for zero in (found.dv, found.dp):
-            np.testing.assert_allclose(zero, 0.0, atol=bent)
+            np.testing.assert_allclose(zero, 0.0, atol=tolerance)
     # an error of the bias is also an error of the signal
     by_bias = np.eye(3, 6)
     by_bias[GYRO_AXIS, GYRO_SIGNAL] -= 0.2 * by_rate

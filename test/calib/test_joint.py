@@ -16,8 +16,8 @@ pytestmark = pytest.mark.slow
 USUAL = {'z3': 0.05}
 
 
-def of(borders, steps=STEPS, usual=None):
-    return fit_jointly(borders, steps, 'k', usual=usual)
+def of(marginals, steps=STEPS, usual=None):
+    return fit_jointly(marginals, steps, 'k', usual=usual)
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def toy():
 
 
 def test_joint_estimate_equals_one_fit_of_all_rows(toy):
-    found, (value, covariance) = of(toy.borders()), toy.batch()
+    found, (value, covariance) = of(toy.marginals()), toy.batch()
     assert not found.disputed
     assert largest_deviation(found.value, value, covariance) < 1e-9
     assert np.abs(found.covariance / covariance - 1).max() < 1e-6      # small beside large values
@@ -35,32 +35,32 @@ def test_joint_estimate_equals_one_fit_of_all_rows(toy):
 
 
 def test_separate_errors_of_each_leg_are_unknowns_of_the_fit(toy):
-    own = {'z0': 0.3, 'z3': 0.05}
-    value, covariance = toy.batch(own=[(NAMES.index(n), s) for n, s in own.items()])
-    found = of([b.with_leg_errors(own) for b in toy.borders()])
+    leg_errors = {'z0': 0.3, 'z3': 0.05}
+    value, covariance = toy.batch(leg_errors=[(NAMES.index(n), s) for n, s in leg_errors.items()])
+    found = of([b.with_leg_errors(leg_errors) for b in toy.marginals()])
     assert largest_deviation(found.value, value, covariance) < 1e-9
 
 
 def test_linearisation_point_and_order_of_legs_have_no_effect(toy):
-    moved = [toy.border(j, TRUTH - 0.2 * j) for j in range(LEGS)]
-    a, b = of(toy.borders()), of(moved)
+    moved = [toy.marginal(j, TRUTH - 0.2 * j) for j in range(LEGS)]
+    a, b = of(toy.marginals()), of(moved)
     assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
     assert a.chi2 == pytest.approx(b.chi2, rel=1e-6)
-    borders = toy.borders()
-    one = of(borders, np.zeros(LEGS - 1))
-    other = of([borders[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
+    marginals = toy.marginals()
+    one = of(marginals, np.zeros(LEGS - 1))
+    other = of([marginals[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
     assert largest_deviation(one.value, other.value, one.covariance) < 1e-6
     assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
 
 
 def test_prior_counts_once(toy):
     # almost no data: the result has the variance of the prior, not a fifth of it
-    found = of([b.widened(1e5) for b in toy.borders()])
+    found = of([b.widened(1e5) for b in toy.marginals()])
     assert np.sqrt(np.diag(found.covariance))[1:] == pytest.approx(PRIOR[1:], rel=1e-3)
 
 
 def test_selected_constants_have_the_marginal_with_priors_of_the_others(toy):
-    whole = toy.border(0)
+    whole = toy.marginal(0)
     prior = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
     H = whole.information + np.diag(prior)
     x = np.linalg.solve(H, whole.gradient + whole.information @ whole.point)
@@ -72,9 +72,9 @@ def test_selected_constants_have_the_marginal_with_priors_of_the_others(toy):
 
 
 def test_leg_without_information_changes_nothing(toy):
-    borders = toy.borders()
-    nothing = replace(borders[0], information=np.zeros((5, 5)), gradient=np.zeros(5))
-    a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
+    marginals = toy.marginals()
+    nothing = replace(marginals[0], information=np.zeros((5, 5)), gradient=np.zeros(5))
+    a, b = of(marginals), of([nothing, *marginals], [0.1, *STEPS])
     assert largest_deviation(a.value, b.value, a.covariance) < 1e-9
     # freedom is a sum of about twenty shares weighted by priors: equal within rounding
     assert (a.freedom, a.chi2) == (pytest.approx(b.freedom, rel=1e-12),
@@ -84,19 +84,19 @@ def test_leg_without_information_changes_nothing(toy):
 def test_sections_of_one_leg_count_as_one_leg(toy):
     """The scatter between legs does not apply to sections: the result is as without scatter."""
     still = np.zeros(LEGS - 1)
-    whole = of(toy.borders(), still)
-    found = fit_jointly(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
+    whole = of(toy.marginals(), still)
+    found = fit_jointly(toy.marginals(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
     assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
     assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
-    scattered = of(toy.borders(), still, USUAL)
+    scattered = of(toy.marginals(), still, USUAL)
     assert scattered.covariance[4, 4] > 1.001 * whole.covariance[4, 4]
 
 
 def test_chi_square_has_its_expected_mean_and_variance():
     rng = np.random.default_rng(2)
     small = Toy(rng, states=6, rows=60)
-    found = [of(small.walk(rng).borders(), usual=USUAL) for _ in range(400)]
+    found = [of(small.walk(rng).marginals(), usual=USUAL) for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, minus 9 unknowns
     # (priors take a small part of what these determine)
@@ -115,10 +115,10 @@ def test_leg_and_constant_that_differ_are_named():
     small = Toy(rng, states=6, rows=40)
     constants = np.tile(TRUTH, (LEGS, 1))
     constants[3, 4] += 5.0
-    borders = small.draw(rng, constants).borders()
+    marginals = small.draw(rng, constants).marginals()
     # the prior of that leg is relaxed, as in a leg where the data contradict it
-    borders[3] = replace(borders[3], relaxed_sigma=np.where(PRIOR == 1.0, 5.0, PRIOR))
-    found = of(borders, usual=USUAL)
+    marginals[3] = replace(marginals[3], relaxed_sigma=np.where(PRIOR == 1.0, 5.0, PRIOR))
+    found = of(marginals, usual=USUAL)
     assert found.disputed == ('z3',)
     assert np.argmax(np.abs(found.deviation[:, 4])) == 3
     # one of five legs deviates by 5: scatter 5 / sqrt(5), mean shifted by 1
@@ -131,7 +131,7 @@ def test_disagreement_without_a_single_cause_widens_all_constants():
     rng = np.random.default_rng(4)
     small = Toy(rng, states=6, rows=40)
     constants = TRUTH + 3.0 * rng.standard_normal((LEGS, 5))
-    found = of(small.draw(rng, constants).borders(), usual=USUAL)
+    found = of(small.draw(rng, constants).marginals(), usual=USUAL)
     assert found.disputed[0] == 'z3'
     assert found.factor > 1.5
 

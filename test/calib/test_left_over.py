@@ -118,17 +118,17 @@ def test_odometer_residuals_are_nan_without_odometer_data():
 
 
 def test_sigmas_of_the_biases_hold_over_the_whole_drive():
-    apart = []
+    errors_in_sigmas = []
     for seed in range(1, 9):
         drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
         true = truth(drive, config, leg)
         sigma = bias_sigmas(fit.solved.marginals(), 1.0)
         off = np.stack([fit.state.gyro_bias - true.gyro_bias,
                         fit.state.accel_bias - true.accel_bias])
-        apart.append(off / sigma)
+        errors_in_sigmas.append(off / sigma)
         assert sigma.shape == (2, len(fit.state.t), 3)
         assert sigma[0, len(true.t) // 2, 2] < 0.99 * sigma[0, 0, 2], 'least amid the drive'
-    z = np.sqrt((np.array([one[:, ::50].copy() for one in apart])**2).mean(axis=(0, 2)))
+    z = np.sqrt((np.array([one[:, ::50].copy() for one in errors_in_sigmas])**2).mean(axis=(0, 2)))
     # rms of 8 drives, each axis about one draw: 0.35 to 1.75 in 999 of 1000 by chi2 of 8
     assert z.min() > 0.35
     assert z.max() < 1.75

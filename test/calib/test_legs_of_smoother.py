@@ -36,7 +36,7 @@ def legs():
     return drive.truth, steady, [smoothed(**SHORT, seed=seed)[1] for seed in (1, 2, 3)]
 
 
-def by_border(one, i):
+def by_marginal(one, i):
     """Return value and sigma of ln K, yaw or pitch from the marginal information of a result."""
     found = fit_jointly([one.marginal], [])
     # sizes belong to the priors of the vehicle, which marginal information does not include
@@ -48,7 +48,7 @@ def by_border(one, i):
 def test_marginal_information_and_priors_determine_a_leg_of_the_smoother(legs):
     for one in legs[2]:
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
-            e, (found, sigma) = one.estimates[name], by_border(one, i)
+            e, (found, sigma) = one.estimates[name], by_marginal(one, i)
             value, size = (np.log(e.value), e.value) if i == 0 else (e.value, 1.0)
             assert sigma == pytest.approx(e.sigma / size, rel=1e-6)
             assert abs(found - value) < 1e-3 * sigma
@@ -123,7 +123,7 @@ def test_marginal_information_includes_a_wheel_change_within_the_leg(legs):
     loose = with_wheel_change(results[0], run)
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
-    assert by_border(loose, 0)[1] == pytest.approx(scale.sigma / scale.value, rel=1e-6)
+    assert by_marginal(loose, 0)[1] == pytest.approx(scale.sigma / scale.value, rel=1e-6)
 
 
 def disputes(whole):

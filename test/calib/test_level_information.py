@@ -86,29 +86,29 @@ def test_known_levels_add_no_error_and_unknown_levels_add_their_prior(weighted_e
     at, levels = weighted_equations
     both, solved = at()
     information = both.information(solved)
-    own = prior_information(levels)
-    sure = information.effects(dict.fromkeys(own, 1e12))
+    prior = prior_information(levels)
+    sure = information.effects(dict.fromkeys(prior, 1e12))
     assert (np.sqrt((sure**2).sum(axis=1)) < 1e-5 * np.sqrt(np.diag(solved.covariance))).all()
-    effects = information.effects(own)
-    most = sum(information.constants_by_level[:, i]**2 / own[n]
+    effects = information.effects(prior)
+    most = sum(information.constants_by_level[:, i]**2 / prior[n]
                for i, n in enumerate(information.names))
     # joint errors of levels may double the separate errors; the factor is at most their number
-    assert ((effects**2).sum(axis=1) <= most * len(own) + 1e-30).all()
+    assert ((effects**2).sum(axis=1) <= most * len(prior) + 1e-30).all()
 
 
 def test_marginal_information_with_level_errors_has_the_sum_of_both_covariances():
     rng = np.random.default_rng(1)
     A, effects = rng.standard_normal((9, 4)), 0.1 * rng.standard_normal((4, 2))
     D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)
-    border = MarginalInformation(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9),
+    marginal = MarginalInformation(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9),
                                  centre, sigma,
                                  sigma)
-    wider, weight = border.with_errors(effects), 1 / sigma**2
+    wider, weight = marginal.with_errors(effects), 1 / sigma**2
 
     def posterior(one):
         P = np.linalg.inv(one.information + np.diag(weight))
         return P, P @ (one.gradient + weight * centre)
 
-    (P, x), (wide, same) = posterior(border), posterior(wider)
+    (P, x), (wide, same) = posterior(marginal), posterior(wider)
     np.testing.assert_allclose(wide, P + effects @ effects.T, rtol=1e-9)
     np.testing.assert_allclose(same, x, rtol=1e-9)

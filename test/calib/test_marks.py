@@ -187,14 +187,15 @@ def test_slow_share_is_that_of_a_mean_of_gauss_markov_errors(seconds, tau):
     assert slow_share(seconds, math.inf) == slow_share(0.0, math.inf) == 1.0
 
 
-@pytest.mark.parametrize(('own', 'used', 'slow', 'tau', 'rest', 'after'), [
+@pytest.mark.parametrize(('sigma', 'used', 'slow', 'tau', 'rest', 'after'), [
     (0.01, 100, 0.2, math.inf, 30.0, 0.2),     # treated as white: widened to the value of the leg
     (0.01, 100, 0.005, math.inf, 30.0, 0.01),  # never narrower
     (0.5, 100, 0.8, math.inf, 30.0, 0.5),      # the mark has found correlated errors: unchanged
     (0.2, 100, 0.8, math.inf, 30.0, 0.8),      # unless the leg shows clearly larger errors
     (0.001, 1000, 0.8, 60.0, 300.0, 0.8 * slow_share(300.0, 60.0))])    # they average down
-def test_mark_is_widened_by_correlated_errors_it_cannot_detect(own, used, slow, tau, rest, after):
-    result = with_slow_errors(mark(own, used), slow, tau, (-rest, 0.0), 1.0, 4.0)
+def test_mark_is_widened_by_correlated_errors_it_cannot_detect(
+        sigma, used, slow, tau, rest, after):
+    result = with_slow_errors(mark(sigma, used), slow, tau, (-rest, 0.0), 1.0, 4.0)
     np.testing.assert_allclose(result.covariance_n, after * STATED)
 
 

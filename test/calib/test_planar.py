@@ -43,14 +43,14 @@ def run_of(d, kind='differential', arc=0.0, lateral=0.95, slip=0.0, noise=1e-4, 
     turn = np.append(0.0, np.cumsum(d[:, 2])) + 0.3
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
     z = np.append(0.0, np.cumsum(chord * np.exp(1j * (turn[1:] + turn[:-1]) / 2)))
-    apart = d[:, 2] * WIDTH
+    delta = d[:, 2] * WIDTH         # right minus left wheel
     for _ in range(50 * bool(arc)):     # the width depends on the wheels
-        straight = make_side_wheels((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT,
+        straight = make_side_wheels((d[:, 0] - delta / 2) / LEFT, (d[:, 0] + delta / 2) / RIGHT,
                                     'skid').straightness
-        apart = d[:, 2] / (1 / WIDTH + arc * straight)
+        delta = d[:, 2] / (1 / WIDTH + arc * straight)
     rows = wheel_rows(kind, count, offset)
     side = d[:, 1] / (lateral if kind == 'mecanum' else 1.0)
-    metres = rows @ np.stack([d[:, 0], side, apart / 2])
+    metres = rows @ np.stack([d[:, 0], side, delta / 2])
     if slip:
         metres = metres + slip * np.sqrt(np.abs(metres)) * rng.standard_normal(metres.shape)
     scales = SCALES[:len(rows)] if len(rows) > 2 else (LEFT, RIGHT)

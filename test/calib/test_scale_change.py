@@ -31,10 +31,10 @@ ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of 
 
 @pytest.mark.parametrize('first', [1, 2, 4])
 def test_continued_legs_equal_one_fit_with_the_later_legs(first):
-    borders = Toy(np.random.default_rng(5)).borders()
-    whole = fit_jointly(borders, STEPS, 'k')
-    before = fit_jointly(borders[:first], STEPS[:first - 1], 'k').information
-    found = fit_jointly([before, *borders[first:]], STEPS[first - 1:], 'k')
+    marginals = Toy(np.random.default_rng(5)).marginals()
+    whole = fit_jointly(marginals, STEPS, 'k')
+    before = fit_jointly(marginals[:first], STEPS[:first - 1], 'k').information
+    found = fit_jointly([before, *marginals[first:]], STEPS[first - 1:], 'k')
     assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     sigma = np.sqrt(np.diag(whole.covariance))
     assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
@@ -43,13 +43,13 @@ def test_continued_legs_equal_one_fit_with_the_later_legs(first):
 def test_random_walk_is_rarely_a_change_and_a_change_is_found():
     rng = np.random.default_rng(6)
     toy = Toy(rng, states=6, rows=60)
-    alarms = sum(len(scale_steps(toy.walk(rng).borders(), STEPS, 'k')) for _ in range(500))
+    alarms = sum(len(scale_steps(toy.walk(rng).marginals(), STEPS, 'k')) for _ in range(500))
     # three legs of five can be compared with others: one in 370 of 1500 is 4
     assert 0 < alarms <= 12
     rng = np.random.default_rng(7)
     toy = Toy(rng, states=6, rows=60)
     for _ in range(20):
-        (found,) = scale_steps(toy.walk(rng, change=-0.9).borders(), STEPS, 'k')
+        (found,) = scale_steps(toy.walk(rng, change=-0.9).marginals(), STEPS, 'k')
         assert found.leg == 3
         assert found.change == pytest.approx(-0.9, abs=4 * 0.06)     # walk and noise of the legs
         assert found.sigmas < -REMARK_SIGMAS
@@ -144,8 +144,8 @@ def imu_of(legs, config, folder):
     """Return settings with the IMU constants of a calibration of these legs, and the IMU."""
     path = folder / 'calibration.json'
     path.write_text(json.dumps(as_json(combine(legs, config), config, [], 'now')))
-    own = with_settings(config, {'imu.constants': str(path)})
-    return own, known_imu(own)
+    with_imu = with_settings(config, {'imu.constants': str(path)})
+    return with_imu, known_imu(with_imu)
 
 
 def test_imu_known_from_rtk_determines_the_scale_with_correlated_fixes(tmp_path):
@@ -170,14 +170,14 @@ def test_imu_belongs_to_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
     config, results = session
     config = with_settings(config, {'leg.automatic': False, 'vehicle': 'van'})
     legs = legs_of(results)
-    own, imu = imu_of(legs[:2], config, tmp_path)
+    with_imu, imu = imu_of(legs[:2], config, tmp_path)
     assert {name.split('_')[0] for name in imu.marginal.names} == {'gyro', 'accelerometer'}
     # a leg that it includes does not count twice; an IMU of another vehicle is rejected
     assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
         1].estimates[YAW].sigma
     for other in ({'vehicle': 'lorry'}, {'imu.mounting_rpy': (0.0, 0.0, 1.5)}):
         with pytest.raises(BadUsage, match=f'has another {list(other)[0]}'):
-            known_imu(with_settings(own, other))
+            known_imu(with_settings(with_imu, other))
 
 
 def test_scatter_information_of_combined_legs_is_continued(session):

@@ -122,9 +122,9 @@ def test_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
     assert fit.value == pytest.approx(7.0)
     assert fit.r_squared == pytest.approx(1.0)
     assert fit.lack_of_fit < 1e-14
-    bent = fit_surface(y, values + y[:, 0] * y[:, 1] * y[:, 2])
-    assert bent.lack_of_fit == pytest.approx(1.0 / np.ptp(values + y.prod(axis=1)))
-    assert bent.r_squared < 1.0
+    cubic = fit_surface(y, values + y[:, 0] * y[:, 1] * y[:, 2])
+    assert cubic.lack_of_fit == pytest.approx(1.0 / np.ptp(values + y.prod(axis=1)))
+    assert cubic.r_squared < 1.0
 
 
 @pytest.mark.parametrize('definite', [True, False])

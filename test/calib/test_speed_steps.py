@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import cached, everything_said, off, settings
+from drives import cached, off, reason_texts, settings
 import numpy as np
 import pytest
 
@@ -50,7 +50,7 @@ def test_scale_error_of_a_speed_in_whole_kmh_is_within_its_sigma(how, rate, betw
     # and a filter of the speed is an additional unknown
     assert relative_sigma(drive, result.methods['smoother']) < most
     assert off(result.methods['two_point'], drive) < 2.0
-    seen = everything_said(result)
+    seen = reason_texts(result)
     assert Code.SPEED_COARSE in seen
     assert Code.WHEEL_SLIP not in seen
 
@@ -61,7 +61,7 @@ def test_filter_before_the_steps_is_found(tau):
                                          speed_filter=tau), odometer_rate=5.0, duration=600.0)
     method = result.methods['smoother']
     assert off(method, drive) < 3.3
-    assert Code.SPEED_FILTERED in everything_said(result)
+    assert Code.SPEED_FILTERED in reason_texts(result)
     found = method.details['odometer_lag_square']
     # 15 % of the time constant: a first-order filter by five speeds
     assert abs(found['value'] - tau**2) < 0.3 * tau**2 + 3.3 * found['sigma']
@@ -103,20 +103,20 @@ def test_truncation_and_rounding_are_distinguished(how, share):
     offset = result.methods['smoother'].details['speed_offset']
     assert offset['value'] == pytest.approx(share * KMH, abs=3 * offset['sigma'])
     assert offset['sigma'] < KMH / 20
-    assert 'resolution is 0.278 m/s (1 km/h)' in everything_said(result)[Code.SPEED_COARSE]
+    assert 'resolution is 0.278 m/s (1 km/h)' in reason_texts(result)[Code.SPEED_COARSE]
 
 
 @pytest.mark.parametrize('nominal', [KMH, 1.0])
 def test_step_of_a_topic_in_kmh_is_stated_in_its_unit(nominal):
     """With the default of the nominal scale, 1, the fixes determine the unit."""
     _, result = calibrated(scale=KMH, nominal_scale=nominal, step=1.0)
-    assert 'resolution is 1 km/h (0.278 m/s)' in everything_said(result)[Code.SPEED_COARSE]
+    assert 'resolution is 1 km/h (0.278 m/s)' in reason_texts(result)[Code.SPEED_COARSE]
 
 
 def test_continuous_speed_has_no_steps():
     _, result = calibrated(step=0.0)
     smoother = result.methods['smoother']
-    assert Code.SPEED_COARSE not in everything_said(result)
+    assert Code.SPEED_COARSE not in reason_texts(result)
     assert smoother.details['speed_offset']['value'] == 0.0
     assert 'speed_truncation' not in {s.name for s in smoother.sources}
 
@@ -158,7 +158,7 @@ def test_rounding_at_constant_speed_is_in_the_sigma():
 def test_half_metre_pulses_are_named_and_are_not_slip():
     drive, result = calibrated(odometer='counts', rate=50.0, step=0.0, scale=0.505,
                                nominal_scale=0.5)
-    seen = everything_said(result)
+    seen = reason_texts(result)
     assert Code.COUNTER_COARSE in seen
     assert Code.WHEEL_SLIP not in seen
     assert off(result.methods['smoother'], drive) < 3.3

@@ -131,7 +131,7 @@ def test_without_heights_the_scale_is_given_and_the_pitch_is_refused():
     result = calibrate(flat, drives.settings(made))
     e = result.methods['two_point'].estimates
     assert e['pitch_mounting_angle'].value is None
-    assert Code.PITCH_NOT_DETERMINED in drives.everything_said(result)
+    assert Code.PITCH_NOT_DETERMINED in drives.reason_texts(result)
     assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
     # an unknown pitch adds half its square to the scale (152 ppm per degree), and an unknown
     # height above the ellipsoid is 800 m of the Earth's radius
@@ -159,7 +159,7 @@ def test_heights_that_give_a_pitch_beyond_the_limit_reject_the_method():
 def test_closed_loop_is_refused_with_the_action():
     made = drives.drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
     result = calibrate(made.leg(), drives.settings(made))
-    texts = drives.everything_said(result)
+    texts = drives.reason_texts(result)
     assert 'less than a fifth of the' in texts[Code.CHORD_TOO_SHORT]
     assert '--leg' in Code.CHORD_TOO_SHORT.remedy
     assert all(e.value is None for e in result.methods['two_point'].estimates.values())
@@ -176,7 +176,7 @@ def test_track_that_loops_where_the_fixes_do_not_is_refused():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
     spun = drives.changed(made.imu, w_i=lambda a: a + [0.0, 0.0, 0.5] * (
         drives.seconds(made.leg(), made.imu) > 5.0)[:, None])
-    texts = drives.everything_said(calibrate(replace(made.leg(), imu=spun), drives.settings(made)))
+    texts = drives.reason_texts(calibrate(replace(made.leg(), imu=spun), drives.settings(made)))
     assert 'dead-reckoned track' in texts[Code.CHORD_TOO_SHORT]
 
 
@@ -187,14 +187,14 @@ def test_heading_less_accurate_than_the_required_yaw_refuses_only_the_yaw(sigma,
                                                    verdict__max_yaw_sigma=0.0087))
     e = result.methods['two_point'].estimates
     assert (e['yaw_mounting_angle'].value is not None) == given
-    assert (Code.YAW_NOT_SEPARABLE in drives.everything_said(result)) != given
+    assert (Code.YAW_NOT_SEPARABLE in drives.reason_texts(result)) != given
     assert e['scale_factor'].value == pytest.approx(made.truth.scale, rel=2e-3)
 
 
 def test_course_is_not_used_as_the_heading_for_the_yaw():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='consumer')
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=None))
-    assert 'course' in drives.everything_said(result)[Code.YAW_NOT_SEPARABLE]
+    assert 'course' in drives.reason_texts(result)[Code.YAW_NOT_SEPARABLE]
     e = result.methods['two_point'].estimates
     assert e['yaw_mounting_angle'].value is None
     assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4

@@ -132,22 +132,22 @@ def test_two_changes_and_an_outlier_leg_are_distinguished():
 
 def test_an_error_shared_by_all_legs_does_not_affect_a_change():
     """It changes the level and no step: an error common to all legs cancels exactly."""
-    own = np.full(N, 1e-5**2)
+    variances = np.full(N, 1e-5**2)
     y = 2e-4 * (np.arange(N) >= 4)
-    alone, = history(y, covariance(own)).changes
-    shared, = history(y, covariance(own, [np.full((N, 1), 1e-2)])).changes
+    alone, = history(y, covariance(variances)).changes
+    shared, = history(y, covariance(variances, [np.full((N, 1), 1e-2)])).changes
     assert shared.sigma == pytest.approx(alone.sigma, rel=1e-6)
     # the mean of 4 against that of 6
     assert alone.sigma == pytest.approx(1e-5 * (1 / 4 + 1 / 6)**0.5, rel=1e-12)
     # an error of half of the legs only may be the step
     half = np.where(np.arange(N) >= 4, 1e-2, 0.0)[:, None]
-    assert history(y, covariance(own, [half])).changes == ()
+    assert history(y, covariance(variances, [half])).changes == ()
 
 
 def test_the_slope_of_a_drift_has_the_sigma_of_the_regression():
-    own = np.full(N, 1e-5**2)
+    variances = np.full(N, 1e-5**2)
     t = DAYS / 365.25
-    found = history(1e-3 * t, covariance(own), t)
+    found = history(1e-3 * t, covariance(variances), t)
     assert found.slope == pytest.approx(1e-3, rel=1e-9)
     assert found.slope_sigma == pytest.approx(1e-5 / np.sqrt(((t - t.mean())**2).sum()), rel=1e-9)
 

@@ -3,7 +3,7 @@
 
 """A straight drive with a known heading, and one through a town with its running estimates."""
 
-from foreseeing import drive_of, fit_updates, HEADING
+from forecast_drives import drive_of, fit_updates, HEADING
 import pytest
 
 from odocal_ros.settings.config import Config, with_settings

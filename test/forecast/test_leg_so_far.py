@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, held_up, seconds, settings, thinned
+from drives import changed, delayed_in_bursts, drive, seconds, settings, thinned
 import numpy as np
 import pytest
 
@@ -62,7 +62,7 @@ def test_faults_during_the_recording_are_those_of_the_result(made, wrong):
 
 def test_late_rows_are_corrected_during_the_recording_as_in_the_result(made):
     leg = made.leg()
-    late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
+    late = replace(leg, odometer=delayed_in_bursts(leg.odometer, how_long_s=0.4)[0])
     expected = screen(late, settings(made))[0].travel
     cells = ThinnedLeg(leg.form)
     sent_ns = late.odometer.stamp_ns

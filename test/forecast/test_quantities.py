@@ -145,14 +145,14 @@ def test_two_wheels_require_turns_and_a_straight_section():
     far = {'distance_m': 500.0, 'max_speed': 10.0}
     assert manoeuvres(recording(**far)) == [TURNS]           # before the first update
     assert manoeuvres(recording(**far, two_wheels=False)) == []
-    apart = Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, None))
-    assert manoeuvres(recording(**far, forecast=apart)) == [TURNS]
-    neither = replace(apart, wheels=WheelsForecast(2e-3, None))
+    without_width = Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, None))
+    assert manoeuvres(recording(**far, forecast=without_width)) == [TURNS]
+    neither = replace(without_width, wheels=WheelsForecast(2e-3, None))
     assert hint(recording(**far, forecast=neither, still_s=10.0)) == (
         'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.5); drive straight at '
         'normal speed until left and right scale are separable; for the track width: turn by '
         '90 deg in total or more; call ~/stop_leg')
-    both = replace(apart, wheels=WheelsForecast(2e-4, 0.01))
+    both = replace(without_width, wheels=WheelsForecast(2e-4, 0.01))
     assert manoeuvres(recording(**far, forecast=both)) == []
 
 

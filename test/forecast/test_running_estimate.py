@@ -6,7 +6,7 @@
 import time
 from types import SimpleNamespace
 
-from foreseeing import foreseen
+from forecast_drives import forecast_at
 import pytest
 
 from odocal_ros.data.leg import LegRecorder
@@ -71,7 +71,7 @@ def test_the_running_estimate_equals_the_forecast_of_its_thinned_leg(drive, conf
     assert estimate.forecast is None                      # too early
     estimate.update(now_ns)
     finished(worker)
-    expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
+    expected = forecast_at(drive, config, 150.0, smoother=SmootherSoFar())
     assert log.lines == []
     assert estimate.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
     assert estimate.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 import warnings
 
-from foreseeing import drive_of, fit_updates
+from forecast_drives import drive_of, fit_updates
 import numpy as np
 import pytest
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
-def apart(one, other):
+def compared(one, other):
     """Return differences of estimates in sigmas of the other, and the ratios of sigmas."""
     return [((one[n].value - other[n].value) / other[n].sigma, one[n].sigma / other[n].sigma)
             for n in NAMES]
@@ -39,7 +39,7 @@ def errors_in_sigmas(running, drive):
 
 def test_estimate_is_always_within_its_sigma_and_ends_as_the_result(town_drive, exact, updates):
     result = calibrate(town_drive.leg(), exact).methods['smoother'].estimates
-    for off, ratio in apart(updates[-1].running.method.estimates, result):
+    for off, ratio in compared(updates[-1].running.method.estimates, result):
         assert abs(off) < 0.5
         assert 0.9 < ratio < 1.3       # slightly larger: noise levels from 150 s of driving
     for seen in updates:
@@ -54,7 +54,7 @@ def test_an_update_starts_from_the_last_and_agrees_with_a_cold_start(exact, upda
     assert passes.count(UPDATE_PASSES) >= 2
     cold = SmootherSoFar().update(updates[-1].leg, exact).method.estimates
     assert cold['scale_factor'].value != updates[-1].running.method.estimates['scale_factor'].value
-    for off, ratio in apart(updates[-1].running.method.estimates, cold):
+    for off, ratio in compared(updates[-1].running.method.estimates, cold):
         # both stop within 0.1 sigma and levels within 10 % of where they would end
         assert abs(off) < 0.2
         assert ratio == pytest.approx(1.0, abs=0.1)
@@ -79,7 +79,7 @@ def test_a_long_leg_is_estimated_in_windows(town_drive, exact, updates, monkeypa
     assert windowed.distance == pytest.approx(whole.distance, rel=0.01)
     assert windowed.agility == pytest.approx(whole.agility, rel=0.1)
     assert (windowed.sigmas < past.sigmas).all()
-    for off, ratio in apart(windowed.method.estimates, whole.method.estimates):
+    for off, ratio in compared(windowed.method.estimates, whole.method.estimates):
         # a window ends where the next begins, with unknown states
         assert abs(off) < 1.0
         assert 0.9 < ratio < 1.6
@@ -154,7 +154,7 @@ def test_the_size_of_an_imperfection_is_carried_on(exact):
         leg = SmootherSoFar().update(later.leg, graded)
         # two passes instead of a converged level: within a tenth of its own sigma of about 1
         assert size(later.running) == pytest.approx(size(leg), rel=0.1)
-        (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
+        (off, ratio), *_ = compared(later.running.method.estimates, leg.method.estimates)
         offs.append(off)
         ratios.append(ratio)
     # as in each update from the last; in 80 s the level of slow errors is known to a factor
@@ -198,7 +198,7 @@ def test_an_imu_mounted_upside_down_gives_the_same_values(exact, updates):
     down = np.array([1.0, -1.0, -1.0])
     over = replace(leg, imu=replace(leg.imu, w_i=leg.imu.w_i * down, f_i=leg.imu.f_i * down))
     both = [SmootherSoFar().update(one, exact).method.estimates for one in (leg, over)]
-    for off, ratio in apart(*both):
+    for off, ratio in compared(*both):
         assert (off, ratio) == (pytest.approx(0.0, abs=1e-3), pytest.approx(1.0, abs=1e-3))
 
 

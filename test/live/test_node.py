@@ -58,8 +58,8 @@ def _first_leg(seen, leg, client):
     seen.recording = client.until(state='recording')
     # an estimate that is due also comes after the last message, from 50 s of the leg or more;
     # after one that takes 3 s on a busy machine, the next comes a minute later
-    seen.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
-                             and client.status, 'a running estimate', 4 * PATIENCE)
+    seen.recording_status = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
+                                     and client.status, 'a running estimate', 4 * PATIENCE)
     # nothing is sent until the answer: the data of the leg must not depend on the machine's load
     leg.play(115, 117)
     stopping = client.ask('stop_leg')
@@ -195,7 +195,7 @@ def test_the_status_has_plain_numbers_and_times_and_rates_of_the_leg(session):
 
 
 def test_the_status_shows_the_running_estimate_during_a_leg(session):
-    status = session.foreseen
+    status = session.recording_status
     assert status['state'] == 'recording'
     assert 'smoother' in status['estimate_method']
     value, sigma, scale_ppm, metres = (float(status[key]) for key in (
@@ -213,12 +213,12 @@ def test_the_status_shows_the_running_estimate_during_a_leg(session):
 
 
 def test_the_forecast_is_empty_except_during_a_leg(session):
-    foreseen = [key for key in session.foreseen
+    keys = [key for key in session.recording_status
                 if key.startswith(('predicted_', 'metres_to_go_', 'largest_error_source_'))]
-    assert len(foreseen) == 8
+    assert len(keys) == 8
     for status in (session.waiting, session.idle, session.computing, session.calibrated,
                    session.cancelled, session.two_legs, session.after_reset):
-        assert not any(status[key] for key in foreseen)
+        assert not any(status[key] for key in keys)
 
 
 def test_the_live_distance_agrees_with_the_computed_one(session):

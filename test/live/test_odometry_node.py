@@ -165,10 +165,10 @@ def test_the_ekf_configuration_uses_the_published_twist():
     import yaml
     ekf = yaml.safe_load((ROOT / 'config' / 'ekf_odocal.yaml').read_text())[
         '/**/ekf_filter_node']['ros__parameters']
-    own = yaml.safe_load((ROOT / 'config' / 'odometry.yaml').read_text())[
+    frames = yaml.safe_load((ROOT / 'config' / 'odometry.yaml').read_text())[
         '/**/odometry']['ros__parameters']['frames']
     assert ekf['twist0'] == 'odometry/twist'
-    assert (ekf['odom_frame'], ekf['base_link_frame']) == (own['odom'], own['base'])
+    assert (ekf['odom_frame'], ekf['base_link_frame']) == (frames['odom'], frames['base'])
     names = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
     fused = dict(zip([*names, *(f'v{n}' for n in names), 'ax', 'ay', 'az'],
                      ekf['twist0_config'], strict=True))

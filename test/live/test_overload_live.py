@@ -235,9 +235,9 @@ def test_late_counts_are_not_slip_and_slip_is_found(tmp_path):
         assert 'WHEEL_SLIP' not in reasons[name]
     assert 'ODOMETER_LATE' in reasons['held']
     for name in LEGS:     # each has its own folder and journal
-        own = tmp_path / 'odocal' / name / 'calibrator'
-        assert len(list((own / 'journal').iterdir())) == 1
-        content = json.loads((own / 'latest' / 'calibration.json').read_text())
+        folder = tmp_path / 'odocal' / name / 'calibrator'
+        assert len(list((folder / 'journal').iterdir())) == 1
+        content = json.loads((folder / 'latest' / 'calibration.json').read_text())
         assert (content['vehicle'], content['inputs'][0]['node']) == (name, f'/{name}/calibrator')
     text = answers['slip'].message
     assert 'WHEEL_SLIP' in text

@@ -118,9 +118,9 @@ def test_readings_are_the_rows_in_plain_numbers(which, data):
     def read(how):
         reader, found = new_reader(), {}
         for k, raw in enumerate(raws):
-            for own, rows in getattr(reader, how)([raw], [k], make.deserializer(msgtype)):
+            for slot, rows in getattr(reader, how)([raw], [k], make.deserializer(msgtype)):
                 rows = rows if how == 'readings' else readings_of(rows)
-                found.setdefault(own, []).extend(
+                found.setdefault(slot, []).extend(
                     repr([list(v) if isinstance(v, tuple) else v for v in row[:4]])
                     for row in rows)
         return found, reader.unreadable

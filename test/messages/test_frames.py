@@ -165,8 +165,8 @@ def test_distances_in_n_equal_those_in_the_local_frame(latitude_deg):
     geodetic = np.stack(geodetic_of(position, latitude_deg), -1)
     position_n = Origin(*geodetic[7]).to_n(geodetic)       # n has another origin
     for row in (0, 5, 9):
-        own, core = (np.linalg.norm(p - p[row], axis=1) for p in (position, position_n))
-        assert np.abs(core - own).max() < TENTH_MM
+        distance, distance_n = (np.linalg.norm(p - p[row], axis=1) for p in (position, position_n))
+        assert np.abs(distance_n - distance).max() < TENTH_MM
 
 
 def test_a_z_of_zero_is_not_a_height():

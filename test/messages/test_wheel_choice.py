@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, settings
+from drives import drive, reason_texts, settings
 import pytest
 
 from odocal_ros.messages.wheel_choice import select_wheels
@@ -89,11 +89,11 @@ def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_reported():
     config = settings(made, method='auto')
     result = calibrate(blind, config)
     assert 'scale_factor_left' not in result.methods['smoother'].estimates
-    assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is used'
+    assert reason_texts(result)[Code.ODOMETER_CHOSEN] == 'the mean is used'
     both = calibrate(leg, config)
     assert both.methods['smoother'].estimates['scale_factor_left'].value is not None
     # the names give the sides, but a straight path cannot confirm them
-    assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('too few turns')
+    assert reason_texts(both)[Code.ODOMETER_CHOSEN].startswith('too few turns')
     assert result.methods['two_point'].estimates['scale_factor'].value == \
         both.methods['two_point'].estimates['scale_factor'].value
 
@@ -104,4 +104,4 @@ def test_a_dead_wheel_of_unknown_side_is_still_found():
     dead = replace(leg.odometer_right, value=leg.odometer_right.value * 0)
     result = calibrate(replace(leg, odometer_right=dead, form=replace(leg.form, sides=False)),
                        settings(made))
-    assert Code.WHEEL_DEAD in everything_said(result)
+    assert Code.WHEEL_DEAD in reason_texts(result)

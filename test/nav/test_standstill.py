@@ -30,9 +30,9 @@ def gyro(t, noise=0.0, bias=(0.0, 0.0, 0.0), turn=None, seed=1):
 
 def counts(t, drive, phase=0.3):
     """Return travel as whole counts of K metres at the odometer's own 50 Hz."""
-    own = t[::2]
-    s = np.floor(np.interp(own, *drive) / K + phase)
-    return Travel(own, s - s[0], 1.0)
+    t_odometer = t[::2]
+    s = np.floor(np.interp(t_odometer, *drive) / K + phase)
+    return Travel(t_odometer, s - s[0], 1.0)
 
 
 def ramp(begin, end, top=10.0, slope=1.0):
@@ -136,8 +136,8 @@ def test_an_imu_gap_is_not_a_standstill():
 
 def test_a_standstill_is_found_without_odometer_messages_at_rest():
     rows = counts(T, DRIVE)
-    own = (rows.t == 0) | ((rows.t > 20) & (rows.t < 70)) | (rows.t == rows.t[-1])
-    found = standstills(T, gyro(T), Travel(rows.t[own], rows.s[own], 1.0), K, 2.0)
+    in_motion = (rows.t == 0) | ((rows.t > 20) & (rows.t < 70)) | (rows.t == rows.t[-1])
+    found = standstills(T, gyro(T), Travel(rows.t[in_motion], rows.s[in_motion], 1.0), K, 2.0)
     assert len(found) == 2
     assert found[0, 1] <= 20.0
     assert found[1, 0] >= 70.0

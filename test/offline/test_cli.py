@@ -138,12 +138,12 @@ def ros2(*argv):
     assert inspect.getdoc(extension)        # its first line is the help
     parser = argparse.ArgumentParser(prog='ros2')
     commands = parser.add_subparsers()
-    own = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter)
-    own.exit, leave = lambda status=0, message=None: None, own.exit
-    own.print_help, show = lambda: None, own.print_help
+    command = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.exit, leave = lambda status=0, message=None: None, command.exit
+    command.print_help, show = lambda: None, command.print_help
     parser.parse_known_args(argv)
-    own.exit, own.print_help = leave, show
-    extension.add_arguments(own, f'ros2 {name}')
+    command.exit, command.print_help = leave, show
+    extension.add_arguments(command, f'ros2 {name}')
     return extension.main(parser=parser, args=parser.parse_args(argv))
 
 

@@ -128,9 +128,9 @@ def test_sigmas_without_shared_errors_are_reported_but_not_used(compare):
     assert change['sigmas_if_shared_cancels'] == pytest.approx(0.012 / (0.0024 * 2**0.5))
     assert code == 0
     assert found['scale_factor'][1]['to_first']['sigmas_if_shared_cancels'] is None
-    own = content()
-    own['methods']['two_point']['budget']['initial_heading']['shared'] = False
-    change = changes(compare, own, content(yaw=0.022, start=2 * START))[2]['yaw_mounting_angle']
+    old = content()
+    old['methods']['two_point']['budget']['initial_heading']['shared'] = False
+    change = changes(compare, old, content(yaw=0.022, start=2 * START))[2]['yaw_mounting_angle']
     assert change[1]['to_first']['sigmas_if_shared_cancels'] is None
     text = compare(content(), content(yaw=0.022, start=2 * START))[1]
     assert 'yaw mounting is 3.5 sigma if' in text

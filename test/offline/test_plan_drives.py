@@ -42,13 +42,13 @@ def test_speed_steps_of_a_gpx_track_do_not_reduce_the_sigmas(tmp_path, scenario,
     place = place + noise * np.random.default_rng(3).normal(size=(2, len(place))).T.copy().view(
         complex)[:, 0]
     sigmas = Sigmas()
-    own, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
+    planned, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
         planned_drives.from_scenario(scenario, None),
         planned_drives.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
     # points 5 m apart hide the first 4 s of a start with 0.5 m/s^2, a sixth of its 25 s, and noise
     # adds to it; steps of speed at each point would halve the sigma of the straight drive
     for name in NAMES[:2]:
-        assert drawn[name].sigma > 0.75 * own[name].sigma
+        assert drawn[name].sigma > 0.75 * planned[name].sigma
 
 
 def test_a_gpx_track_gives_its_distance_speed_and_standstills(tmp_path, capsys):
@@ -107,8 +107,8 @@ def test_the_plan_of_a_bag_uses_its_drive_and_fixes(tmp_path, capsys):
     assert answer['drive']['distance'] == pytest.approx(motion.distance, rel=0.01)
     assert answer['drive']['standing'] == pytest.approx([60.0, 60.0], abs=1.5)
     assert answer['sigmas']['pulse'] == pytest.approx(0.0213, rel=0.02)     # its own counts
-    own = plan_of(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
-    assert own['sigmas']['pulse'] == 0.1
+    plan = plan_of(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
+    assert plan['sigmas']['pulse'] == 0.1
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
     (bag / 'journal.yaml').write_text(
         '/**/calibrator:\n  ros__parameters:\n    imu.grade: tactical\n'

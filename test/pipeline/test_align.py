@@ -79,13 +79,13 @@ def test_bias_walk_of_a_warming_gyro_is_taken_from_its_standstills(slope):
 def test_an_imu_configured_with_a_better_grade_has_sigmas_of_its_noise():
     noisy = replace(PLAIN, imu_grade='consumer')
     alignment, _ = Case(noisy, settings(imu__grade='tactical')).align()
-    own, _ = Case(noisy, settings(imu__grade='consumer')).align()
+    consumer, _ = Case(noisy, settings(imu__grade='consumer')).align()
     grade = GRADES['consumer']
-    assert alignment.gyro_bias_walk == own.gyro_bias_walk == grade.gyro_bias_walk
+    assert alignment.gyro_bias_walk == consumer.gyro_bias_walk == grade.gyro_bias_walk
     assert alignment.gyro_scale_sigma == grade.gyro_scale_error
     assert alignment.gyro_axes_sigma == pytest.approx(np.sqrt(2) * grade.misalignment)
     # sold with a bias of 25 mg
-    assert own.level_sigma == pytest.approx(
+    assert consumer.level_sigma == pytest.approx(
         np.hypot(25e-3, np.sqrt(2) * grade.misalignment), rel=0.01)
 
 

@@ -6,7 +6,7 @@
 import re
 from types import SimpleNamespace
 
-from drives import drive, everything_said, seconds, settings, spoilt
+from drives import drive, reason_texts, seconds, settings, with_columns
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(± ([\d.]+) s\) (late|early).*
 def delay_texts(made, method, **changes):
     """Return a reported delay: (sensor, seconds late, sigma, setting, its value)."""
     result = calibrate(made.leg(), settings(made, method=method, heading_sigma=None, **changes))
-    text = everything_said(result).get(Code.DELAY_SEEN)
+    text = reason_texts(result).get(Code.DELAY_SEEN)
     if text is None:
         return None
     what, size, sigma, direction, name, offset = SAID.search(text).groups()
@@ -113,7 +113,7 @@ def whole_kmh(leg, spun=0.0):
     t, value = seconds(leg, leg.odometer), leg.odometer.value
     fast = t[(value > 8.0) & (t > 60.0)][0]
     value = value + spun / 2.0 * ((t > fast) & (t < fast + 2.0))
-    return spoilt(leg, 'odometer', value=(slice(None), np.trunc(3.6 * value) / 3.6)), fast
+    return with_columns(leg, 'odometer', value=(slice(None), np.trunc(3.6 * value) / 3.6)), fast
 
 
 @pytest.mark.parametrize('spun', [0.0, 4.0])
@@ -126,7 +126,7 @@ def test_slip_of_a_coarse_speed_is_found_by_the_track_of_the_smoother(spun):
     if spun:
         assert float(delay_texts[0].split('t = ')[1].split(' s')[0]) == pytest.approx(at + 1.0,
                                                                                       abs=1.5)
-    assert Code.SPEED_COARSE in everything_said(result)
+    assert Code.SPEED_COARSE in reason_texts(result)
 
 
 STRAIGHT = {'scenario': 'straight', 'duration': 400.0, 'two_wheels': True, 'seed': 3}
@@ -139,7 +139,7 @@ def with_slip(made, extra_m):
     leg, count = made.leg(), made.odometer_right.value
     share = (count - count[0]) / (count[-1] - count[0])
     more = extra_m(seconds(leg, leg.odometer_right), share) / made.truth.wheel_scales[1]
-    return spoilt(leg, 'odometer_right', value=lambda n: n + np.round(more).astype(np.int64))
+    return with_columns(leg, 'odometer_right', value=lambda n: n + np.round(more).astype(np.int64))
 
 
 def slow(made):
@@ -198,7 +198,7 @@ def test_slow_slip_is_reported_with_its_size(slipped):
     else:
         assert 1800 < float(text.split(' by ')[1].split(' cm')[0]) < 2200
     # 0.25 % exceeds the required accuracy of 0.1 %; settings of these tests require 10 %
-    assert Code.SCALE_SIGMA_TOO_LARGE not in everything_said(result)
+    assert Code.SCALE_SIGMA_TOO_LARGE not in reason_texts(result)
 
 
 def test_an_increased_sigma_is_compared_with_its_limit():

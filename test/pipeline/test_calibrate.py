@@ -97,11 +97,12 @@ def test_residuals_of_the_track_show_the_correction(made):
 def test_values_are_within_sigmas_for_each_kind_of_drive(option, value):
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
                         **{option: value})
-    own = option in ('heading_sigma', 'orientation_sigma')
-    result = calibrate(made.leg(), drives.settings(made, heading_sigma=None if own else 1e-3))
+    from_drive = option in ('heading_sigma', 'orientation_sigma')
+    config = drives.settings(made, heading_sigma=None if from_drive else 1e-3)
+    result = calibrate(made.leg(), config)
     z = drives.errors_in_sigmas(result, made.truth)
     assert set(z) == {SCALE, YAW, PITCH}
-    assert not drives.rejecting(result), drives.everything_said(result)
+    assert not drives.rejecting(result), drives.reason_texts(result)
     assert all(abs(x) < 5 for x in z.values()), z
 
 

@@ -6,7 +6,7 @@
 from dataclasses import replace
 import math
 
-from drives import drive, everything_said, off, settings, spoilt
+from drives import drive, off, reason_texts, settings, with_columns
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def posed(made, latitude_deg=math.nan, position=None):
 
 def without_covariance(made):
     """Return the leg of a drive whose fixes have no covariance, like poses."""
-    return spoilt(made.leg(), 'fix', covariance_type=np.zeros_like)
+    return with_columns(made.leg(), 'fix', covariance_type=np.zeros_like)
 
 
 def estimates(leg, config):
@@ -156,9 +156,9 @@ def test_a_local_frame_has_no_gyrocompass():
     assert calibrate(made.leg(), config).methods['two_point'].estimates[
         'yaw_mounting_angle'].value is not None
     result = calibrate(posed(made), config)
-    assert Code.YAW_NOT_SEPARABLE in everything_said(result)
+    assert Code.YAW_NOT_SEPARABLE in reason_texts(result)
     heading_config = settings(made, heading_sigma=None, alignment__heading_source='gyrocompass')
-    assert 'y axis does not point to north' in everything_said(calibrate(posed(made),
+    assert 'y axis does not point to north' in reason_texts(calibrate(posed(made),
                                                                          heading_config))[
         Code.GYROCOMPASS_REFUSED]
 
@@ -167,7 +167,7 @@ def test_an_orientation_is_a_heading_in_the_frame_only_if_configured():
     made = drive(**CAR, orientation_sigma=0.001)
     for source in ('auto', 'imu_orientation'):
         config = settings(made, heading_sigma=None, alignment__heading_source=source)
-        texts = everything_said(calibrate(posed(made), config))
+        texts = reason_texts(calibrate(posed(made), config))
         assert (Code.YAW_NOT_SEPARABLE in texts) == (source == 'auto')
 
 
@@ -214,7 +214,7 @@ def test_a_pose_that_contains_the_wheels_is_reported():
     assert 'positions fused with a wheel speed' in texts.text
     assert all(word in texts.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
     plain = calibrate(posed(drive(**CAR)), settings(drive(**CAR), **SMOOTHER))
-    assert Code.FIXES_FOLLOW_ODOMETER not in everything_said(plain)
+    assert Code.FIXES_FOLLOW_ODOMETER not in reason_texts(plain)
 
 
 def test_a_result_in_a_local_frame_has_no_map(made):
@@ -250,9 +250,9 @@ def test_the_simulated_frame_starts_at_the_vehicle_and_looks_ahead():
     forward = position[len(position) // 3]
     assert abs(forward[1]) < 0.2 * forward[0]
     geodetic = np.stack([made.fix.latitude, made.fix.longitude, made.fix.height], -1)
-    own = Origin(made.options.latitude, made.options.longitude, made.options.height)
+    origin = Origin(made.options.latitude, made.options.longitude, made.options.height)
     turned = position @ matrix_from_rpy([0.0, 0.0, math.pi / 2 - made.options.heading]).T
-    np.testing.assert_allclose(turned, own.to_n(geodetic), atol=1e-9)
+    np.testing.assert_allclose(turned, origin.to_n(geodetic), atol=1e-9)
 
 
 def test_a_track_in_a_local_frame_has_no_north():

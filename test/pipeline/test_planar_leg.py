@@ -37,9 +37,9 @@ def driven(drive='differential', **more):
     options = {'scenario': 'indoor', 'reference': 'mocap', 'fix_rate': 10.0, 'odometer': 'angle',
                'imu': False, 'slip_walk': 5e-4, 'drive': drive, 'duration': 120.0} | more
     made = simulate(SimOptions(**options))
-    own = settings(made)['odometer']
-    own.pop('lever_arm')
-    return made, with_settings(Config(), {f'odometer.{k}': v for k, v in own.items()})
+    odometer = settings(made)['odometer']
+    odometer.pop('lever_arm')
+    return made, with_settings(Config(), {f'odometer.{k}': v for k, v in odometer.items()})
 
 
 @pytest.mark.core
@@ -127,18 +127,18 @@ def test_controller_parameters_of_each_drive_are_exported():
     made, config = driven('mecanum')
     text = _controllers(_calibrated(made, config), config)
     assert 'mecanum_drive_controller:' in text
-    own = yaml.safe_load(text)['mecanum_drive_controller']['ros__parameters']['kinematics']
-    assert set(own) == foreign_keys.MECANUM_KINEMATICS
-    assert own['wheels_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
-    assert own['sum_of_robot_center_projection_on_X_Y_axis'] == pytest.approx(0.3, rel=1e-2)
+    kinematics = yaml.safe_load(text)['mecanum_drive_controller']['ros__parameters']['kinematics']
+    assert set(kinematics) == foreign_keys.MECANUM_KINEMATICS
+    assert kinematics['wheels_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
+    assert kinematics['sum_of_robot_center_projection_on_X_Y_axis'] == pytest.approx(0.3, rel=1e-2)
     assert 'diff_drive' not in text
     made, config = driven('omni')
     config = with_settings(config, {'odometer.wheel_offset': 0.0})
-    own = yaml.safe_load(_controllers(_calibrated(made, config), config))
-    own = own['omni_wheel_drive_controller']['ros__parameters']
-    assert set(own) == foreign_keys.OMNI_WHEEL_DRIVE
-    assert own['wheel_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
-    assert own['robot_radius'] == pytest.approx(0.15, rel=1e-2)
+    parameters = yaml.safe_load(_controllers(_calibrated(made, config), config))
+    parameters = parameters['omni_wheel_drive_controller']['ros__parameters']
+    assert set(parameters) == foreign_keys.OMNI_WHEEL_DRIVE
+    assert parameters['wheel_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
+    assert parameters['robot_radius'] == pytest.approx(0.15, rel=1e-2)
     made, config = driven('skid')
     calibration = _calibrated(made, config)
     assert 'wheel_separation_multiplier: 1.7' in _controllers(calibration, config)

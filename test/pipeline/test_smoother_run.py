@@ -4,7 +4,7 @@
 """The smoother as a method of the pipeline."""
 
 import drives
-from drives import ANGLES, drive, everything_said, off, settings, spoilt, TOWN
+from drives import ANGLES, drive, off, reason_texts, settings, TOWN, with_columns
 import numpy as np
 import pytest
 
@@ -49,7 +49,7 @@ def smoothed(leg, made):
 
 def with_height(made, height):
     """Return the leg of a drive with a height, m, in all fixes, or in each."""
-    return spoilt(made.leg(), 'fix', height=(slice(None), height))
+    return with_columns(made.leg(), 'fix', height=(slice(None), height))
 
 
 def test_fixes_without_altitude_give_all_three_values(made):
@@ -96,7 +96,7 @@ def test_heights_stated_far_worse_than_the_level_part_leave_a_result():
     rough = drive(**TOWN, fix_sigma=1.0)
     # m: of a receiver that states 1 km for a height it does not know
     stated = (slice(None), np.diag([0.01, 0.01, 1000.0])**2)
-    found = smoothed(spoilt(rough.leg(), 'fix', covariance_n=stated), rough)
+    found = smoothed(with_columns(rough.leg(), 'fix', covariance_n=stated), rough)
     assert off(found, rough, 'scale_factor', 'yaw_mounting_angle') < SIGMAS
 
 
@@ -107,7 +107,7 @@ def test_a_late_odometer_loses_no_travel_at_a_mark_in_motion():
     leg = part_of(made.leg(), made.truth.start_ns, stop, None)
     assert made.motion.speed(200.0) > 10.0      # 0.8 m in the delay
     result = calibrate(leg, settings(made, **ASKED))
-    assert not {Code.WHEEL_SLIP, Code.TRAVEL_MISSING} & set(everything_said(result))
+    assert not {Code.WHEEL_SLIP, Code.TRAVEL_MISSING} & set(reason_texts(result))
     assert off(result.methods['smoother'], made, 'scale_factor', *ANGLES) < SIGMAS
 
 
@@ -117,7 +117,7 @@ def test_a_start_within_an_odometer_gap_is_not_slip(made):
     start = moves[1:][(np.diff(moves) > 2.0) & (moves[1:] > 30.0)][0]     # after a stop
     lost = drives.without(leg, 'odometer', start - 10.0, start + 10.0)
     found = [calibrate(one, settings(made, **ASKED)) for one in (leg, lost)]
-    assert Code.WHEEL_SLIP not in everything_said(found[1])
+    assert Code.WHEEL_SLIP not in reason_texts(found[1])
     scale, with_gap = (one.methods['smoother'].estimates['scale_factor'] for one in found)
     assert abs(with_gap.value - made.truth.scale) < SIGMAS * with_gap.sigma
     assert with_gap.sigma < 1.1 * scale.sigma       # 20 s of 200 are missing

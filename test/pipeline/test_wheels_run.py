@@ -98,7 +98,8 @@ def test_the_holdout_is_not_in_the_fit_and_agrees_with_the_track(made, result):
     # nothing after the begin of the holdout is in the fit
     late = made.fix.stamp_ns > made.truth.start_ns + 0.9 * (
         made.truth.stop_ns - made.truth.start_ns)
-    moved = drives.spoilt(made.leg(), 'fix', latitude=lambda x: x + late * 2e-5)      # 127 m north
+    # 127 m north
+    moved = drives.with_columns(made.leg(), 'fix', latitude=lambda x: x + late * 2e-5)
     again = calibrate(moved, settings(made), holdout=True)
     # sums by BLAS differ in the last bit with where arrays lie in memory
     assert again.methods['smoother'].estimates['scale_factor_left'].value == pytest.approx(
@@ -138,7 +139,7 @@ def test_slip_of_one_wheel_is_reported_once_and_changes_no_ratio_or_mean(made, r
     leg = made.leg()
     t = drives.seconds(leg, leg.odometer)
     spun = np.rint(np.clip((t - 100.0) / 2.0, 0.0, 1.0) * 0.5 / made.options.scale)
-    slipped = drives.spoilt(leg, 'odometer', value=lambda n: n + spun.astype(np.int64))
+    slipped = drives.with_columns(leg, 'odometer', value=lambda n: n + spun.astype(np.int64))
     clean, result = result, calibrate(slipped, settings(made))
     assert sum(r.code is Code.WHEEL_SLIP for r in result.reasons) == 1
     source = next(s for s in result.methods['two_point'].sources if s.name == 'wheel_slip')

@@ -5,7 +5,7 @@
 
 import re
 
-from drives import configured, kept, seconds, settings, spoilt
+from drives import configured, kept, seconds, settings, with_columns
 import numpy as np
 import pytest
 
@@ -135,7 +135,7 @@ def drive(request):
 
 
 def screened(drive, change, **options):
-    leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=change)
+    leg = with_columns(drive.leg(), 'fix_velocity', velocity_n=change)
     inputs, found = screen(leg, settings(drive, None, **options))
     texts = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
     assert len(texts) == (not len(inputs.external['fix_velocity'].t))
@@ -172,7 +172,7 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
 
 
 def test_a_velocity_that_is_not_configured_is_not_reported(drive):
-    leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=lambda v: v.fill(9.0))
+    leg = with_columns(drive.leg(), 'fix_velocity', velocity_n=lambda v: v.fill(9.0))
     _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
 

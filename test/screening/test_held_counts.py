@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, settings
+from drives import drive, reason_texts, settings
 import numpy as np
 import pytest
 
@@ -51,7 +51,7 @@ def test_a_counter_read_at_5_hz_and_published_at_50_hz_gives_no_slip():
     slow = replace(leg, odometer=replace(leg.odometer, value=leg.odometer.value[read]))
     result, plain = (calibrate(one, settings(made, heading_sigma=None, method='smoother'))
                      for one in (slow, leg))
-    texts = everything_said(result)
+    texts = reason_texts(result)
     assert not {Code.WHEEL_SLIP, Code.TRAVEL_MISSING, Code.TOPIC_GAP, Code.ODOMETER_LATE} & set(
         texts)
     found, exact = (one.methods['smoother'].estimates['scale_factor'] for one in (result, plain))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import re
 
 import drives
-from drives import drive, everything_said, off, rejecting, settings, shifted, spoilt
+from drives import drive, off, reason_texts, rejecting, settings, shifted, with_columns
 import numpy as np
 import pytest
 from reversing_drives import made, there_and_back, three_point_turn, without_direction
@@ -69,7 +69,7 @@ def test_imu_orientation_is_not_found_without_accelerations():
     rng = np.random.default_rng(1)
     for noise in (0.0, 3.0):        # m/s^2: zero, and far above accelerations of driving
         still = [0.0, 0.0, 9.81] + noise * rng.standard_normal(made.imu.f_i.shape)
-        assert seen(made, spoilt(made.leg(), 'imu', f_i=(slice(None), still))) is None
+        assert seen(made, with_columns(made.leg(), 'imu', f_i=(slice(None), still))) is None
 
 
 def test_a_large_orientation_error_is_reported_with_side_and_size():
@@ -112,13 +112,13 @@ def test_a_leg_reports_the_orientation_and_no_slip(yaw, code):
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto'))
     assert code in {r.code for r in result.reasons}
     assert code in rejecting(result)
-    assert Code.WHEEL_SLIP not in everything_said(result)
+    assert Code.WHEEL_SLIP not in reason_texts(result)
 
 
 def test_an_imu_with_a_configured_rotation_is_calibrated_without_slip():
     made = town(40.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto'))
-    texts = everything_said(result)
+    texts = reason_texts(result)
     assert Code.WHEEL_SLIP not in texts
     assert Code.YAW_FAR_FROM_NOMINAL in texts
     assert off(result.methods['smoother'], made, 'yaw_mounting_angle') < 4
@@ -126,16 +126,16 @@ def test_an_imu_with_a_configured_rotation_is_calibrated_without_slip():
     made = town(180.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto',
                                             imu__nominal_yaw=np.pi))
-    assert not {Code.WHEEL_SLIP, Code.ODOMETER_REVERSED} & set(everything_said(result))
+    assert not {Code.WHEEL_SLIP, Code.ODOMETER_REVERSED} & set(reason_texts(result))
     yaw = result.methods['smoother'].estimates['yaw_mounting_angle']
     assert abs(wrap(yaw.value - np.pi)) < 4 * yaw.sigma
 
 
 def test_a_whole_leg_driven_backwards_is_not_a_reversed_odometer():
     made = town(180.0)
-    backwards = spoilt(made.leg(), 'odometer', value=lambda n: 20_000 - n)
+    backwards = with_columns(made.leg(), 'odometer', value=lambda n: 20_000 - n)
     result = calibrate(backwards, settings(made, heading_sigma=None, method='auto'))
-    assert Code.ODOMETER_REVERSED not in everything_said(result)
+    assert Code.ODOMETER_REVERSED not in reason_texts(result)
 
 
 def moved(made, rpy_deg, share=0.5):
@@ -145,7 +145,7 @@ def moved(made, rpy_deg, share=0.5):
 
     def turn(x):
         return np.concatenate([x[:begin], x[begin:] @ C.T])
-    return spoilt(made.leg(), 'imu', w_i=turn, f_i=turn)
+    return with_columns(made.leg(), 'imu', w_i=turn, f_i=turn)
 
 
 @pytest.mark.parametrize('share', [0.3, 0.45, 0.7])
@@ -158,7 +158,7 @@ def test_a_moved_imu_rejects_the_leg_with_the_time(rpy_deg, text, share):
     leg = moved(made, rpy_deg, share)
     result = calibrate(leg, settings(made))
     assert rejecting(result) == {Code.IMU_AXES}
-    reason_text = everything_said(result)[Code.IMU_AXES]
+    reason_text = reason_texts(result)[Code.IMU_AXES]
     begin, end = (float(x) for x in reason_text.split('t = ')[1].split(' s:')[0].split(' to '))
     at = (leg.imu.stamp_ns[int(share * len(leg.imu.stamp_ns))] - leg.start_ns) * 1e-9
     angle = float(reason_text.split('turns by ')[1].split()[0])
@@ -218,7 +218,7 @@ def test_corrected_reversing_gives_the_true_values_and_no_slip(route):
         result = calibrate(without_direction(drive_.leg()), config)
         assert result.verdict is Verdict.CAUTION
         assert not rejecting(result)
-        assert not {Code.WHEELS_SWAPPED, Code.WHEEL_SLIP} & set(everything_said(result))
+        assert not {Code.WHEELS_SWAPPED, Code.WHEEL_SLIP} & set(reason_texts(result))
         errors = drives.errors_in_sigmas(result, drive_.truth)
         assert max(map(abs, errors.values())) < 3.5
 

@@ -3,7 +3,7 @@
 
 """IMU rows: regular intervals, an axis at the limit of its range, two alternating IMUs."""
 
-from drives import drive, seconds, spoilt
+from drives import drive, seconds, with_columns
 import numpy as np
 import pytest
 
@@ -152,7 +152,7 @@ def second(x, by):
     ('w_i', lambda w: w + BIAS), ('f_i', lambda f: f + 100 * BIAS),
     ('w_i', lambda w: w @ matrix_from_rpy([0.1, 0.0, 0.0]).T)], ids=['gyro', 'force', 'axes'])
 def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
-    _, reasons = screen(spoilt(leg, 'imu', **{column: lambda x: second(x, by)}), Config())
+    _, reasons = screen(with_columns(leg, 'imu', **{column: lambda x: second(x, by)}), Config())
     assert 'every second message' in {r.code: r for r in reasons}[Code.SEVERAL_IMUS].text
 
 

@@ -6,7 +6,7 @@
 from dataclasses import replace
 
 import drives
-from drives import changed, drive, everything_said, held_up, settings, with_increments
+from drives import changed, delayed_in_bursts, drive, reason_texts, settings, with_increments
 import numpy as np
 import pytest
 
@@ -57,7 +57,7 @@ def increments(made):
 def of_smoother(made, samples):
     leg = replace(made.leg(), odometer=samples)
     result = calibrate(leg, settings(made, heading_sigma=None, method='smoother'))
-    return result.methods['smoother'], everything_said(result)
+    return result.methods['smoother'], reason_texts(result)
 
 
 @pytest.fixture(scope='module')
@@ -69,7 +69,7 @@ def straight(made):
 @pytest.mark.parametrize(('how_long_s', 'drain_s'), [(0.12, 1e-4), (0.12, 0.01), (1.5, 0.012)],
                          ids=['at once', 'slow line', 'starved'])
 def test_late_rows_are_moved_to_their_sampling_times(made, true, how_long_s, drain_s):
-    late, held = held_up(made.odometer, how_long_s=how_long_s, drain_s=drain_s)
+    late, held = delayed_in_bursts(made.odometer, how_long_s=how_long_s, drain_s=drain_s)
     inputs, found = screened(made, late)
     assert len(inputs.travel.t) == len(true.travel.t)
     moving = np.abs(np.gradient(true.travel.s, true.travel.t)) * made.truth.scale > 2.0
@@ -82,7 +82,7 @@ def test_late_rows_are_moved_to_their_sampling_times(made, true, how_long_s, dra
 
 
 def test_late_rows_are_not_slip(made, straight):
-    late, _ = held_up(made.odometer)
+    late, _ = delayed_in_bursts(made.odometer)
     method, texts = of_smoother(made, late)
     assert Code.ODOMETER_LATE in texts
     assert Code.WHEEL_SLIP not in texts
@@ -246,7 +246,7 @@ def test_rows_that_arrive_together_are_distributed(made):
 
 
 def test_a_slip_between_late_rows_is_found(made):
-    late, _ = held_up(spun(made, made.odometer))
+    late, _ = delayed_in_bursts(spun(made, made.odometer))
     method, texts = of_smoother(made, late)
     assert Code.ODOMETER_LATE in texts
     assert Code.WHEEL_SLIP in texts
@@ -256,7 +256,7 @@ def test_a_slip_between_late_rows_is_found(made):
 
 
 def test_lost_rows_within_a_burst(made, true):
-    late, held = held_up(made.odometer)
+    late, held = delayed_in_bursts(made.odometer)
     lost = held & (np.arange(len(held)) % 3 == 0)
     some = take(late, ~lost)
     inputs, _ = screened(made, some)
@@ -269,7 +269,7 @@ def test_lost_rows_within_a_burst(made, true):
 
 def test_increments_that_are_late_are_not_lost(made):
     steps, form = increments(made)
-    late, _ = held_up(steps, how_long_s=0.5)
+    late, _ = delayed_in_bursts(steps, how_long_s=0.5)
     inputs, found = screened(made, late, form=form)
     straight, _ = screened(made, steps, form=form)
     assert inputs.travel.s[-1] == straight.travel.s[-1]

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, kept, spoilt, STRAIGHT, with_increments
+from drives import drive, kept, STRAIGHT, with_columns, with_increments
 import numpy as np
 import pytest
 from screened import screen_with
@@ -29,7 +29,8 @@ def true(leg):
 def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span, scale):
     made = drive(**STRAIGHT | {'duration': 900.0}, odometer='counts', scale=scale)
     alone, _ = screen_with(made.leg())
-    inputs, found = screen(spoilt(made.leg(), 'odometer', value=lambda v: v % span), Config())
+    leg = with_columns(made.leg(), 'odometer', value=lambda v: v % span)
+    inputs, found = screen(leg, Config())
     codes, remedies = {r.code: r.text for r in found}, [r.remedy for r in found]
     assert np.diff(made.odometer.value[[0, -1]]) > 3 * span
     assert f'rolls over at {span}' in codes[Code.COUNTER_ROLLOVER]
@@ -50,7 +51,8 @@ def test_jumps_larger_than_a_span_are_not_a_rollover():
 @pytest.mark.parametrize('value', [0, -50_000, 2**62, 10**9])
 @pytest.mark.parametrize('length', [1, 20, 300])
 def test_a_counter_that_jumps_away_and_back_is_corrected(leg, true, value, length):
-    inputs, codes = screen_with(spoilt(leg, 'odometer', value=(slice(2000, 2000 + length), value)))
+    inputs, codes = screen_with(
+        with_columns(leg, 'odometer', value=(slice(2000, 2000 + length), value)))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
     assert 'are frozen or isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
@@ -60,7 +62,7 @@ def test_a_counter_that_jumps_away_and_back_is_corrected(leg, true, value, lengt
 @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s
 def test_a_counter_that_hangs_and_catches_up_is_corrected(leg, true, first):
     hung = (slice(first, first + 150), leg.odometer.value[first])
-    inputs, codes = screen_with(spoilt(leg, 'odometer', value=hung))
+    inputs, codes = screen_with(with_columns(leg, 'odometer', value=hung))
     assert Code.COUNTER_RESET not in codes
     assert inputs.travel.s[-1] == true[-1]
 
@@ -68,7 +70,7 @@ def test_a_counter_that_hangs_and_catches_up_is_corrected(leg, true, first):
 def test_a_reset_is_bridged_within_the_stated_uncertainty(made, leg, true):
     after = slice(2000, None)     # 12 m/s
     count = leg.odometer.value[after]
-    inputs, codes = screen_with(spoilt(leg, 'odometer', value=(after, count - count[0])))
+    inputs, codes = screen_with(with_columns(leg, 'odometer', value=(after, count - count[0])))
     assert 'a reset, not motion' in codes[Code.COUNTER_RESET]
     # one interval at the adjacent speed, uniform between zero and two of it
     speed = 12.0 / made.options.scale
@@ -91,6 +93,6 @@ def test_lost_increments_are_bridged_at_the_adjacent_speed(leg, true):
 def test_a_speed_that_jumps_is_excluded():
     made = drive(**STRAIGHT, odometer='speed')
     leg = made.leg()
-    inputs, codes = screen_with(spoilt(leg, 'odometer', value=([2500, 2900], [90.0, -40.0])))
+    inputs, codes = screen_with(with_columns(leg, 'odometer', value=([2500, 2900], [90.0, -40.0])))
     assert codes[Code.BAD_ROWS_DROPPED].startswith('2 of')
     np.testing.assert_allclose(inputs.travel.s[-1], screen_with(leg)[0].travel.s[-1], rtol=1e-6)

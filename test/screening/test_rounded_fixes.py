@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import ANGLES, configured, drive, everything_said, off, spoilt, TOWN
+from drives import ANGLES, configured, drive, off, reason_texts, TOWN, with_columns
 import numpy as np
 import pytest
 
@@ -120,9 +120,9 @@ def test_a_step_far_below_the_stated_sigma_is_not_reported():
 def test_a_scale_from_float32_positions_is_as_uncertain_as_stated():
     made = drive(**TOWN | {'seed': 5}, fix_rate=5.0, fix_noise='rtk')
     leg, config = made.leg(), replace(configured(made), method='smoother')
-    coarse = spoilt(leg, 'fix', latitude=rounded(float32), longitude=rounded(float32))
+    coarse = with_columns(leg, 'fix', latitude=rounded(float32), longitude=rounded(float32))
     found = calibrate(coarse, config)
     assert off(found.methods['smoother'], made, 'scale_factor', *ANGLES) < 2.5
-    assert 'rounded' in everything_said(found)[Code.FIXES_NOISIER_THAN_SAID]
+    assert 'rounded' in reason_texts(found)[Code.FIXES_NOISIER_THAN_SAID]
     inputs, _ = screen(leg, config)
     assert not inputs.rounding_n.any()

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, seconds, spoilt
+from drives import changed, seconds, with_columns
 import numpy as np
 import pytest
 from screened import screen_with
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.core
 
 
 def test_rows_without_a_stamp_are_dropped_and_located_by_arrival(leg):
-    inputs, codes = screen_with(spoilt(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
+    inputs, codes = screen_with(with_columns(leg, 'odometer', stamp_ns=(slice(100, 105), 0)))
     n, t = len(leg.odometer.stamp_ns), (leg.odometer.received_ns[100] - leg.start_ns) * 1e-9
     assert codes[Code.BAD_ROWS_DROPPED] == (
         f'5 of {n} odometer messages have no stamp (zero or negative), first at t = {t:.2f} s '
@@ -29,7 +29,7 @@ def test_rows_without_a_stamp_are_dropped_and_located_by_arrival(leg):
 
 
 def test_one_stamp_in_the_future_excludes_one_row(leg):
-    inputs, codes = screen_with(spoilt(
+    inputs, codes = screen_with(with_columns(
         leg, 'imu', stamp_ns=(500, leg.imu.stamp_ns[500] + 3600 * 10**9)))
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns) - 1
     assert '1 of' in codes[Code.STAMPS_NOT_RISING]
@@ -46,7 +46,7 @@ def test_stamps_are_continuous_after_a_clock_step(leg, slot, by, wrong):
     at = len(stamps) * 2 // 5
     part, moved, mark = ((slice(at, None), moved, 'stop_ns') if wrong == 'after' else
                          (slice(at), -moved, 'start_ns'))
-    other = spoilt(leg, slot, stamp_ns=(part, stamps[part] + moved))
+    other = with_columns(leg, slot, stamp_ns=(part, stamps[part] + moved))
     if slot == 'imu':       # whose stamps are used
         other = replace(other, **{mark: getattr(leg, mark) + moved})
     inputs, codes = screen_with(other)
@@ -68,7 +68,7 @@ def test_stamps_out_of_order_are_not_a_clock_step(leg, rows):
 
 
 def test_rows_without_a_stamp_or_out_of_order_are_not_a_clock_step(leg):
-    unstamped = spoilt(leg, 'imu', stamp_ns=(slice(3000, 3200), 0))
+    unstamped = with_columns(leg, 'imu', stamp_ns=(slice(3000, 3200), 0))
     assert Code.CLOCK_SET not in screen_with(unstamped)[1]
     order = np.arange(len(leg.imu.stamp_ns))
     order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])
@@ -125,7 +125,7 @@ def test_queued_messages_that_arrive_together_are_not_a_clock_offset(leg):
         return replace(samples, received_ns=leg.start_ns + np.round(late * 1e9).astype(np.int64))
     held = leg.with_rows(**{slot: queued(leg.rows(slot)) for slot in ('imu', 'odometer', 'fix')})
     assert Code.CLOCKS_DIFFER not in screen_with(held)[1]
-    late = spoilt(held, 'fix', stamp_ns=lambda a: a + 700_000_000)
+    late = with_columns(held, 'fix', stamp_ns=lambda a: a + 700_000_000)
     assert 'fix stamps differ by +0.7' in screen_with(late)[1][Code.CLOCKS_DIFFER]
 
 
@@ -133,7 +133,7 @@ def test_queued_messages_that_arrive_together_are_not_a_clock_offset(leg):
                                                ('fix', 'gnss.time_offset')])
 @pytest.mark.parametrize('late', [0.8, -0.8])
 def test_clock_offsets_reject_the_leg_until_an_offset_is_configured(leg, slot, setting, late):
-    moved = spoilt(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
+    moved = with_columns(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
     _, codes = screen_with(moved)
     seen = float(codes[Code.CLOCKS_DIFFER].split('differ by ')[1].split(' s')[0])
     assert abs(seen - late) < 0.055       # the 0.05 s until fixes arrive looks the same
@@ -147,7 +147,7 @@ def test_clock_offsets_reject_the_leg_until_an_offset_is_configured(leg, slot, s
 
 
 def test_an_offset_of_an_hour_suggests_no_setting_beyond_its_range(leg):
-    _, found = screen(spoilt(leg, 'fix', stamp_ns=lambda a: a - 3600 * 10**9), Config())
+    _, found = screen(with_columns(leg, 'fix', stamp_ns=lambda a: a - 3600 * 10**9), Config())
     reason, = (r for r in found if r.code is Code.CLOCKS_DIFFER)
     assert '-3600.0' in reason.text
     assert 'gnss.time_offset' not in reason.text + reason.remedy

@@ -145,10 +145,10 @@ def test_wheels_differ_by_track_times_turn_rate():
     state = lively(slope=0.0).at(np.linspace(0, 20, 2001))
     track = 1.6
     left, right = (0.0, track / 2, 0.0), (0.0, -track / 2, 0.0)
-    apart = true_motion.contact_speed(state, right) - true_motion.contact_speed(state, left)
+    difference = true_motion.contact_speed(state, right) - true_motion.contact_speed(state, left)
     # the local level turns relative to the Earth by v tan(L) / R < 2e-6 rad/s
-    assert_allclose(apart, track * state.yaw_rate, atol=track * 2.1e-6)
-    assert np.abs(apart).max() > 0.3
+    assert_allclose(difference, track * state.yaw_rate, atol=track * 2.1e-6)
+    assert np.abs(difference).max() > 0.3
     rolled = true_motion.contact_travel(state, right) - true_motion.contact_travel(state, left)
     assert rolled[-1] == pytest.approx(track * np.radians(100), abs=track * 2e-5)
     mean = (true_motion.contact_travel(state, right) + true_motion.contact_travel(state, left)) / 2

@@ -43,11 +43,11 @@ def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
     made = robot(drive='skid', wheels=2)
     state, rolled = paths(made)
     spot = (state.speed == 0.0) & (state.yaw_rate != 0.0)
-    apart = np.diff(rolled['right_wheel_joint'] - rolled['left_wheel_joint'])
+    difference = np.diff(rolled['right_wheel_joint'] - rolled['left_wheel_joint'])
     turns = np.diff(state.turned)
     assert effective_width(made.options) == pytest.approx(SPOT_RATIO * 0.3)
-    assert_allclose(apart[spot[:-1] & spot[1:]], SPOT_RATIO * 0.3 * turns[spot[:-1] & spot[1:]],
-                    rtol=1e-9, atol=1e-12)
+    both = spot[:-1] & spot[1:]
+    assert_allclose(difference[both], SPOT_RATIO * 0.3 * turns[both], rtol=1e-9, atol=1e-12)
     wide = effective_width(made.options, 1e9)
     assert wide == pytest.approx(STRAIGHT_RATIO * 0.3)
 

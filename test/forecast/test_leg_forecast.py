@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 
 from drives import thinned
-from foreseeing import foreseen, HEADING
+from forecast_drives import forecast_at, HEADING
 import numpy as np
 import pytest
 
@@ -35,7 +35,7 @@ NO_YAW = ParameterForecast(None, 0.0087, None, (), 'limited by the heading uncer
 def test_forecast_at_the_end_of_a_leg_agrees_with_the_result(drive, config):
     leg = drive.leg()
     result = calibrate(leg, config).methods['two_point'].estimates
-    forecast = foreseen(drive, config, (leg.stop_ns - leg.start_ns) / SECOND)
+    forecast = forecast_at(drive, config, (leg.stop_ns - leg.start_ns) / SECOND)
     scale, yaw = result['scale_factor'], result['yaw_mounting_angle']
     # the rough scale is good to a per cent, and the fix sigma there scatters by 5 % from residuals
     assert forecast.scale.sigma == pytest.approx(scale.sigma / scale.value, rel=0.1)
@@ -46,12 +46,12 @@ def test_forecast_at_the_end_of_a_leg_agrees_with_the_result(drive, config):
 
 def test_forecast_distance_agrees_with_the_distance_required(drive, config):
     t_now = 100.0
-    first = foreseen(drive, config, t_now)
+    first = forecast_at(drive, config, t_now)
     required = first.scale.sigma / 1.6
     strict = with_settings(config, {'verdict.max_scale_sigma': required})
-    metres = foreseen(drive, strict, t_now).scale.remaining_m
+    metres = forecast_at(drive, strict, t_now).scale.remaining_m
     speed = drive.truth.distance / 240.0            # driven in about the middle 240 s
-    later = [foreseen(drive, strict, t_now + share * metres / speed) for share in (0.5, 1.5)]
+    later = [forecast_at(drive, strict, t_now + share * metres / speed) for share in (0.5, 1.5)]
     assert later[0].scale.remaining_m > 0 < metres
     assert later[0].scale.sigma > required
     assert (later[1].scale.remaining_m, later[1].scale.sigma <= required) == (0.0, True)
@@ -60,12 +60,12 @@ def test_forecast_distance_agrees_with_the_distance_required(drive, config):
 
 def test_yaw_is_not_reached_below_the_heading_sigma_or_from_course_alone(drive, config):
     required = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
-    yaw = foreseen(drive, required, 150.0).yaw
+    yaw = forecast_at(drive, required, 150.0).yaw
     assert yaw.remaining_m is None
     assert yaw.as_text('yaw', 'deg', math.degrees(1)) == (
         'yaw: limited by the heading uncertainty (0.17 deg)')
     course = with_settings(config, {'alignment.heading_source': 'course'})
-    yaw = foreseen(drive, course, 150.0).yaw
+    yaw = forecast_at(drive, course, 150.0).yaw
     assert (yaw.sigma, yaw.remaining_m) == (None, None)
     assert 'not separable from the course over ground' in yaw.why
 
@@ -99,11 +99,11 @@ def test_forecast_uses_a_received_orientation_as_the_heading(drive, config):
 
 def test_no_forecast_is_made_at_rest_or_before_a_scale_is_known(drive, config):
     with pytest.raises(OdocalError):
-        foreseen(drive, config, -5.0)
+        forecast_at(drive, config, -5.0)
     with pytest.raises(OdocalError, match='not known yet'):
-        foreseen(drive, config, 6.0)
+        forecast_at(drive, config, 6.0)
     known = with_settings(config, {'odometer.nominal_scale': drive.truth.scale})
-    assert foreseen(drive, known, 6.0).scale.sigma > 0.01    # 0.3 m fixes 10 m apart
+    assert forecast_at(drive, known, 6.0).scale.sigma > 0.01    # 0.3 m fixes 10 m apart
 
 
 def test_a_drive_is_lengthened_at_its_own_speed_and_heading():
@@ -129,10 +129,10 @@ def test_a_prediction_uses_few_rows_and_keeps_the_stops(drive, config, monkeypat
     predict = leg_forecast.predict
     monkeypatch.setattr(leg_forecast, 'predict', counted)
     monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100)
-    sparse = foreseen(drive, config, 270.0)
+    sparse = forecast_at(drive, config, 270.0)
     assert len(seen[0].t) <= 100 + 2 * 100      # a standstill of 10 s is added in steps of 0.1 s
     monkeypatch.setattr(leg_forecast, 'DRIVE_ROWS', 100_000)
-    dense = foreseen(drive, config, 270.0)
+    dense = forecast_at(drive, config, 270.0)
     assert len(seen[-1].t) > 10 * len(seen[0].t)
     assert seen[0].standstills(2.0) == seen[-1].standstills(2.0)
     assert sparse.scale.sigma == pytest.approx(dense.scale.sigma, rel=0.02)
@@ -147,7 +147,7 @@ def test_an_update_stops_at_its_next_step_after_the_end_of_the_leg(drive, config
         return len(required) < 3
 
     with pytest.raises(Abandoned):
-        foreseen(drive, strict, 150.0, is_needed=is_needed)
+        forecast_at(drive, strict, 150.0, is_needed=is_needed)
     assert len(required) == 3
 
 
@@ -157,10 +157,10 @@ def two():
                                seed=4, imu_grade='tactical'))
 
 
-def looked_at(made, t_stop, **settings):
+def smoother_forecast_at(made, t_stop, **settings):
     """Return the forecast after so many seconds of a drive."""
     config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
-    return foreseen(made, config, t_stop, smoother=SmootherSoFar())
+    return forecast_at(made, config, t_stop, smoother=SmootherSoFar())
 
 
 @pytest.fixture(scope='module')
@@ -173,7 +173,7 @@ def found(two):
 @pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
 def test_forecast_of_two_wheels_agrees_with_the_result(two, found, method):
     whole = two.leg()
-    forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
+    forecast = smoother_forecast_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
     left, right, width = (found[name] for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     # the thinned leg has a tenth of the rows, whose noise is estimated again
@@ -185,14 +185,14 @@ def test_forecast_of_two_wheels_agrees_with_the_result(two, found, method):
 
 
 def test_two_point_and_a_single_counter_give_no_forecast_of_wheels(two, drive):
-    assert looked_at(two, 100.0, method='two_point').wheels is None
-    assert looked_at(drive, 100.0, method='smoother').wheels is None
+    assert smoother_forecast_at(two, 100.0, method='two_point').wheels is None
+    assert smoother_forecast_at(drive, 100.0, method='smoother').wheels is None
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto'])
 def test_without_an_accelerometer_the_forecast_has_a_scale_and_no_angle(two, method):
     still = replace(two, imu=replace(two.imu, f_i=np.zeros_like(two.imu.f_i)))
-    forecast = looked_at(still, 200.0, method=method)
+    forecast = smoother_forecast_at(still, 200.0, method=method)
     assert 0.0 < forecast.scale.sigma < 0.01
     assert forecast.wheels.left_right < 0.01
     assert (forecast.yaw.sigma, forecast.pitch) == (None, None)

@@ -16,7 +16,7 @@ HEADING = 0.003         # rad
 LOOKS = (30.0, 47.0, 60.0, 95.0, 108.0, 165.0, 172.0, 240.0)    # s after the start mark
 
 
-def foreseen(drive, config, t_stop, begin_s=float('-inf'), **more):
+def forecast_at(drive, config, t_stop, begin_s=float('-inf'), **more):
     """Return the forecast after seconds of a drive; begin_s: begin of its recording."""
     leg = drive.leg()
     cells = thinned(leg, t_stop, begin_s)

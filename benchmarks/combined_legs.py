@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Legs of a vehicle combined on their border: what is stated, and how far it is off.
+Legs of a vehicle combined by their shared constants: stated sigmas and errors.
 
-    python benchmarks/border_legs.py [--vehicles 4] [--legs 6] [--grade consumer]
-                                     [--fixes correlated|white|rtk] [--file F]
+    python benchmarks/combined_legs.py [--vehicles 4] [--legs 6] [--grade consumer]
+                                       [--fixes correlated|white|rtk] [--file F]
 
 A vehicle has one scale, one mounting and one IMU, whose scale errors are drawn from its grade
 (accelerometer: grades.GRADES, gyro: a third of that); biases, road, wheels and fixes are different
 in each leg. The scale error of the accelerometer is the same on all axes; the vertical one changes
-the pitch by its product with the pitch, which is no constant. Legs are town drives of 10 minutes,
-a quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
+the pitch by its product with the pitch, which is not a constant. Legs are town drives of
+10 minutes, a quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
 
 Printed for scale, yaw and pitch: median stated sigma and RMS of error over sigma of one leg, of
-all legs on their border and, for comparison, of the mean of the same legs weighted by variances
+all legs combined and, for comparison, of the mean of the same legs weighted by variances
 (as ``two_point`` is combined); chi-square of the legs over its freedom; the sigma by which
 constants scatter between them.
 Rows are kept in the file: an interrupted run continues where it stopped.
@@ -45,7 +45,7 @@ def driven(vehicle, legs, grade, fixes):
     from odocal_ros.sim.noise import make_rng
     seed = FIRST_SEED + 100 * vehicle
     rng, of_grade = make_rng(seed, 'what the vehicle is'), GRADES[grade]
-    own = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
+    drawn = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
            'gyro_scale_error': float(of_grade.gyro_scale_error / 3 * rng.standard_normal()),
            'scale': float(0.0213 * np.exp(0.01 * rng.standard_normal())),
            'yaw': float(np.deg2rad(2.0) * rng.standard_normal()),
@@ -54,7 +54,7 @@ def driven(vehicle, legs, grade, fixes):
     for j in range(legs):
         drive, config = simulated(
             seed + j, scenario='town', duration=600.0, imu_grade=grade, fix_noise=fixes,
-            start_ns=1_750_000_000_000_000_000 + j * APART, **own)
+            start_ns=1_750_000_000_000_000_000 + j * APART, **drawn)
         results.append(smooth(leg_of(drive.leg(), config), config))
         times.append(drive.truth.start_ns)
     return results, times, config, drive.truth
@@ -79,7 +79,7 @@ def run_vehicle(vehicle, legs, grade, fixes):
     good = [(r, t) for r, t in zip(results, times, strict=True) if r.marginal]
     together = combine_legs(*zip(*good, strict=True), config)
     return {'seed': vehicle, 'legs': [off(r, truth) for r in results],
-            'border': off(together, truth),
+            'combined': off(together, truth),
             'mean': off(combine_method('smoother', [r for r, _ in good]), truth),
             'disagreement': together.details['disagreement'],
             'codes': sorted({r.code.name for r in together.reasons}),
@@ -92,7 +92,7 @@ def table(rows):
     for name, (title, unit) in NAMES.items():
         for label, found in (('one leg', [leg for r in rows for leg in r['legs']]),
                              ('mean', [r['mean'] for r in rows]),
-                             ('border', [r['border'] for r in rows])):
+                             ('combined', [r['combined'] for r in rows])):
             e = np.array([f[name] for f in found if f[name]])
             if not len(e):
                 continue
@@ -111,7 +111,7 @@ def table(rows):
 def main():
     """Run what the file does not hold yet, print the table."""
     args = parsed(__doc__, vehicles=4, legs=6, grade='consumer', fixes='correlated', file=Path)
-    path = args.file or Path(f'/tmp/border_{args.grade}_{args.fixes}_{args.legs}.jsonl')
+    path = args.file or Path(f'/tmp/combined_{args.grade}_{args.fixes}_{args.legs}.jsonl')
     table(run_missing(run_vehicle, range(args.vehicles), read_rows(path), path, 1, args.legs,
                       args.grade, args.fixes))
 

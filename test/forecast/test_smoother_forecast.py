@@ -6,7 +6,7 @@
 from dataclasses import replace
 import math
 
-from foreseeing import fit_updates
+from forecast_drives import fit_updates
 import numpy as np
 import pytest
 
