@@ -5,8 +5,8 @@
 
 import re
 
+import layout_names
 import pytest
-import shown
 
 from odocal_ros.settings.config import SETTINGS
 
@@ -40,15 +40,15 @@ def leaves(layout):
 
 
 def test_rviz_layout_uses_classes_of_rviz():
-    classes = [c for c in all_values(shown.rviz(), 'Class') if c]
+    classes = [c for c in all_values(layout_names.rviz(), 'Class') if c]
     assert len(classes) > 8
     assert set(classes) <= RVIZ
 
 
 def test_rviz_shows_both_paths_in_their_own_frame_latched():
-    options = shown.rviz()['Visualization Manager']['Global Options']
+    options = layout_names.rviz()['Visualization Manager']['Global Options']
     assert options['Fixed Frame'] == SETTINGS['frames.local'].default
-    paths = [d for d in shown.rviz_displays() if d['Class'].endswith('/Path')]
+    paths = [d for d in layout_names.rviz_displays() if d['Class'].endswith('/Path')]
     assert {d['Topic']['Value'] for d in paths} == {
         f'calibrator/path/{name}' for name in ('dead_reckoning', 'reference')}
     for display in paths:
@@ -63,7 +63,7 @@ def test_rviz_shows_both_paths_in_their_own_frame_latched():
 @pytest.mark.parametrize(('name', 'panels'), [
     ('odocal_foxglove.json', PANELS), ('odocal_result_foxglove.json', {'map', 'Plot'})])
 def test_foxglove_has_every_panel_once_with_a_known_type(name, panels):
-    layout = shown.foxglove(name)
+    layout = layout_names.foxglove(name)
     placed = leaves(layout['layout'])
     for panel in layout['configById'].values():
         for tab in panel.get('tabs', ()):
@@ -73,29 +73,29 @@ def test_foxglove_has_every_panel_once_with_a_known_type(name, panels):
 
 
 def test_foxglove_shows_paths_status_and_curves():
-    panels = shown.foxglove()['configById']
+    panels = layout_names.foxglove()['configById']
     assert panels['3D!paths']['followTf'] == SETTINGS['frames.local'].default
     assert all(topic['type'] == 'line' for topic in panels['3D!paths']['topics'].values())
-    paths = shown.foxglove_paths()
+    paths = layout_names.foxglove_paths()
     assert len(paths) == len(set(paths)) > 12
     for path in paths:
-        assert shown.KEY.search(path) or re.fullmatch(r'/[a-z/]+(\.[a-z_]+)+', path), path
+        assert layout_names.KEY.search(path) or re.fullmatch(r'/[a-z/]+(\.[a-z_]+)+', path), path
 
 
 def test_plotjuggler_is_complete_and_subscribes_to_its_curves():
-    root = shown.plotjuggler()
+    root = layout_names.plotjuggler()
     assert root.tag == 'root'
     for splitter in root.iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter) == len(splitter.get('sizes').split(';'))
     assert len(list(root.iter('Tab'))) == 3
     wanted = {t for t in ('/calibrator/status', '/imu/data', '/odometer')
-              if any(name.startswith(t + '/') for name in shown.curves())}
+              if any(name.startswith(t + '/') for name in layout_names.curves())}
     for plugin in root.iter('plugin'):
         assert set(plugin.find('selected_topics').get('value').split(';')) == wanted
 
 
 def test_all_topics_in_the_layouts_are_of_the_node():
-    assert set(shown.published()) == OUTPUTS
-    assert {topic for topic, _ in shown.of_inputs()} <= INPUTS
-    assert shown.status_names() == {('odocal', 'calibrator: calibration')}
-    assert {s.rpartition('/')[0] for s in shown.services()} == {'/calibrator'}
+    assert set(layout_names.published()) == OUTPUTS
+    assert {topic for topic, _ in layout_names.of_inputs()} <= INPUTS
+    assert layout_names.status_names() == {('odocal', 'calibrator: calibration')}
+    assert {s.rpartition('/')[0] for s in layout_names.services()} == {'/calibrator'}

@@ -8,7 +8,7 @@ from itertools import count
 import struct
 import zlib
 
-from faults import Refusing
+from disk_errors import Refusing
 import pytest
 import ros_bags
 import ros_messages as make

@@ -8,11 +8,11 @@ import operator
 import re
 from xml.etree import ElementTree
 
+import layout_names
 import numpy as np
 from pyproj import Geod
 import pytest
 from rosbags.highlevel import AnyReader
-import shown
 
 from odocal_ros import OdocalError
 from odocal_ros.library.export import KNOWN
@@ -114,7 +114,7 @@ def test_mcap_is_a_readable_bag(calibration, exported):
 
 
 def test_foxglove_layout_shows_topics_of_the_mcap(exported):
-    layout = shown.foxglove('odocal_result_foxglove.json')['configById']
+    layout = layout_names.foxglove('odocal_result_foxglove.json')['configById']
     topics, drawn = set(layout['map!track']['topicColors']), {}
     for panel in layout.values():
         for path in panel.get('paths', ()):

@@ -7,7 +7,7 @@ import errno
 from itertools import count
 import os
 
-from faults import Refusing
+from disk_errors import Refusing
 import pytest
 
 from odocal_ros.bagio import segments

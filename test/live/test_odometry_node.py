@@ -16,7 +16,7 @@ from player import messages_of, playing_to, stamp_of, with_clock
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
-from test_shown_names import allowed, seen
+from test_names_shown_to_users import allowed, seen
 
 from odocal_ros.apply.pose import Pose
 from odocal_ros.live.odometry import transform_of

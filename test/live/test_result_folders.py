@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 SPEED = 30.0
 QUICK = {'method': 'two_point'}     # the files are the same
 OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1])!r})\n'
-        'from faults import obey_permissions; obey_permissions()\n')
+        'from disk_errors import obey_permissions; obey_permissions()\n')
 # a report that takes as long as that of a long leg on a busy machine
 SLOW = ('import odocal_ros.output.files as f\n'
         'draw = f.report_or_error_page\n'

@@ -83,7 +83,7 @@ def test_conversion_to_the_origin_frame_and_back_is_exact(place):
     assert_allclose(origin.to_geodetic(np.array([0.0, 0.0, 7.0]))[2], place[2] + 7, atol=5e-9)
 
 
-def test_track_at_times():
+def test_track_is_interpolated_linearly_and_constant_outside():
     track = quarter_turn(4)
     assert_allclose(track.at(track.t), track.P, atol=1e-15)
     assert_allclose(track.at(3.75), (track.P[1] + track.P[2]) / 2, atol=1e-15)
@@ -93,7 +93,7 @@ def test_track_at_times():
         np.outer(np.deg2rad([0, 22.5, 22.5, 90]), [0, 0, 1])), atol=1e-15)
 
 
-def test_track_of_one_epoch():
+def test_track_of_one_epoch_is_at_the_origin_at_any_time():
     track = dead_reckon(np.array([3.0]), np.array([[0, 0, 0, 1.0]]),
                         Travel(np.array([0.0, 9.0]), np.array([0.0, 1.0]), 0.0))
     assert isinstance(track, Track)

@@ -25,7 +25,7 @@ def grid():
     return np.deg2rad(lat.ravel()), np.deg2rad(lon.ravel()), h.ravel().astype(float)
 
 
-def test_earth_fixed_coordinates_against_pyproj():
+def test_earth_fixed_coordinates_agree_with_pyproj():
     pyproj = pytest.importorskip('pyproj')
     to_ecef = pyproj.Transformer.from_crs('EPSG:4979', 'EPSG:4978', always_xy=True)
     lat, lon, h = grid()

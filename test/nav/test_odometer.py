@@ -130,7 +130,7 @@ def test_uneven_counts_and_stamps_are_not_resets(t, value):
     assert np.array_equal(found.s, (value - value[0]).astype(float))
 
 
-def test_an_angle_in_floats_and_its_reset():
+def test_a_floating_point_angle_is_exact_and_its_reset_is_bridged():
     t = np.arange(100) * 0.02
     angle = 5.0 + 12.0 * t
     form = OdometerForm('cumulative', 0, 'm/rad')
@@ -167,7 +167,7 @@ def test_increments_add_up_and_rates_are_summed_by_trapezoids():
 
 @pytest.mark.parametrize('form', [counter(2**32), OdometerForm('increment', 0, 'm/pulse'),
                                   OdometerForm('rate', 0, '1')])
-def test_reversed_counts(form):
+def test_reversed_counts_give_negative_travel(form):
     t, value = np.arange(30.0), np.arange(30) ** 2
     assert np.array_equal(make_travel(t, value, form, True)[0].s,
                           -make_travel(t, value, form)[0].s)

@@ -27,7 +27,7 @@ def test_on_the_central_meridian_northing_is_the_meridian_arc():
     assert east == pytest.approx(500_000.0, abs=1e-6)
 
 
-def test_utm_is_four_in_ten_thousand_short_on_its_meridian():
+def test_utm_scale_on_the_central_meridian_is_0_9996():
     start, end = np.array([0.7, np.deg2rad(9.0), 0.0]), np.array([0.7001, np.deg2rad(9.0), 0.0])
     plane = plane_for(ProjectionConfig(kind='utm'), np.deg2rad(9.3))
     assert plane_chord(plane, start, end)[0] / geodesic_chord(start, end)[0] == pytest.approx(
@@ -60,7 +60,7 @@ def test_plane_about_a_leg_keeps_lengths_and_bearings_anywhere(middle_deg, latit
     assert bearing == pytest.approx(azimuth - convergence, abs=3e-6)
 
 
-def test_height_stretches_a_geodesic():
+def test_a_geodesic_is_longer_at_height():
     """Without a height of 1000 m a geodesic is 0.016 % shorter: h over the Earth radius."""
     start, end = np.array([0.7, 2.0, 1000.0]), np.array([0.7003, 2.0002, 1000.0])
     length, azimuth = geodesic_chord(start, end)

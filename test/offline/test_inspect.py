@@ -7,7 +7,7 @@ import math
 import shlex
 import struct
 
-from inspecting import codes, drive, inspect, K, planar, RATE, topic
+from inspect_output import codes, drive, inspect, K, planar, RATE, topic
 import numpy as np
 import pytest
 import ros_bags

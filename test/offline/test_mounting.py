@@ -7,7 +7,7 @@ import json
 import math
 import re
 
-from inspecting import G, planar, RATE
+from inspect_output import G, planar, RATE
 import numpy as np
 import pytest
 

@@ -9,7 +9,7 @@ import re
 import shlex
 
 import numpy as np
-from planning import gpx, NAMES, plan_of, refused, TWO_POINT
+from plan_output import gpx, NAMES, plan_of, refused, TWO_POINT
 import pytest
 
 from odocal_ros.forecast.planned_drive import add_stop_and_start

@@ -6,7 +6,7 @@
 import math
 
 import numpy as np
-from planning import gpx, gpx_of, NAMES, plan_of, refused, TWO_POINT
+from plan_output import gpx, gpx_of, NAMES, plan_of, refused, TWO_POINT
 import pytest
 
 from odocal_ros.forecast.planned_methods import predict_smoother

@@ -6,8 +6,8 @@
 from itertools import count
 import json
 
-import inspecting
-from inspecting import inspect, planar, RATE, topic
+import inspect_output
+from inspect_output import inspect, planar, RATE, topic
 import numpy as np
 import pytest
 import ros_bags
@@ -25,7 +25,7 @@ def drive(message):
     left, right = (np.cumsum(v - s * w * WIDTH / 2) / RATE / RADIUS for s in (1, -1))
     number = count()
     return [('/wheels', ns, message(ns, i := next(number), left[i], right[i]))
-            if name == '/odometer' else (name, ns, m) for name, ns, m in inspecting.drive()]
+            if name == '/odometer' else (name, ns, m) for name, ns, m in inspect_output.drive()]
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from hand_made import GAP
+from calibration_parts import GAP
 import numpy as np
 import pytest
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 import re
 
-from hand_made import CREATED
+from calibration_parts import CREATED
 import numpy as np
 
 from odocal_ros.calib.evidence import Evidence

@@ -7,9 +7,9 @@ from dataclasses import replace
 from math import tau
 import re
 
+from calibration_parts import texts, with_estimates
 from drives import drive, settings
 import foreign_keys
-from hand_made import texts, with_estimates
 import numpy as np
 import pytest
 import yaml

@@ -12,7 +12,7 @@ from pathlib import Path
 import signal
 import threading
 
-from faults import Refusing
+from disk_errors import Refusing
 import pytest
 
 from odocal_ros.errors import BadUsage

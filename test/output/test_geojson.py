@@ -8,7 +8,7 @@ from dataclasses import replace
 import io
 import json
 
-from hand_made import CREATED
+from calibration_parts import CREATED
 import numpy as np
 import pytest
 

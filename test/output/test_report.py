@@ -8,7 +8,7 @@ from html import unescape
 import math
 import re
 
-from hand_made import CREATED
+from calibration_parts import CREATED
 import numpy as np
 import pytest
 from report_pages import drawn, evidence, INPUTS, page_of, three_methods

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 import re
 
+from calibration_parts import CREATED
 from drives import drive, settings
-from hand_made import CREATED
 import numpy as np
 import pytest
 

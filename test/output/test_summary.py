@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 import re
 
-from hand_made import GAP
+from calibration_parts import GAP
 import numpy as np
 import pytest
 

@@ -6,7 +6,7 @@
 from dataclasses import replace
 import json
 
-from hand_made import CREATED
+from calibration_parts import CREATED
 import pytest
 
 from odocal_ros.output import report_tables

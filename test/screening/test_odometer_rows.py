@@ -8,7 +8,7 @@ from dataclasses import replace
 from drives import drive, kept, STRAIGHT, with_columns, with_increments
 import numpy as np
 import pytest
-from screened import screen_with
+from screening_run import screen_with
 
 from odocal_ros.data.samples import join, take
 from odocal_ros.reasons import Code

@@ -6,7 +6,7 @@
 from drives import drive, seconds, settings, with_columns, without
 import numpy as np
 import pytest
-from screened import screen_with
+from screening_run import screen_with
 
 from odocal_ros.data.leg import Leg
 from odocal_ros.reasons import Code

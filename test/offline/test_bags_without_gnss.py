@@ -48,7 +48,7 @@ def test_inspect_shows_the_reference_and_suggests_the_command(bag, capsys):
     assert 'LOCAL_FRAME' in text
 
 
-def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys):
+def test_replay_calibrates_and_states_the_reference(bag, tmp_path, capsys):
     assert cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
                      '--output', str(tmp_path / 'out'), *NUMBERS]) == 0
     printed = capsys.readouterr()
@@ -66,7 +66,7 @@ def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys)
 
 
 @pytest.mark.parametrize('name', ['trajectory.csv', 'debug.mcap', 'track.kml'])
-def test_what_is_exported_has_no_place_on_a_map(bag, tmp_path, capsys, monkeypatch, name):
+def test_exports_of_local_positions_have_no_latitude(bag, tmp_path, capsys, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     code = cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
                      '--output', str(tmp_path / 'out'), '--export', name, '--quiet', *NUMBERS])
@@ -129,7 +129,7 @@ def tf_bag(tmp_path_factory):
     return with_tf(tmp_path_factory.mktemp('tf'))
 
 
-def test_positions_before_the_static_transform_are_of_the_tf_topic(tmp_path, capsys):
+def test_tf_positions_are_counted_also_before_the_static_transform(tmp_path, capsys):
     bag = with_tf(tmp_path, '/a/tf')       # before the other topics, by name
     assert cli.main(['inspect', str(bag), '--json', '--fix-topic', '/a/tf', *FRAMES]) == 0
     topics = {one['name']: one for one in json.loads(capsys.readouterr().out)['topics']}
@@ -137,7 +137,7 @@ def test_positions_before_the_static_transform_are_of_the_tf_topic(tmp_path, cap
     assert topics['/a/tf']['fix']['positions'] == pytest.approx(count, abs=1)
 
 
-def test_replay_by_tf_is_replay_by_poses(tf_bag, tmp_path):
+def test_tf_and_poses_as_reference_give_the_same_result(tf_bag, tmp_path):
     found = []
     for name in ('/pose', '/tf'):
         out = tmp_path / name[1:]

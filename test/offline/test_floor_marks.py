@@ -98,7 +98,7 @@ def test_the_axes_of_the_points_are_free(tmp_path):
             assert plain.sigmas[name] == pytest.approx(turned.sigmas[name], rel=0.02)
 
 
-def test_replay_takes_marks(tmp_path, capsys):
+def test_replay_accepts_marks_as_options(tmp_path, capsys):
     out = tmp_path / 'square'
     assert cli.main(['simulate', '--scenario', 'square', '--out', str(out), '--quiet']) == 0
     marks = [word for t in TIMES for word in ('--mark', f'{t:g}')]
@@ -124,7 +124,7 @@ def test_replay_takes_marks(tmp_path, capsys):
     ({'reference.marks': [5.0, 500.0]}, '--mark 500: the odometer has no data there'),
     ({'reference.points': [0.0, 0.0, 4.0]}, 'reference.points has 3 values; required with marks'),
     ({'reference.points': []}, 'reference.points has 0 values')])
-def test_marks_that_cannot_be_are_refused(change, message, tmp_path):
+def test_impossible_marks_are_refused(change, message, tmp_path):
     made, bag = robot(tmp_path, imu_rate=20.0)
     with pytest.raises(BadUsage, match=message):
         calibrate_bag(bag, TOPICS, marks_config(made) | change)

@@ -11,11 +11,11 @@ from xml.etree import ElementTree
 
 from bench import answer_of, PATIENCE, ROOT, wait_for
 from launch_stand_in import of_python
+import layout_names
 from pages import all_commands
 from player import messages_of, playing_to, straight, within
 import pytest
 from rclpy.node import NodeNameNonExistentError
-import shown
 import yaml
 
 from odocal_ros.live.messages import message_class
@@ -62,8 +62,8 @@ def test_the_node_has_the_topics_and_services_of_the_layouts(start, connect):
         with suppress(NodeNameNonExistentError):
             return dict(getattr(node, f'get_{what}_names_and_types_by_node')('calibrator', '/'))
         return {}
-    wait_for(lambda: set(shown.published()) <= set(of_node('publisher')), 'all publishers')
-    for topic, kind in shown.published().items():
+    wait_for(lambda: set(layout_names.published()) <= set(of_node('publisher')), 'all publishers')
+    for topic, kind in layout_names.published().items():
         assert of_node('publisher')[topic] == [kind]
         # a node that has just ended may still be listed
         info, = wait_for(lambda topic=topic: len(
@@ -71,7 +71,7 @@ def test_the_node_has_the_topics_and_services_of_the_layouts(start, connect):
             f'the one publisher of {topic}')
         if topic != '/diagnostics':      # the display needs it latched
             assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
-    assert shown.status_keys() <= set(status)
+    assert layout_names.status_keys() <= set(status)
     documented = keys_on_the_page()
     assert len(documented) > 40
     assert documented <= set(status)
@@ -79,15 +79,15 @@ def test_the_node_has_the_topics_and_services_of_the_layouts(start, connect):
     rest = set(status) - documented - {'level', 'name', 'message'}
     assert not {key for key in rest if '_sigma' not in key}
     array = client.arrays[-1].status[0]
-    assert shown.status_names() == {(array.hardware_id, array.name)}
-    wait_for(lambda: set(shown.services()) <= set(of_node('service')), 'all services')
-    for service in shown.services():
+    assert layout_names.status_names() == {(array.hardware_id, array.name)}
+    wait_for(lambda: set(layout_names.services()) <= set(of_node('service')), 'all services')
+    for service in layout_names.services():
         assert of_node('service')[service] == ['std_srvs/srv/Trigger']
     for kind, names in allowed('/calibrator').items():      # a node conforms to the policy
         assert seen(client, kind) <= names
 
 
-@pytest.mark.parametrize(('topic', 'fields'), sorted(shown.of_inputs()))
+@pytest.mark.parametrize(('topic', 'fields'), sorted(layout_names.of_inputs()))
 def test_the_inputs_have_the_fields_that_the_layouts_plot(topic, fields):
     assert has_field(INPUT_TYPES[topic], fields)
     assert not has_field(INPUT_TYPES[topic], (*fields[:-1], 'nothing'))

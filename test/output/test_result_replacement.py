@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from hand_made import CREATED
+from calibration_parts import CREATED
 import pytest
 
 from odocal_ros.calib.result import Estimate

@@ -69,7 +69,7 @@ def message(store, package, k):
 
 @pytest.mark.parametrize('package', ['gps_msgs', 'gps_common'])
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_bag_with_its_definition_is_read(tmp_path, package, storage):
+def test_gpsfix_messages_of_both_packages_are_read_from_a_bag(tmp_path, package, storage):
     store, name = store_of(package), f'{package}/msg/GPSFix'
     rows = [('/gps', k, bytes(store.serialize_cdr(message(store, package, k), name)))
             for k in range(len(CASES))]
@@ -90,7 +90,7 @@ def test_a_bag_with_its_definition_is_read(tmp_path, package, storage):
     assert fix.status.tolist() == [status for _, _, status in CASES]
 
 
-def test_columns_and_single_messages_give_the_same_rows():
+def test_a_block_and_single_gpsfix_messages_give_the_same_rows():
     store, name = store_of('gps_msgs'), 'gps_msgs/msg/GPSFix'
     raws = [bytes(store.serialize_cdr(message(store, 'gps_msgs', k), name))
             for k in range(len(CASES))]
@@ -104,7 +104,7 @@ def test_columns_and_single_messages_give_the_same_rows():
         assert np.array_equal(one, other), field.name
 
 
-def test_a_navsatfix_goes_first_and_poses_last():
+def test_navsatfix_takes_precedence_over_gpsfix_and_gpsfix_over_poses():
     base = {'/imu': 'sensor_msgs/msg/Imu', '/ticks': 'std_msgs/msg/Int64',
             '/gps': 'gps_msgs/msg/GPSFix', '/slam': 'geometry_msgs/msg/PoseStamped'}
     for more, expected in (({}, '/gps'), ({'/fix': 'sensor_msgs/msg/NavSatFix'}, '/fix')):

@@ -5,13 +5,13 @@
 
 import math
 
-from inspecting import codes, inspect, topic
+from inspect_output import codes, inspect, topic
 import pytest
 
 pytestmark = pytest.mark.slow
 
 
-def test_comma(data_dir, capsys):
+def test_inspect_finds_topics_axes_and_motion_of_a_car_of_comma2k19(data_dir, capsys):
     path = data_dir / 'comma2k19_rav4' / 'bag'
     seen, text = inspect(path, capsys)
     assert seen['mapping'] == {'odometer': '/odometer/pulses_derived', 'imu': '/imu/data',
@@ -42,7 +42,7 @@ def test_comma(data_dir, capsys):
         assert line in text
 
 
-def test_husky(data_dir, capsys):
+def test_inspect_finds_mounting_and_straight_sides_of_a_husky_drive(data_dir, capsys):
     path = data_dir / 'husky_parking_lot' / 'bag'
     seen, text = inspect(path, capsys)
     assert seen['mounting']['rpy'] == pytest.approx([math.pi / 2, 0, -math.pi / 2], abs=1e-9)
@@ -74,7 +74,7 @@ def test_husky(data_dir, capsys):
 
 @pytest.mark.parametrize('name', ['talker_mcap', 'cdr_test_mcap', 'service_events_mcap',
                                   'split3_sqlite3_no_metadata', 'split5_mcap'])
-def test_bags_without_any_input(data_dir, capsys, name):
+def test_inspect_of_bags_without_any_input_names_what_is_missing(data_dir, capsys, name):
     seen, text = inspect(data_dir / 'reader_bags' / name, capsys)
     assert codes(seen) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
     assert seen['command'] == ''

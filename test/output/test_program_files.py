@@ -10,7 +10,7 @@ import sys
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
-from hand_made import texts, with_estimates
+from calibration_parts import texts, with_estimates
 from pages import fenced, ROOT
 import pytest
 import yaml
@@ -57,7 +57,7 @@ def test_the_parameter_file_has_every_name_the_node_declares(good, nothing):
         assert expected <= set(parameters(texts(calibration)['calibration.yaml'])['result'])
 
 
-def test_a_rejected_result_is_no_file_to_drive_by(rejected):
+def test_a_rejected_result_writes_only_the_parameter_file(rejected):
     written = texts(rejected)
     assert list(written) == ['calibration.yaml']
     result = parameters(written['calibration.yaml'])['result']
@@ -65,7 +65,7 @@ def test_a_rejected_result_is_no_file_to_drive_by(rejected):
     assert result['scale_factor'] == 0.05
 
 
-def test_autoware_gets_the_ratio_for_pulses_and_the_factor_for_speeds(good):
+def test_the_autoware_factor_is_the_ratio_for_pulses_and_the_scale_for_speeds(good):
     by_speed = with_estimates(good, scale_factor=Estimate(0.98, 1e-3, '1'),
                               scale_ratio=Estimate(0.49, 5e-4, '1'))
     truncated = with_estimates(by_speed, scale_factor_as_sent=Estimate(0.99, 1e-3, '1'))
@@ -77,7 +77,7 @@ def test_autoware_gets_the_ratio_for_pulses_and_the_factor_for_speeds(good):
     assert name not in texts(with_estimates(good, scale_ratio=Estimate(None, None, '1')))
 
 
-def test_the_gyro_bias_goes_back_to_the_axes_and_unit_of_the_message(good):
+def test_the_gyro_bias_is_written_in_axes_and_unit_of_the_message(good):
     assert 'imu_corrector.param.yaml' not in texts(good)
     bias = {f'gyro_bias_{a}': Estimate(v, 1e-5, 'rad/s') for a, v in zip(
         'xyz', (1.0, 2.0, 3.0), strict=True)}
@@ -89,7 +89,7 @@ def test_the_gyro_bias_goes_back_to_the_axes_and_unit_of_the_message(good):
         'angular_velocity_stddev_yy': 0.03, 'angular_velocity_stddev_zz': 0.03}
 
 
-def test_the_three_transforms_are_one_and_the_same(good):
+def test_the_three_transform_files_contain_the_same_transform(good):
     written = texts(good, imu__lever_arm=(0.5, -0.1, 1.0), frames__imu='imu_top',
                     frames__base='rear_axle')
     joint = ElementTree.fromstring(written['imu_transform.urdf'])
@@ -104,7 +104,7 @@ def test_the_three_transforms_are_one_and_the_same(good):
     assert written['imu_transform.txt'].endswith(f'static_transform_publisher {expected}\n')
 
 
-def test_without_a_yaw_there_is_no_transform(good):
+def test_without_a_yaw_no_transform_is_written(good):
     written = texts(replace(good, imu_rotation_rpy=None, imu_rotation_xyzw=None))
     assert not [name for name in written if 'transform' in name]
     assert 'vehicle_velocity_converter.param.yaml' in written
