@@ -79,7 +79,7 @@ def matrix(scale):
     return (0.0, scale, 0.0) + (0.0,) * 6
 
 
-# code: (fault, kind of drive, SimOptions, figures of Real, settings, change of the leg)
+# code: (fault, kind of drive, SimOptions, fields of RealEffects, settings, change of the leg)
 FAULTS: dict = {
     'WHEEL_SLIP': ('spins by 0.5 m, 60 an hour', 'town', {'slip_events': 60.0, 'slip_size': 0.5},
                    {}, {}, None),

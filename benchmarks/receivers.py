@@ -51,7 +51,7 @@ class Run:
     names : reasons that name the effect.   also : further reasons that are true of it.
     """
 
-    real: dict[str, Any] = field(default_factory=dict)       # figures of Real
+    real: dict[str, Any] = field(default_factory=dict)       # fields of RealEffects
     options: dict[str, Any] = field(default_factory=dict)    # SimOptions
     kinds: tuple[str, ...] = ROADS
     names: tuple[str, ...] = ()

@@ -169,10 +169,10 @@ def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOpti
     """Return SimOptions of the options, a random vehicle if requested, and sensor parameters."""
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
-    from odocal_ros.sim.real import parse_parameter, Real
+    from odocal_ros.sim.real_effects import parse_parameter, RealEffects
     figures = dict(parse_parameter(text) for text in args.figures)
     if not (args.vehicle or args.effects):
-        return SimOptions(**options, real=Real(**figures))
+        return SimOptions(**options, real=RealEffects(**figures))
     if 'odometer' in options:
         raise BadUsage(f'--odometer {options["odometer"]}: a random vehicle has its own odometer; '
                        'omit this option, or use --effect coarse_speed')

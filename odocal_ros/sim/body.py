@@ -14,7 +14,7 @@ from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Hills, Profile
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.zoo import G
 
 # physical: natural frequency of a car's body on its springs, damped by shock absorbers
@@ -24,7 +24,7 @@ STILL = 1e-9          # m/s, judgement: rounding
 KNEELING_TIME = 2.0   # s, judgement: of the kneeling or rising of a bus
 
 
-def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = None,
+def tilts(speed: Profile, yaw_rate: Profile, real: RealEffects, hills: Hills | None = None,
           lean: Profile | None = None) -> tuple[Profile, Profile]:
     """
     Return roll and pitch of the body relative to the vehicle by time, rad, fixed-axis angles.
@@ -65,7 +65,7 @@ def kneeling_degree(speed: Profile, t: Floats) -> Floats:
     return degree
 
 
-def road_lean(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
+def road_lean(speed: Profile, yaw_rate: Profile, real: RealEffects) -> Profile:
     """Return the lean of the road to the right by time, rad."""
     step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)

@@ -19,7 +19,7 @@ from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.zoo import flat, GRADES, TUPLES_BY_GRADE, VALUES_BY_GRADE, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')    # scenarios of the zoo
@@ -34,7 +34,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     seed : of the vehicle, and of the noise of its drive.   kind : scenario.   grade : of the IMU:
     consumer, industrial or tactical.   effects : names of the effects to draw; None: all, ``()``:
     an ideal vehicle.   fixed_options : fields of SimOptions that are not drawn; ``real``: a dict
-    of fields of Real.
+    of fields of RealEffects.
 
     Raises BadUsage: a name is unknown, or two effects exclude each other.
     """
@@ -66,7 +66,8 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
             present.append(name)
         options |= effect.options
         real |= effect.real
-    return SimOptions(**options | fixed_options, real=Real(**real | fixed_real)), tuple(present)
+    options |= fixed_options
+    return SimOptions(**options, real=RealEffects(**real | fixed_real)), tuple(present)
 
 
 def _ideal_vehicle(seed: int, kind: str, grade: str,

@@ -15,7 +15,7 @@ from typing import Any
 from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, FEWEST_OMNI, MECANUM, OMNI
 from odocal_ros.settings.nominal import Grade, GRADES
-from odocal_ros.sim.real import NONE3, Real, Vector
+from odocal_ros.sim.real_effects import NONE3, RealEffects, Vector
 
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
@@ -131,7 +131,7 @@ class SimOptions:
     velocity_scale_error: float = 0.0      # relative
     velocity_outliers: float = 0.0         # share of outliers
 
-    real: Real = Real()                    # further errors of real sensors
+    real: RealEffects = RealEffects()      # further errors of real sensors
 
     @property
     def wheel_count(self) -> int:
@@ -208,7 +208,7 @@ def resolved(options: SimOptions) -> SimOptions:
     resolved_options = _with_defaults(options, {'scale': scale, 'nominal_scale': nominal,
                                       'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
     if isinstance(options.real, dict):      # as in truth.yaml
-        resolved_options = replace(resolved_options, real=Real(**options.real))
+        resolved_options = replace(resolved_options, real=RealEffects(**options.real))
     _check(resolved_options)
     return resolved_options
 

@@ -19,7 +19,7 @@ from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPORT_DELAY
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 
 # physical: frequency, Hz, width, Hz, and relative power of wheel hop and of the engine
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
@@ -75,7 +75,7 @@ def mounting_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
     return *angles(R.T @ d), *angles(d)
 
 
-def with_triad_errors(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
+def with_triad_errors(w_i: Floats, f_i: Floats, real: RealEffects) -> tuple[Floats, Floats]:
     """Return turn rate and specific force with the errors of the triads: (n, 3) each."""
     gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
     w_m = w_i + w_i @ gyro.T if gyro.any() else w_i

@@ -33,7 +33,7 @@ from odocal_ros.sim.noise import (
     white,
 )
 from odocal_ros.sim.options import REFERENCES, SIM_GRADES, SimOptions
-from odocal_ros.sim.real import NONE3
+from odocal_ros.sim.real_effects import NONE3
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise

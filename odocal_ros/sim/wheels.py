@@ -18,7 +18,7 @@ from odocal_ros.settings.config import MECANUM, OMNI, SIDES, SKID
 from odocal_ros.sim.motion import contact_speed, State, turn_rate
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.zoo import G
 
 AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
@@ -125,18 +125,18 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     return state.travel + side * by_turn
 
 
-def tyre_growth(state: State, real: Real) -> Floats | float:
+def tyre_growth(state: State, real: RealEffects) -> Floats | float:
     """Return the relative growth of the rolling radius from a cold, slow tyre: (n,), or 0.0."""
     grown: Floats | float = 0.0
     if real.speed_law:
-        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as defined in Real
+        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as defined in RealEffects
     if real.warming:
         steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
         grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
     return grown
 
 
-def slip_share(state: State, real: Real) -> Floats:
+def slip_share(state: State, real: RealEffects) -> Floats:
     """Return the slip per metre of path under traction and braking: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
     # force over load; a slope adds to it
@@ -148,12 +148,12 @@ def slip_share(state: State, real: Real) -> Floats:
     return share
 
 
-def tyre_slip(state: State, real: Real) -> Floats:
+def tyre_slip(state: State, real: RealEffects) -> Floats:
     """Return the accumulated tyre slip at each time, m: (n,)."""
     return np.cumsum(slip_share(state, real) * np.diff(state.travel, prepend=state.travel[:1]))
 
 
-def leg_factor(state: State, real: Real, slipped: Floats) -> float:
+def leg_factor(state: State, real: RealEffects, slipped: Floats) -> float:
     """Return the true path over that of the count with a cold wheel; slipped: at starts, m."""
     if not (real.speed_law or real.warming or real.tyre_slip or slipped.any()):
         return 1.0
@@ -174,7 +174,7 @@ def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
     return np.array(out)
 
 
-def quantized(speed: Floats, real: Real) -> Floats:
+def quantized(speed: Floats, real: RealEffects) -> Floats:
     """Return the published speeds: in steps, 0 below the dead band, or held."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step

@@ -53,7 +53,7 @@ TUPLES_BY_GRADE: dict[str, tuple[tuple[float, ...], ...]] = {
 class Effect:
     """An effect as the values that cause it; without any the effect is absent."""
 
-    real: dict[str, Any] = field(default_factory=dict)       # fields of ``real.Real``
+    real: dict[str, Any] = field(default_factory=dict)       # fields of ``RealEffects``
     options: dict[str, Any] = field(default_factory=dict)    # fields of ``SimOptions``
 
 

@@ -14,14 +14,14 @@ from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.body_tilt import BodyTilt, HILL_INTERVALS, moving_mean
 from odocal_ros.estimator.factors.motion import D
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.wheels import G
 
 
 def test_body_pitches_about_the_middle_of_the_wheelbase_on_a_crest():
     """The remaining error is the curvature of the road within the wheelbase: (h / length)^2."""
     _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
-                                 real=Real(wheelbase=3.0))
+                                 real=RealEffects(wheelbase=3.0))
     off, by = along_axis(problem, state, 2, layout.BODY_TILT)
     by = by[:, 0]
     centre = -(by @ off) / (by @ by)
@@ -40,7 +40,7 @@ def test_body_pitches_about_the_middle_of_the_wheelbase_on_a_crest():
 @pytest.mark.parametrize('banking', [0.0, 1.0])
 def test_turn_on_banked_ground_pitches_the_vehicle_about_its_left_axis(banking):
     """The bank balances the lateral force: the road leans inwards by the angle to gravity."""
-    _, problem, state = at_truth(real=Real(banking=banking))
+    _, problem, state = at_truth(real=RealEffects(banking=banking))
     motion = Equations(problem, state).factors['motion'].motion
     rate, speed = motion.rate_n[:, 2], np.linalg.norm(state.v_n, axis=1)[:-1]
     want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
@@ -51,7 +51,7 @@ def test_turn_on_banked_ground_pitches_the_vehicle_about_its_left_axis(banking):
 
 def test_side_force_of_the_tyres_includes_gravity_on_a_bank():
     """The bank balances the lateral force, as a mean over HILL_INTERVALS."""
-    _, problem, state = at_truth(real=Real(banking=1.0))
+    _, problem, state = at_truth(real=RealEffects(banking=1.0))
     motion = Equations(problem, state).factors['motion'].motion
     speed = np.linalg.norm(state.v_n, axis=1)
     turning = motion.rate_n[:, 2] * (speed[1:] + speed[:-1]) / 2

@@ -25,11 +25,11 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import draw_vehicle
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 # a consumer gyro that warms up by 10 K: 0.35 deg/s in total, half of it in the first 5 min
-WARMS = Real(gyro_slope=(4e-4, -6e-4, 5e-4), warm_rise=10.0, warm_time=400.0)
+WARMS = RealEffects(gyro_slope=(4e-4, -6e-4, 5e-4), warm_rise=10.0, warm_time=400.0)
 DRIVE = {'duration': 1860.0, 'imu_rate': 20.0, 'odometer_rate': 10.0, 'imu_grade': 'consumer',
          'real': WARMS}
 

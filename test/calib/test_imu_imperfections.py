@@ -21,7 +21,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.nominal import GRADES, TURN_ON, with_grade_by_noise
 from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
@@ -110,7 +110,7 @@ ACCEL = (0.0, 0.0, 0.0, SKEW, 0.0, 0.0, SKEW, 0.0, 0.0)
 def test_mounting_angles_refer_to_the_measuring_axes_of_the_imu():
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.01,
-                              real=Real(gyro_matrix=GYRO, accel_matrix=ACCEL))
+                              real=RealEffects(gyro_matrix=GYRO, accel_matrix=ACCEL))
     truth, found = drive.truth, smooth(leg, of_grade(config, 'misalignment'))
     assert abs(truth.yaw - truth.yaw_housing) == pytest.approx(SKEW, rel=0.05)
     for name, true, housing in (('yaw', truth.yaw, truth.yaw_housing),
@@ -130,8 +130,8 @@ def test_yaw_sigma_includes_the_misalignment_of_y_and_z_with_a_pitched_imu(skew)
     # other two axes determine whether axes are misaligned
     drive, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.12,
-                              real=Real(accel_matrix=(0.0, 0.0, 0.0, skew, 0.0, skew,
-                                                      skew, 0.0, 0.0)))
+                              real=RealEffects(accel_matrix=(0.0, 0.0, 0.0, skew, 0.0, skew,
+                                                             skew, 0.0, 0.0)))
     found = smooth(leg, of_grade(config, 'misalignment'))
     e = found.estimates['yaw_mounting_angle']
     assert abs(e.value - drive.truth.yaw) < 1.96 * e.sigma     # 61 of 52 mdeg, no skew: 6 of 31
@@ -237,7 +237,7 @@ def test_wrong_lever_arm_is_not_unobservable_but_a_delay_without_a_value_is():
 
 
 def test_vehicle_effects_beside_the_values_are_reported():
-    real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
+    real = RealEffects(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,
                               fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
     moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
@@ -262,7 +262,7 @@ def test_vehicle_effects_beside_the_values_are_reported():
 
 def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():
     _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial', seed=4,
-                          fix_noise='rtk', real=Real(speed_law=-0.006))
+                          fix_noise='rtk', real=RealEffects(speed_law=-0.006))
     falls = next(r for r in smooth(leg, config).reasons if r.code is Code.SCALE_VARIES)
     assert re.search('changes by -.* from low to high speed', falls.text)
     assert falls.remedy.startswith('Possible causes: truncated speed values')
@@ -272,7 +272,8 @@ def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():
 def test_tyre_slip_in_one_direction_keeps_the_mean_scale_correct(driven):
     """A wheel without drive slips only in braking: half a slope per direction is 90 ppm."""
     drive, config, leg = made(**TOWN | {
-        'fix_noise': 'rtk', 'fix_sigma': 0.01, 'real': Real(tyre_slip=0.035, driven=driven)})
+        'fix_noise': 'rtk', 'fix_sigma': 0.01,
+        'real': RealEffects(tyre_slip=0.035, driven=driven)})
     method = smooth(leg, config)
     assert off(method, drive) < 3.3
     assert method.estimates['scale_factor'].sigma / drive.truth.scale < 60e-6

@@ -15,7 +15,7 @@ from odocal_ros.estimator.result.odometry_output import twist_noise
 from odocal_ros.estimator.several import _disagreement_reasons
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 
 RATE = 100.0
 
@@ -139,9 +139,9 @@ def errors_over_sigma(made):
     {'two_wheels': True, 'odometer_rate': 50.0, 'scenario': 'yard', 'fix_noise': 'rtk'},
     {'odometer': 'angle', 'slip_walk': 0.01, 'odometer_rate': 20.0},
     {'odometer': 'speed', 'speed_noise': 0.02},
-    {'odometer': 'speed', 'seed': 12, 'real': Real(speed_step=1 / 3.6), 'duration': 500.0},
+    {'odometer': 'speed', 'seed': 12, 'real': RealEffects(speed_step=1 / 3.6), 'duration': 500.0},
     {'odometer': 'speed', 'speed_noise': 0.005, 'scenario': 'motorway',
-     'real': Real(speed_law=0.01)}], ids=str)
+     'real': RealEffects(speed_law=0.01)}], ids=str)
 def test_errors_over_sigma_have_rms_one(options):
     """
     With 300 s at 10 Hz or more, the rms of independent errors is within 1.3 % of one.

@@ -19,7 +19,7 @@ from odocal_ros.estimator.state import CONSTANTS, FIX_ERROR_BY_SIGMA, HEIGHT_DRI
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ IN_SIGMAS = np.array([0.8, -1.2, 0.5])      # east, north, up
 
 def received(**real):
     """Return details and reasons of a drive; asserts that the scale is within its sigma."""
-    drive, config, leg = made(**DRIVE, seed=4, real=Real(**real))
+    drive, config, leg = made(**DRIVE, seed=4, real=RealEffects(**real))
     found = smooth(leg, config)
     assert off(found, drive) < 3
     return found.details, reason_texts(found)
@@ -64,7 +64,7 @@ def test_receiver_without_a_filter_has_no_reasons():
 def test_odometer_in_the_receiver_is_found_with_a_consumer_accelerometer():
     """In a short yard drive, an accelerometer error of the same size also explains the speeds."""
     drive = simulate(SimOptions(scenario='yard', duration=300.0, seed=5,
-                                imu_grade='consumer', real=Real(receiver_odometer=0.05)))
+                                imu_grade='consumer', real=RealEffects(receiver_odometer=0.05)))
     config = settings(drive, None)
     found = smooth(leg_of(drive.leg(), config), config)
     assert off(found, drive) < 3
@@ -119,7 +119,7 @@ def test_errors_with_a_persistent_rate_grow_faster_than_their_steps():
 @pytest.mark.parametrize('name', ['fix', 'odometer'])
 def test_clock_rate_is_reported_and_the_scale_is_that_of_the_wheel(name):
     drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
-                              duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
+                              duration=300.0, real=RealEffects(**{f'{name}_clock_rate': FAST}))
     result = smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
     scale, texts = result.estimates['scale_factor'], reason_texts(result)
     assert off(result, drive) < 3

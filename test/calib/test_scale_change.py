@@ -22,7 +22,7 @@ from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.levels import REMARK_SIGMAS
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 
 pytestmark = pytest.mark.slow
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
@@ -152,7 +152,7 @@ def test_imu_known_from_rtk_determines_the_scale_with_correlated_fixes(tmp_path)
     results = []
     for seed, noise in ((1, 'rtk'), (2, 'correlated')):
         drive, config, leg = made(duration=200.0, imu_grade='industrial', seed=seed,
-                                  fix_noise=noise, real=Real(accel_matrix=ACCEL))
+                                  fix_noise=noise, real=RealEffects(accel_matrix=ACCEL))
         config = with_settings(config, {'imu.accel_scale_sigma': np.nan, 'method': 'smoother',
                                         'vehicle': 'van'})
         results.append(smooth(leg, config))

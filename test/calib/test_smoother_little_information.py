@@ -22,7 +22,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim import routes
 from odocal_ros.sim.profile import hold, ramp, turn
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 
 pytestmark = pytest.mark.slow
 WINDOW, WINDOWS = 45.0, 6      # s, of one drive
@@ -63,7 +63,7 @@ def test_scale_sigma_includes_a_correlated_error_too_small_to_be_detected():
     for seed in range(1, 7):
         # 2 % of the variance of white fixes
         drive, config, leg = made(**TOWN | {'duration': 300.0, 'seed': seed},
-                                  real=Real(slow_errors=((0.21, 60.0),)))
+                                  real=RealEffects(slow_errors=((0.21, 60.0),)))
         found = smooth(leg, config)
         assert found.details['noise']['correlation_time'] > 0
         out.append(off(found, drive))

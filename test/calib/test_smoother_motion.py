@@ -23,7 +23,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.wheels import G
 
@@ -80,7 +80,7 @@ def test_turn_is_not_treated_as_braking():
     """Tyres slip by 0.8 % per m/s^2 of drive, half of it in braking: a turn has no such slip."""
     stiff = 0.04
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
-                                 real=Real(tyre_slip=stiff, driven=True))
+                                 real=RealEffects(tyre_slip=stiff, driven=True))
     c = state.constants.copy()
     c[layout.TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
@@ -148,7 +148,7 @@ def _rms_after_lean(real, axis, columns):
 
 
 def test_axle_slides_by_speed_times_turn_rate():
-    whole, rest = _rms_after_lean(Real(sideslip=0.005), 1, [[0, 1]])
+    whole, rest = _rms_after_lean(RealEffects(sideslip=0.005), 1, [[0, 1]])
     # the mean of a product over 1 s is not the product of means; a difference of velocities
     # left 3 %
     assert rest < 1e-3 * whole
@@ -156,7 +156,7 @@ def test_axle_slides_by_speed_times_turn_rate():
 
 def test_body_lean_is_delayed():
     """At least a third of the remaining squat is proportional to the change of acceleration."""
-    whole, rest, with_change = _rms_after_lean(Real(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
+    whole, rest, with_change = _rms_after_lean(RealEffects(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
     assert rest < 0.3 * whole
     assert with_change < 0.7 * rest
 
@@ -214,7 +214,7 @@ def test_scale_is_that_of_the_path_for_any_body_direction():
 
 def result(kneeling):
     """Return the calibration of a drive, and the drive."""
-    drive = simulate(replace(BUS, real=Real(kneeling=kneeling)))
+    drive = simulate(replace(BUS, real=RealEffects(kneeling=kneeling)))
     config = configured(drive)
     return combine([calibrate(drive.leg(), config)], config), drive
 

@@ -21,7 +21,7 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import draw_vehicle
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
@@ -48,7 +48,7 @@ def test_levels_of_a_noisy_speed_and_a_swaying_vehicle_are_found(noise):
 def test_body_that_kerbs_pitch_lifts_its_axle(kerbs, least, most):
     # within a second by half a wheelbase at most, 0.25 m/rad; without kerbs the initial value
     _, config, leg = made(scenario='yard', duration=300.0, imu_grade='industrial',
-                          fix_noise='rtk', real=Real(kerbs=kerbs, wheelbase=0.5))
+                          fix_noise='rtk', real=RealEffects(kerbs=kerbs, wheelbase=0.5))
     assert least < smooth(leg, config).details['noise']['pitching'] < most
 
 
@@ -132,11 +132,11 @@ def test_noise_at_the_truth_does_not_bias_the_imu_errors(monkeypatch):
     # few turns in long sway: a signal that contains the sway gives scale y an error of 4.6 sigmas
     {'scenario': 'out_and_back', 'duration': 2400.0, 'imu_grade': 'industrial', 'sway': 0.02,
      'odometer_rate': 5.0, 'imu_rate': 10.0, 'fix_rate': 1.0,
-     'real': Real(speed_step=1 / 3.6, slow_errors=((1.5, 60.0), (1.0, 600.0)))},
+     'real': RealEffects(speed_step=1 / 3.6, slow_errors=((1.5, 60.0), (1.0, 600.0)))},
     # with such fixes, IMU scales and odometer scale are hardly separable: a signal without
     # sway and a path with sway increase them by 5 sigmas
     {'scenario': 'yard', 'duration': 900.0, 'imu_grade': 'consumer', 'sway': 0.02, 'seed': 2,
-     'odometer_rate': 20.0, 'fix_rate': 1.0, 'real': Real(slow_errors=((1.5, 100.0),))}])
+     'odometer_rate': 20.0, 'fix_rate': 1.0, 'real': RealEffects(slow_errors=((1.5, 100.0),))}])
 def test_gyro_noise_and_road_vibration_cause_no_scale_error(drive):
     drive, config, leg = made(**({'odometer': 'speed'} | drive))
     found = smooth(leg, by_grade(config))
@@ -146,8 +146,8 @@ def test_gyro_noise_and_road_vibration_cause_no_scale_error(drive):
         assert abs(one['value']) < 3.3 * one['sigma'], name
 
 
-BANKED = {'scenario': 'oval', 'real': Real(banking=0.5)}
-KERBS = {'scenario': 'yard', 'real': Real(kerbs=0.06, wheelbase=0.5)}
+BANKED = {'scenario': 'oval', 'real': RealEffects(banking=0.5)}
+KERBS = {'scenario': 'yard', 'real': RealEffects(kerbs=0.06, wheelbase=0.5)}
 
 
 @pytest.mark.parametrize('road', [BANKED, KERBS])

@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
@@ -26,7 +26,7 @@ def calibrated(how='floor', rate=10.0, step=KMH, between=0.0, **options):
     drive = simulate(SimOptions(**({
         'scenario': 'town', 'odometer': 'speed', 'scale': 1.01, 'nominal_scale': 1.0,
         'odometer_rate': rate, 'imu_rate': 50.0, 'duration': 300.0, 'seed': SEED,
-        'real': Real(speed_step=step, speed_rounding=how)} | options)))
+        'real': RealEffects(speed_step=step, speed_rounding=how)} | options)))
     leg = drive.leg()
     if between:
         ns, v = leg.odometer.stamp_ns, leg.odometer.value
@@ -57,8 +57,8 @@ def test_scale_error_of_a_speed_in_whole_kmh_is_within_its_sigma(how, rate, betw
 
 @pytest.mark.parametrize('tau', [0.4, 0.8])
 def test_filter_before_the_steps_is_found(tau):
-    drive, result = calibrated(real=Real(speed_step=KMH / 2, speed_rounding='floor',
-                                         speed_filter=tau), odometer_rate=5.0, duration=600.0)
+    real = RealEffects(speed_step=KMH / 2, speed_rounding='floor', speed_filter=tau)
+    drive, result = calibrated(real=real, odometer_rate=5.0, duration=600.0)
     method = result.methods['smoother']
     assert off(method, drive) < 3.3
     assert Code.SPEED_FILTERED in reason_texts(result)
@@ -70,7 +70,7 @@ def test_filter_before_the_steps_is_found(tau):
 @pytest.mark.parametrize('how', ['floor', 'round'])
 def test_factor_as_sent_gives_the_path_length_of_the_sent_speeds(how):
     drive, result = calibrated(how, 10.0)
-    exact = simulate(replace(drive.options, real=Real())).leg().odometer.value
+    exact = simulate(replace(drive.options, real=RealEffects())).leg().odometer.value
     ratio = exact.sum() / drive.leg().odometer.value.sum()
     assert (ratio > 1.01) == (how == 'floor')
     found = result.methods['smoother'].estimates['scale_factor_as_sent']
@@ -88,7 +88,7 @@ YARD = {'scenario': 'yard', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_n
 
 @pytest.mark.parametrize(('options', 'most'), [
     # squat and turns change the direction of the path, without information on the scale
-    ({'rate': 1.0, 'real': Real(speed_step=KMH, squat=0.002, sideslip=0.004)}, 0.04),
+    ({'rate': 1.0, 'real': RealEffects(speed_step=KMH, squat=0.002, sideslip=0.004)}, 0.04),
     # the first and last interval of a motion are only partly in motion
     *(({'rate': 50.0, 'step': 0.1 * KMH, 'seed': seed}, np.inf) for seed in (33, 35))], ids=str)
 def test_scale_error_in_a_yard_with_many_stops_is_within_its_sigma(options, most):
@@ -134,8 +134,8 @@ def test_steps_too_fine_for_crossings_have_an_offset():
 @pytest.mark.parametrize('seed', [12, 15])
 def test_scales_of_imu_and_odometer_do_not_shrink_together(seed):
     """With multipath, only the steps determine their common scale; residuals in m/s reduced it."""
-    real = Real(speed_step=KMH, slow_errors=((4.0, 40.0), (3.0, 300.0)), bursts=60.0,
-                burst_size=20.0)
+    real = RealEffects(speed_step=KMH, slow_errors=((4.0, 40.0), (3.0, 300.0)), bursts=60.0,
+                       burst_size=20.0)
     drive = simulate(SimOptions(
         scenario='town', duration=900.0, imu_grade='consumer', odometer='speed', odometer_rate=5.0,
         odometer_delay=0.3, fix_rate=1.0, fix_sigma=2.0, seed=seed, real=real))

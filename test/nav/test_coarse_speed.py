@@ -16,7 +16,7 @@ from odocal_ros.nav.coarse_speed import (
 )
 from odocal_ros.nav.odometer import make_travel
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.wheels import quantized, with_least_change
 
 KMH = 1 / 3.6
@@ -180,8 +180,9 @@ def test_a_held_speed_is_recognised_with_its_step(scale):
 
 @pytest.mark.parametrize('value', [
     town(AT), town(AT) + 0.01 * np.random.default_rng(1).standard_normal(len(AT)),
-    np.repeat(town(AT[::5]), 5), quantized(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
-    np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
+    np.repeat(town(AT[::5]), 5), quantized(town(AT), RealEffects(speed_step=1 / 3.6)),
+    np.zeros(len(AT)), np.full(len(AT), 5.0)],
+    ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
 def test_other_speeds_are_not_recognised_as_held(value):
     path = make_travel(AT, value, RATE)[0]
     assert path.coarse is None or path.coarse.truncation

@@ -185,10 +185,10 @@ def test_a_random_vehicle_is_drawn_and_given_values_take_precedence(tmp_path):
 
 
 def test_a_single_effect_or_value_is_simulated_alone(tmp_path):
-    from odocal_ros.sim.real import Real
+    from odocal_ros.sim.real_effects import RealEffects
     for name, words in (('effect', ['--effect', 'squat']), ('figure', ['--real', 'squat=0.002'])):
         assert odocal(*SHORT, '--out', tmp_path / name / 'drive', *words, '--quiet') == 0
-        real = Real(**load(tmp_path / name / 'truth.yaml')['options']['real'])
+        real = RealEffects(**load(tmp_path / name / 'truth.yaml')['options']['real'])
         assert real.squat > 0
         assert real.vibration == 0
         assert (real.body_roll > 0) == (name == 'effect')

@@ -31,7 +31,7 @@ from odocal_ros.screening import inputs as inputs_module
 from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.nominal import grade_of
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 
 pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
@@ -201,7 +201,7 @@ def test_the_bias_at_rest_has_the_sigma_of_the_earth_rate():
 
 def test_a_pose_that_contains_the_wheels_is_reported():
     made = drive(**CAR | {'scenario': 'yard', 'duration': 300.0, 'seed': 4},
-                 real=Real(receiver_odometer=-0.03))
+                 real=RealEffects(receiver_odometer=-0.03))
     config = settings(made, **SMOOTHER, leg__min_distance=20.0)
     result = calibrate(posed(made), config).methods['smoother']
     texts, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)

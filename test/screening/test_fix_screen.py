@@ -14,7 +14,7 @@ from odocal_ros.screening.fix_screen import dead_reckoned_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.core
@@ -116,7 +116,7 @@ def test_an_odometer_that_is_late_when_braking_is_not_a_tunnel(lag, tunnel):
 
 @pytest.mark.parametrize(('scenario', 'noise'), [('motorway', 'white'), ('town', 'rtk')])
 def test_fixes_in_a_tunnel_are_not_used_and_this_is_reported(scenario, noise):
-    real = Real(tunnels=((110.0, 70.0),), tunnel_odometer=0.02)
+    real = RealEffects(tunnels=((110.0, 70.0),), tunnel_odometer=0.02)
     made = simulate(SimOptions(scenario=scenario, duration=300.0, imu_grade='industrial',
                                imu_rate=50.0, fix_noise=noise, antenna_lever_arm=(1.0, 0.0, 1.5),
                                real=real))

@@ -11,7 +11,7 @@ from odocal_ros.sim import body
 from odocal_ros.sim.motion import attitude, Motion, Start, velocity_n
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, Hills, hold, ramp, turn
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
 from odocal_ros.sim.zoo import G
 
@@ -39,7 +39,7 @@ def test_slopes_are_derivatives_of_the_height_and_chords_are_means():
 
 
 def test_the_body_climbs_kerbs_with_both_axles():
-    real = Real(kerbs=0.08, kerb_distance=2.0, wheelbase=0.5)
+    real = RealEffects(kerbs=0.08, kerb_distance=2.0, wheelbase=0.5)
     motion = motion_of(resolved(SimOptions(scenario='yard', duration=120.0, real=real)))
     t = np.arange(0.0, 120.0, 0.05)
     state = motion.at(t)
@@ -53,7 +53,7 @@ def test_the_body_climbs_kerbs_with_both_axles():
 def test_a_cross_slope_rolls_the_vehicle_and_gives_lateral_gravity():
     lean = np.radians(2.0)
     drive = simulate(SimOptions(scenario='yard', duration=120.0, imu_grade='perfect', pitch=0.0,
-                                yaw=0.0, real=Real(cross_slope=lean)))
+                                yaw=0.0, real=RealEffects(cross_slope=lean)))
     t = (drive.imu.stamp_ns - drive.imu.stamp_ns[0]) * 1e-9
     still = np.abs(drive.motion.speed(t)) == 0
     roll = np.arctan2(drive.imu.f_i[still, 1], drive.imu.f_i[still, 2])
@@ -63,7 +63,7 @@ def test_a_cross_slope_rolls_the_vehicle_and_gives_lateral_gravity():
 
 
 def test_the_wheel_contact_has_no_sideslip_in_a_banked_curve():
-    real = Real(banking=0.5)
+    real = RealEffects(banking=0.5)
     options = resolved(SimOptions(scenario='oval', odometer_lever_arm=(0.0, 0.0, -0.3), real=real))
     motion = motion_of(options)
     t = np.arange(40.0, 120.0, 0.05)
@@ -111,7 +111,7 @@ def bends():
     speed = chain(hold(1) + ramp(4, 10, 1.0) + hold(8) + ramp(4, -10, 1.0) + hold(1)).integral()
     rate = chain(hold(6) + turn(5, 0.8, 1.5) + hold(7))
     return Motion(speed, rate, Start(0.7, 0.2, 0.0, 0.3),
-                  tilt=body.tilts(speed, rate, Real(squat=SQUAT, body_roll=ROLL)))
+                  tilt=body.tilts(speed, rate, RealEffects(squat=SQUAT, body_roll=ROLL)))
 
 
 def test_the_body_pitches_up_when_accelerating_and_rolls_outwards_in_turns():
@@ -153,7 +153,8 @@ def test_the_imu_measures_the_motion_of_its_place_on_the_body():
 
 
 def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
-    options = resolved(SimOptions(scenario='town', duration=200.0, real=Real(sideslip=0.004)))
+    options = resolved(SimOptions(scenario='town', duration=200.0,
+                                  real=RealEffects(sideslip=0.004)))
     motion = motion_of(options)
     state = motion.at(np.arange(0, 200, 0.1))      # where the sideslip is at the computed value
     side = state.speed * state.yaw_rate
@@ -166,7 +167,7 @@ def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
 
 def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
     fall, straight = 0.025, {'scenario': 'straight', 'duration': 190.0}
-    real = Real(crossfall=fall, body_roll=ROLL, sideslip=0.004)
+    real = RealEffects(crossfall=fall, body_roll=ROLL, sideslip=0.004)
     motion = motion_of(resolved(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
                                            real=real)))
     t = np.arange(0.0, 190.0, 0.1)
@@ -178,7 +179,7 @@ def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
 
 def test_a_bus_kneels_only_at_stops_within_the_drive():
     down = np.radians(2.0)
-    options = SimOptions(scenario='town', duration=300.0, real=Real(kneeling=down))
+    options = SimOptions(scenario='town', duration=300.0, real=RealEffects(kneeling=down))
     motion = motion_of(resolved(options))
     t = np.arange(0.0, 300.0, 0.02)
     still = np.abs(motion.speed(t)) < 1e-9

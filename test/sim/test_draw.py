@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.sim.draw import draw_vehicle, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS, RARE
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_clean_vehicle_has_no_imperfections_and_the_true_settings():
     options, there = draw_vehicle(7, 'town', 'industrial', ())
-    assert options.real == Real()
+    assert options.real == RealEffects()
     assert there == ()
     configured = settings(simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
     assert configured['imu']['grade'] == 'industrial'
@@ -39,7 +39,7 @@ def test_an_effect_alone_changes_the_drive_and_is_that_of_the_whole(name):
     for seed, (one, there) in zip(seeds, alone, strict=True):
         whole, names = draw_vehicle(seed, 'town', 'industrial')
         assert not there or name in names
-        real, plain = asdict(one.real), asdict(Real())
+        real, plain = asdict(one.real), asdict(RealEffects())
         changed = {k: v for k, v in real.items() if v != plain[k]}
         assert changed.items() <= asdict(whole.real).items()
 

@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.sim import motion, real_sensors, sensors
 from odocal_ros.sim.motion import point
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
 
 pytestmark = pytest.mark.core
@@ -38,7 +38,7 @@ def north(drive, times):
     ({'receiver_odometer': 0.02, 'receiver_odometer_time': 15.0}, {450.0: -0.02 * 20 * 15},
      {'rel': 3e-3})], ids=['lag', 'tracking', 'odometer'])
 def test_lag_of_a_receiver_filter_is_the_closed_form(receiver, behind, tolerance):
-    filtered = replace(PAPER, real=Real(**receiver))
+    filtered = replace(PAPER, real=RealEffects(**receiver))
     for t, want in behind.items():
         late = (north(PAPER, [t]) - north(filtered, [t]))[0]
         assert late == pytest.approx(want, **tolerance)
@@ -47,7 +47,7 @@ def test_lag_of_a_receiver_filter_is_the_closed_form(receiver, behind, tolerance
 
 
 def test_satellite_errors_are_smoothed_by_an_odometer_in_the_receiver():
-    t, options = np.arange(0.0, 4000.0), replace(PAPER, real=Real(receiver_odometer=0.01))
+    t, options = np.arange(0.0, 4000.0), replace(PAPER, real=RealEffects(receiver_odometer=0.01))
     white = np.random.default_rng(1).standard_normal((len(t), 3))
     left = real_sensors.fused_errors(t, white, options)
     a = np.exp(-1 / 20)
@@ -58,8 +58,8 @@ def test_satellite_errors_are_smoothed_by_an_odometer_in_the_receiver():
 
 def test_slow_errors_have_their_size_and_are_in_the_covariance():
     slow = ((1.2, 5.0), (0.9, 20.0))
-    options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=Real(slow_errors=slow,
-                                                                     stated_factor=0.5))
+    options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=RealEffects(slow_errors=slow,
+                                                                            stated_factor=0.5))
     drive = simulate(options)
     want = 0.3**2 + 1.2**2 + 0.9**2
     assert_allclose(drive.fix.covariance_n[0], 0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
@@ -74,7 +74,7 @@ def test_slow_errors_have_their_size_and_are_in_the_covariance():
 
 def test_bursts_come_and_go_smoothly():
     t = np.arange(0.0, 3600.0, 0.2)
-    options = replace(resolved(PAPER), real=Real(bursts=10.0, burst_size=10.0))
+    options = replace(resolved(PAPER), real=RealEffects(bursts=10.0, burst_size=10.0))
     error = real_sensors.burst_errors(t, options)
     size = np.hypot(error[:, 0], error[:, 1])
     assert size.max() > 5
@@ -85,7 +85,7 @@ def test_bursts_come_and_go_smoothly():
 
 def test_the_antenna_moves_with_the_roll_of_the_body():
     options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
-                                  real=Real(body_roll=0.01)))
+                                  real=RealEffects(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
     leaning = real_sensors.positions(motion, t, options)
     stiff = point(motion.at(t), options.antenna_lever_arm)
@@ -98,7 +98,7 @@ def test_the_antenna_moves_with_the_roll_of_the_body():
 
 
 def test_fixes_are_dropped_at_random_and_stamped_late():
-    plain, real = (simulate(replace(PAPER, fix_delay=0.1, real=Real(**figures)))
+    plain, real = (simulate(replace(PAPER, fix_delay=0.1, real=RealEffects(**figures)))
                    for figures in ({}, {'drops': 0.2, 'fix_jitter': 0.01}))
     n, kept = len(plain.fix.stamp_ns), len(real.fix.stamp_ns)
     assert kept == pytest.approx(0.8 * n, abs=5 * np.sqrt(n * 0.16))
@@ -107,8 +107,8 @@ def test_fixes_are_dropped_at_random_and_stamped_late():
 
 def test_a_receiver_in_a_tunnel_uses_its_odometer_and_is_right_afterwards():
     tunnel, quiet = ((400.0, 60.0),), {'fix_sigma': 0.0, 'fix_rate': 1.0}
-    wrong, right = (simulate(replace(PAPER, real=Real(tunnels=tunnel, tunnel_odometer=x,
-                                                      tunnel_heading=y), **quiet))
+    wrong, right = (simulate(replace(PAPER, real=RealEffects(tunnels=tunnel, tunnel_odometer=x,
+                                                             tunnel_heading=y), **quiet))
                     for x, y in ((0.02, 0.01), (0.0, 0.0)))
     north_m, east_m = (6.36e6 * (getattr(wrong.fix, name) - getattr(right.fix, name))
                        for name in ('latitude', 'longitude'))

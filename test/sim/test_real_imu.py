@@ -13,7 +13,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
 from odocal_ros.sim import real_sensors
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.real_sensors import sensor_axes
 from odocal_ros.sim.scenarios import simulate
 
@@ -23,14 +23,14 @@ MANY = 40_000
 
 
 def options(**figures):
-    return resolved(replace(STRAIGHT, real=Real(**figures)))
+    return resolved(replace(STRAIGHT, real=RealEffects(**figures)))
 
 
 def test_imu_readings_obey_the_error_model():
     rng = make_rng(1, 'test')
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
-    w_m, f_m = real_sensors.with_triad_errors(w, f, Real(
+    w_m, f_m = real_sensors.with_triad_errors(w, f, RealEffects(
         gyro_matrix=tuple(gyro.ravel()), accel_matrix=tuple(accel.ravel()),
         g_sensitivity=tuple(G.ravel())))
     for k in range(7):
@@ -122,7 +122,7 @@ def test_late_stamps_do_not_move_the_true_marks():
 def test_impossible_options_are_refused(figures, message):
     from odocal_ros.errors import BadUsage
     with pytest.raises(BadUsage, match=message):
-        Real(**figures)
+        RealEffects(**figures)
 
 
 def cross(x, y, z):
@@ -149,7 +149,7 @@ def test_a_sensor_rotated_in_its_housing_equals_a_rotated_mounting():
     mounted = {'scenario': 'town', 'duration': 200.0, 'imu_grade': 'perfect', 'imu_rate': 20.0,
                'mounting_rpy': (0.1, 0.2, 0.4), 'imu_lever_arm': (0.5, 0.2, 0.3)}
     turned = simulate(SimOptions(**mounted, yaw=0.03, pitch=0.01,
-                                 real=Real(gyro_matrix=flat, accel_matrix=flat)))
+                                 real=RealEffects(gyro_matrix=flat, accel_matrix=flat)))
     C_vb = matrix_from_rpy([0.0, 0.01, 0.03]) @ (np.eye(3) - M)
     roll, pitch, yaw = rpy_from_matrix(C_vb)
     ideal = simulate(SimOptions(**mounted, roll=roll, pitch=pitch, yaw=yaw))

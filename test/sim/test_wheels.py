@@ -14,7 +14,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.library.read_bag import read_bag
 from odocal_ros.sim import wheels
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
 from odocal_ros.sim.wheels import (
     effective_width,
@@ -143,7 +143,7 @@ RUN = {'scenario': 'straight', 'duration': 400.0, 'imu_rate': 20.0}
 
 def run(**figures):
     motion = motion_of(resolved(SimOptions(**RUN)))
-    return motion, motion.at(np.arange(0, 400, 0.02)), Real(**figures)
+    return motion, motion.at(np.arange(0, 400, 0.02)), RealEffects(**figures)
 
 
 def test_a_tyre_grows_with_the_square_of_the_speed_and_as_it_warms():
@@ -163,7 +163,7 @@ def test_tyre_slip_is_proportional_to_force_over_load():
     air = wheels.AIR_DRAG * (state.speed[a:b + 1]**2 * np.gradient(state.travel[a:b + 1])).sum()
     want = 2 / 30 * ((push / 9.81 + wheels.ROLLING_RESISTANCE) * path + air)
     assert spun[b] - spun[a] == pytest.approx(want, rel=2e-3)      # at the ends of the sum
-    braked = wheels.tyre_slip(state, Real(tyre_slip=1 / 30, driven=False))
+    braked = wheels.tyre_slip(state, RealEffects(tyre_slip=1 / 30, driven=False))
     assert braked[b] == 0
     assert braked[-1] < 0
 
@@ -178,7 +178,7 @@ def test_tyre_slip_uphill_is_proportional_to_the_slope():
 
 @pytest.mark.parametrize('odometer', ['counts', 'speed', 'angle'])
 def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
-    real = Real(speed_law=0.01, warming=0.01, warming_time=50.0, tyre_slip=1 / 30)
+    real = RealEffects(speed_law=0.01, warming=0.01, warming_time=50.0, tyre_slip=1 / 30)
     drive = simulate(SimOptions(**RUN, odometer=odometer, real=real, start_slip=0.01))
     t, value = (drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9, drive.odometer.value
     path = ((value[1:] + value[:-1]) / 2 * np.diff(t)).sum()
@@ -192,10 +192,10 @@ def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
 
 def test_speed_quantisation_is_symmetric_in_both_directions():
     v = np.array([0.0, 0.2, 0.3, 0.99, -0.99, 1.6])
-    floor, near = (Real(speed_step=0.5, speed_rounding=r) for r in ('floor', 'round'))
+    floor, near = (RealEffects(speed_step=0.5, speed_rounding=r) for r in ('floor', 'round'))
     assert_allclose(wheels.quantized(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
     assert_allclose(wheels.quantized(v, near), [0, 0, 0.5, 1.0, -1.0, 1.5])
-    assert_allclose(wheels.quantized(v, Real(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
+    assert_allclose(wheels.quantized(v, RealEffects(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
 
 
 def test_a_filtered_speed_lags_a_ramp_by_its_time_constant():

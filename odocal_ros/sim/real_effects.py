@@ -4,8 +4,8 @@
 """
 Parameters of the errors of real sensors beyond noise and bias, with their checks.
 
-``Real`` has one field for each; its defaults mean no error. ``real_sensors.py``, ``wheels.py`` and
-``body.py`` apply them; ``odocal simulate --real NAME=VALUE`` sets them.
+``RealEffects`` has one field for each; its defaults mean no error. ``real_sensors.py``,
+``wheels.py`` and ``body.py`` apply them; ``odocal simulate --real NAME=VALUE`` sets them.
 """
 
 from dataclasses import dataclass, fields
@@ -37,7 +37,7 @@ POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_fa
 
 
 @dataclass(frozen=True, kw_only=True)
-class Real:
+class RealEffects:
     """
     Parameters of a vehicle, SI and radians; those of the IMU in its own frame i (the housing).
 
@@ -166,7 +166,7 @@ def parse_parameter(text: str) -> tuple[str, Any]:
     """Return name and value of ``NAME=VALUE``; raise BadUsage for an unknown name."""
     import ast
     name, _, value = text.partition('=')
-    names = [f.name for f in fields(Real)]
+    names = [f.name for f in fields(RealEffects)]
     if name not in names:
         similar = difflib.get_close_matches(name, names, 3) or names
         raise BadUsage(f'--real {name}: no such parameter; similar: {", ".join(similar)}')
