@@ -50,7 +50,8 @@ def test_an_outdated_page_is_reported_and_written_again(tmp_path, monkeypatch, c
 
 def test_each_setting_has_a_row():
     page = (ROOT / 'docs' / 'settings.md').read_text()
-    rows = re.findall(r'^\| `([\w.]+)` \| [\w\[\]]+(?: \(ro\))? \| (.*?) \|', page, re.MULTILINE)
+    rows = re.findall(r'^\| `([\w.]+)` \| [\w\[\]]+(?: \(read-only\))? \| (.*?) \|', page,
+                      re.MULTILINE)
     assert [name for name, _ in rows] == list(SETTINGS)
     assert dict(rows)['leg.min_distance'] == '100.0'
 

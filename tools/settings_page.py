@@ -30,9 +30,9 @@ SETTINGS_HEAD = """\
 
 Made from `odocal_ros/settings/config.py` by `python -m tools.settings_page --write`.
 
-The node's parameters, the keys of `--config` files, of `--set` and of `config=` in Python; `(ro)`:
-fixed at start-up, the others change between legs. `config/calibrator.yaml` holds them all with
-their defaults."""
+The node's parameters, the keys of `--config` files, of `--set` and of `config=` in Python;
+`(read-only)`: fixed at start-up, the others change between legs. `config/calibrator.yaml` holds
+them all with their defaults."""
 NODES = {
     'calibrator': (Config, YAML_HEAD.format('odocal_ros', 'The node takes it by --params-file, '
                                             'odocal replay by --config. Keep the lines you '
@@ -77,7 +77,7 @@ def config_yaml(node: str) -> str:
             lines += ['', f'    {here}:']
             group = here
         indent = '      ' if here else '    '
-        about = setting.about + (' Fixed at start-up.' if setting.ro else '')
+        about = setting.about + (' Fixed at start-up.' if setting.read_only else '')
         notes = [about, f'[{limits(setting)}]'] if limits(setting) else [about]
         for note in notes:
             lines += textwrap.wrap(note, 97, initial_indent=f'{indent}# ',
@@ -97,7 +97,7 @@ def settings_md() -> str:
                      '| parameter | type | default | unit, values | meaning |',
                      '|---|---|---|---|---|']
             group = here
-        fixed = ' (ro)' if setting.ro else ''
+        fixed = ' (read-only)' if setting.read_only else ''
         default = scalar_text(setting.default).replace("''", "`''`")
         rows.append(f'| `{name}` | {TYPES[setting.kind]}{fixed} | {default} | {limits(setting)} | '
                     f'{setting.about} |')

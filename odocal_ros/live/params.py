@@ -67,10 +67,10 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     them with a remedy, rclpy without.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
-    about += ' Fixed at start-up.' if setting.ro else ''
+    about += ' Fixed at start-up.' if setting.read_only else ''
     result = msg.ParameterDescriptor(description=about)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
-        setting.ro and setting.default)
+        setting.read_only and setting.default)
     limits = []
     if setting.choices:
         limits.append('one of ' + ', '.join(setting.choices))
@@ -154,7 +154,7 @@ def change_refusal(config: Config, results: dict[str, Any], parameters: list[Par
         if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
             return (f'{p.name} is set by the node after each leg; to restore a result, start the '
                     'node with --params-file calibration.yaml')
-        if p.name in SETTINGS and SETTINGS[p.name].ro and (
+        if p.name in SETTINGS and SETTINGS[p.name].read_only and (
                 _python_value(p.value) != attrgetter(p.name)(config)):
             return (f'{p.name} is fixed at start-up: restart the node with '
                     f'"--ros-args -p {p.name}:=VALUE"')

@@ -33,13 +33,14 @@ TYPICAL = 'typical value of IMUs sold in this grade'
 
 def _place(about: str) -> Any:
     """Declare a position in base_link."""
-    return setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=about)
+    return setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, read_only=True, about=about)
 
 
 def _arrival() -> Any:
     """Declare whether messages are stamped by their arrival."""
-    return setting(False, ro=True, about='Use the arrival time of messages in place of their '
-                   'stamp, if that is 0 or of another clock (time since boot).')
+    return setting(False, read_only=True, about=(
+        'Use the arrival time of messages in place of their stamp, if that is 0 or of another '
+        'clock (time since boot).'))
 
 
 def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:
@@ -49,18 +50,20 @@ def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade')
 
 @dataclass(frozen=True, kw_only=True)
 class OdometerConfig:
-    type: str = setting('auto', ro=True, about="Message type 'pkg/msg/Type'; auto: type of the "
-                        'first publisher, or of the only candidate in a bag.')
-    field: str = setting('', ro=True, about='Dotted path to the value, with [i] or [name]; empty: '
-                         "the type's default.")
-    quantity: str = setting('auto', choices=('auto', 'cumulative', 'increment', 'rate'), ro=True,
-                            about='Meaning of the value: running count, count since the last '
-                            "message, or speed; auto: the type's default.")
-    wrap: int = setting(0, 'counts', 0, 2**62, ro=True, about='Counter modulus; 0: that of the '
-                        'integer type (65536 for 16 bits sent in an Int32).')
-    signed: bool = setting(True, ro=True, about='False for pulses without direction: reversing '
-                           'is then detected from IMU and fixes, or rejects the leg.')
-    reversed: bool = setting(False, ro=True, about='Positive counts mean backwards.')
+    type: str = setting('auto', read_only=True, about=(
+        "Message type 'pkg/msg/Type'; auto: type of the first publisher, or of the only "
+        'candidate in a bag.'))
+    field: str = setting('', read_only=True, about=(
+        "Dotted path to the value, with [i] or [name]; empty: the type's default."))
+    quantity: str = setting('auto', read_only=True, about=(
+        'Meaning of the value: running count, count since the last message, or speed; auto: the '
+        "type's default."), choices=('auto', 'cumulative', 'increment', 'rate'))
+    wrap: int = setting(0, 'counts', 0, 2**62, read_only=True, about=(
+        'Counter modulus; 0: that of the integer type (65536 for 16 bits sent in an Int32).'))
+    signed: bool = setting(True, read_only=True, about=(
+        'False for pulses without direction: reversing is then detected from IMU and fixes, '
+        'or rejects the leg.'))
+    reversed: bool = setting(False, read_only=True, about='Positive counts mean backwards.')
     nominal_scale: float = setting(0.0, 'm/pulse, m/rad or 1', 0.0, 1e6, about='Scale factor as '
                                    'configured, K0; 0: unknown for counts, 1 for speeds.')
     max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Limit of the deviation from '
@@ -71,19 +74,19 @@ class OdometerConfig:
     # latency of a bus and a middleware is rarely less; u-blox requires 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown delay of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
-    wheels: tuple[str, ...] = setting((), ro=True, item=str, about=(
+    wheels: tuple[str, ...] = setting((), read_only=True, item=str, about=(
         'Wheels in one message: joint names or array indices, the left and the right one of each '
         'axle in turn.'))
-    left: str = setting('', ro=True, about='Left one of two wheels: joint name, array index, or '
-                        "'topic' if it has its own topic.")
-    right: str = setting('', ro=True, about='Right one of two wheels: joint name, array index, or '
-                         "'topic' (odometer_right).")
-    drive: str = setting(DIFFERENTIAL, choices=DRIVES, ro=True, about='Kinematics: differential '
-                         '(cars too), skid (wheels or tracks that slide in turns), mecanum '
-                         '(four odometer.wheels: front left, front right, rear left, rear right) '
-                         'or omni (three or more, counter-clockwise in a circle).')
-    wheel_offset: float = setting(0.0, 'rad', -6.3, 6.3, ro=True, about='Omni wheels: angle from '
-                                  'the x axis to the first wheel, seen from the centre.')
+    left: str = setting('', read_only=True, about=(
+        "Left one of two wheels: joint name, array index, or 'topic' if it has its own topic."))
+    right: str = setting('', read_only=True, about=(
+        "Right one of two wheels: joint name, array index, or 'topic' (odometer_right)."))
+    drive: str = setting(DIFFERENTIAL, choices=DRIVES, read_only=True, about=(
+        'Kinematics: differential (cars too), skid (wheels or tracks that slide in turns), '
+        'mecanum (four odometer.wheels: front left, front right, rear left, rear right) or '
+        'omni (three or more, counter-clockwise in a circle).'))
+    wheel_offset: float = setting(0.0, 'rad', -6.3, 6.3, read_only=True, about=(
+        'Omni wheels: angle from the x axis to the first wheel, seen from the centre.'))
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
                                  'right wheel; 0: unknown.')
 
@@ -113,9 +116,10 @@ class OdometerConfig:
 class ImuConfig:
     grade: str = setting('consumer', choices=GRADES, about='Gyro and accelerometer quality; the '
                          'settings below override single values.')
-    frame_id: str = setting('', ro=True, about='Use only messages of the IMU topic with this '
-                            "frame_id; '': the topic must carry one IMU.")
-    use_pressure: bool = setting(True, ro=True, about='Use the air pressure (pressure) as '
+    frame_id: str = setting('', read_only=True, about=(
+        "Use only messages of the IMU topic with this frame_id; '': the topic must carry one "
+        'IMU.'))
+    use_pressure: bool = setting(True, read_only=True, about='Use the air pressure (pressure) as '
                                  'height if it is published.')
     gyro_noise: float = _figure('rad/s/sqrt(Hz)', 1.0, 'White gyro noise')
     gyro_bias: float = _figure('rad/s', 1.0, 'Turn-on gyro bias, 1 sigma', TYPICAL)
@@ -135,12 +139,12 @@ class ImuConfig:
                                 '0.017453292519943295 for an IMU in deg/s.')
     accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on the published specific '
                                  'force; 9.80665 for an IMU in g.')
-    mounting_rpy: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad', -6.3, 6.3, ro=True, about=(
+    mounting_rpy: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad', -6.3, 6.3, about=(
         'Nominal rotation from the IMU frame to the body frame b (forward, left, up), fixed axes '
-        'roll, pitch, yaw.'))
-    constants: str = setting('', ro=True, about='calibration.json of an earlier result of this '
-                             'vehicle, or its folder: its IMU scales and axes (not the mounting) '
-                             'are used like one more leg of the smoother.')
+        'roll, pitch, yaw.'), read_only=True)
+    constants: str = setting('', read_only=True, about=(
+        'calibration.json of an earlier result of this vehicle, or its folder: its IMU scales '
+        'and axes (not the mounting) are used like one more leg of the smoother.'))
     lever_arm: tuple[float, ...] = _place('IMU position in base_link.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to IMU stamps.')
     arrival_time: bool = _arrival()
@@ -166,8 +170,8 @@ class GnssConfig:
                                    'without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Correlation time of fix errors; '
                                       '0: white; NaN: estimated from the data.')
-    use_velocity: bool = setting(True, ro=True, about='Use the GNSS velocity (fix_velocity) if '
-                                 'it is published.')
+    use_velocity: bool = setting(True, read_only=True, about=(
+        'Use the GNSS velocity (fix_velocity) if it is published.'))
     velocity_scale_sigma: float = setting(1e-3, '1', 0.0, 0.1, about='Relative scale error of the '
                                           'GNSS velocity, 1 sigma. Pure Doppler: 1e-5. A receiver '
                                           'that fuses wheel speeds: 0.05.')
@@ -252,8 +256,9 @@ class Config:
         'Method that gives the result; auto, all: each value from smoother if available, '
         'otherwise from two_point; patent: smoother, plus the search of CN104359492A for two '
         'wheels; wheels: alias of smoother.'))
-    vehicle: str = setting('', ro=True, about='Name of the vehicle, shown in results and as '
-                           'title of the report; a result of another vehicle is not restored.')
+    vehicle: str = setting('', read_only=True, about=(
+        'Name of the vehicle, shown in results and as title of the report; a result of '
+        'another vehicle is not restored.'))
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

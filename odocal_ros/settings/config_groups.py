@@ -25,20 +25,20 @@ class ReferenceConfig:
                                        'the start mark: latitude, longitude, ellipsoidal height, '
                                        'sigma; empty: from fixes.')
     end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
-    latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, ro=True, about=(
+    latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, read_only=True, about=(
         'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
         'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
         '15 deg/h, is estimated as gyro bias.'))
     default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
                                    'positions in a local frame without a covariance: the first '
                                    'value of the estimate.')
-    frames: tuple[str, ...] = setting(('map', 'base_link'), item=str, ro=True, about=(
+    frames: tuple[str, ...] = setting(('map', 'base_link'), item=str, read_only=True, about=(
         'With TF as position reference: the fixed frame, and the frame of the tracked point on '
         'the robot.'))
-    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, ro=True, any_length=True, about=(
-        'Points on the floor where the robot stands at the marks: x and y of each, in the order '
-        'of the marks; after the last point the list starts again. The node then uses ~/mark '
-        'instead of the topic fix.'))
+    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, any_length=True, about=(
+        'Points on the floor where the robot stands at the marks: x and y of each, in the '
+        'order of the marks; after the last point the list starts again. The node then uses '
+        '~/mark instead of the topic fix.'), read_only=True)
     points_sigma: float = setting(0.005, 'm', 1e-4, 1.0, about='Uncertainty of points and of '
                                   'the robot on them, each axis.')
     marks: tuple[float, ...] = setting((), 's', 0.0, 1e6, any_length=True, about=(
@@ -72,22 +72,24 @@ class JournalConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PublishConfig:
-    rate: float = setting(2.0, 'Hz', 0.1, 20.0, ro=True, about='Rate of the status message.')
+    rate: float = setting(2.0, 'Hz', 0.1, 20.0, read_only=True,
+                          about='Rate of the status message.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:
-    base: str = setting('base_link', ro=True, frame=True,
+    base: str = setting('base_link', read_only=True, frame=True,
                         about='Vehicle frame in the result files.')
-    imu: str = setting('', ro=True, frame=True,
+    imu: str = setting('', read_only=True, frame=True,
                        about='IMU frame; empty: frame of the IMU messages.')
-    local: str = setting('odocal_enu', ro=True, frame=True, about='Frame of the published paths.')
+    local: str = setting('odocal_enu', read_only=True, frame=True, about=(
+        'Frame of the published paths.'))
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpdaterConfig:
-    period: float = setting(1.0, 's', 0.1, 60.0, ro=True, about='Period of /diagnostics.')
-    use_fqn: bool = setting(False, ro=True, about='Use the full node name in /diagnostics.')
+    period: float = setting(1.0, 's', 0.1, 60.0, read_only=True, about='Period of /diagnostics.')
+    use_fqn: bool = setting(False, read_only=True, about='Use the full node name in /diagnostics.')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ class Setting:
     high: float | None = None
     about: str = ''
     choices: Sequence[str] = ()
-    ro: bool = False          # read-only after start-up
+    read_only: bool = False          # read-only after start-up
     frame: bool = False       # the value is the name of a coordinate frame
     item: type = float        # type of the values of a list
     any_length: bool = False        # a list of any length
