@@ -19,7 +19,7 @@ import numpy as np
 
 BEFORE_S, AFTER_S = 15.0, 3.0      # s, sent before the start mark and after the stop mark
 BLOCK_S = 10.0                     # s of the drive sent at once
-MOST_AHEAD_S = 20.0                # s of the drive that the node has not taken yet, each topic
+MAX_AHEAD_S = 20.0                # s of the drive that the node has not taken yet, each topic
 SHOWN = {'fix': 'gnss'}            # names of inputs in the diagnostics
 GOAL_S, LONGEST_S = 5.0, 3600.0    # s, of the answer; of the final result, given up then
 
@@ -60,7 +60,7 @@ class Sender:
         for _, slot, raw in sorted(rows, key=lambda row: row[0]):
             self._player.publishers[slot].publish(raw)
             self._sent[slot] += 1
-        wait_for(lambda: max(map(self._ahead_s, self._sent)) < MOST_AHEAD_S, 'what was sent',
+        wait_for(lambda: max(map(self._ahead_s, self._sent)) < MAX_AHEAD_S, 'what was sent',
                  LONGEST_S)
 
     def _ahead_s(self, slot: str) -> float:

@@ -32,13 +32,13 @@ from harness import parsed
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 DRIVE_S, START_S, TICK_S, SIGMAS = 260.0, 20.0, 0.2, 5.0
-MOST_AHEAD = 50     # messages of a topic that the node may be behind
+MAX_AHEAD = 50     # messages of a topic that the node may be behind
 LONGEST_S = 300.0   # an answer
 DRIVES = 10          # of one vehicle, each with noise of its own
 PARKED = 20.0       # times as fast does time go by while nothing is sent
 GROWTH = {'rss_mib': 0.05, 'threads': 0.0, 'descriptors': 0.0, 'odometry_mib': 0.05,
           'odometry_descriptors': 0.0, 'call_ms': 0.5}      # of the earlier
-LEAST = {'call_ms': 20.0}       # ms: less is not looked at, on a machine with others on it
+MIN_GROWN = {'call_ms': 20.0}       # ms: less is not looked at, on a machine with others on it
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class Day:
                 raw = (one.raw[:4] + struct.pack('<iI', *divmod(stamp_ns, 10**9)) + one.raw[12:])
                 self._player.publishers[one.slot].publish(raw)
                 self._sent_imu += one.slot == 'imu'
-                if one.slot == 'imu' and self._sent_imu % MOST_AHEAD == 0:
-                    self._let_it_hear(MOST_AHEAD)
+                if one.slot == 'imu' and self._sent_imu % MAX_AHEAD == 0:
+                    self._let_it_hear(MAX_AHEAD)
         self._let_it_hear(0)
 
     def _let_it_hear(self, ahead: int) -> None:
@@ -190,7 +190,7 @@ def grown(looks: list[Look]) -> list[str]:
         usual = min if most == 0.0 else statistics.median
         before, after = (usual(getattr(one, name) for one in part)
                          for part in (looks[quarter:2 * quarter], looks[-quarter:]))
-        grew = after > max(before * (1 + most), LEAST.get(name, 0.0))
+        grew = after > max(before * (1 + most), MIN_GROWN.get(name, 0.0))
         print(f'{name}: {before:.4g} in legs {quarter + 1} to {2 * quarter}, {after:.4g} in the '
               f'last {quarter}{": GROWN" if grew else ""}')
         found += [name] * grew

@@ -11,7 +11,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.settings.node_configs import PatternConfig
 
 HALF_TURN = 3.0       # rad. Judgement: from here the robot may turn to either side
-LEAST_SIDE = 0.5      # m of the pattern. Judgement: below, a robot of 0.3 m turns more than drives
+MIN_SIDE = 0.5      # m of the pattern. Judgement: below, a robot of 0.3 m turns more than drives
 Point = tuple[float, float]
 Rectangle = tuple[float, float, float, float]      # x and y, least and largest
 # m within which an error of the path is corrected. Judgement: at 0.5 m/s with commands that are
@@ -67,9 +67,9 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
     left, low, right, high = rectangle_of(config)
     inner = left + config.margin, low + config.margin, right - config.margin, high - config.margin
     side = min(inner[2] - inner[0], inner[3] - inner[1])
-    if side < LEAST_SIDE:
+    if side < MIN_SIDE:
         raise BadConfig(f'rectangle: the pattern has {max(side, 0):.2f} m, required: '
-                        f'{LEAST_SIDE:g} m; enlarge the rectangle or lower margin')
+                        f'{MIN_SIDE:g} m; enlarge the rectangle or lower margin')
     pattern_pieces = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight}[
         config.pattern](inner)
     first = (pattern_pieces[0].x, pattern_pieces[0].y)

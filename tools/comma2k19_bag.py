@@ -28,7 +28,7 @@ FLU = np.array([1.0, -1.0, -1.0])                          # forward-right-down 
 K0 = 0.01                # m, of a pulse derived from the speed
 WHEELS = ('front_left', 'front_right', 'rear_left', 'rear_right')
 PIECES = 12              # sections whose scatter gives the sigma of the scale
-LEAST_SIGMA = 6e-4       # of the scale: pose and fixes differ by half of it in Example_1
+MIN_SIGMA = 6e-4       # of the scale: pose and fixes differ by half of it in Example_1
 TRUTH = """\
 bag: bag
 imu_topic: /imu/data
@@ -150,7 +150,7 @@ def scale_by_pose(segment, clock):
         raise BadUsage(f'{segment}: a pose or a speed is not a number, or the car does not move')
     scale = pose.sum() / said.sum()
     off = np.sqrt(((pose - scale * said)**2).sum() * PIECES / (PIECES - 1)) / said.sum()
-    return scale, max(off, LEAST_SIGMA)
+    return scale, max(off, MIN_SIGMA)
 
 
 def way_of(t, speed):

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.strapdown import EVEN_RATIO, LEAST_INTERVAL
+from odocal_ros.nav.strapdown import EVEN_RATIO, MIN_INTERVAL
 
 SMALL = 1e-8      # rad; definition: half angle that is equal to its sine in double precision
 Vector = tuple[float, float, float]
@@ -87,8 +87,8 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
     middle = [(a + b) * 0.5 for a, b in zip(first, second, strict=True)]      # rate at h / 2
     angle = [m * h for m in middle]
     if 0 < k < len(t) - 2:
-        before, between = max(t[k] - t[k - 1], LEAST_INTERVAL), max(h, LEAST_INTERVAL)
-        after = max(t[k + 2] - t[k + 1], LEAST_INTERVAL)
+        before, between = max(t[k] - t[k - 1], MIN_INTERVAL), max(h, MIN_INTERVAL)
+        after = max(t[k + 2] - t[k + 1], MIN_INTERVAL)
         if (max(before, after) < EVEN_RATIO * between
                 and between < EVEN_RATIO * min(before, after)):
             weight = between * between / 4 / (before + between + after)

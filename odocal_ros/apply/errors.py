@@ -45,7 +45,7 @@ EARTH_TILT_WALK = 6e-4
 # angle^2 / 2 of a normal angle; m per m, its limit, reached if the direction is unknown
 SHORTENING, LARGEST_SHORTENING = 3**0.5 / 2, 2.0
 GRAVITY = 9.81    # m/s^2; physical: more digits have no effect on the tilt
-MOST_ACCELERATION = 5.0    # m/s^2; physical: half of g, largest mean over 1 s or 2 s
+MAX_ACCELERATION = 5.0    # m/s^2; physical: half of g, largest mean over 1 s or 2 s
 
 
 class Errors:
@@ -144,7 +144,7 @@ class Errors:
         DRIVING_FORCE as sigma. Returns None, without a correction, if it exceeds this limit too,
         or if the upward part is not gravity.
         """
-        if abs(residual_n[2]) > MOST_ACCELERATION:      # unit g, no gravity, or upside down
+        if abs(residual_n[2]) > MAX_ACCELERATION:      # unit g, no gravity, or upside down
             return None
         H = np.zeros((2, N))
         H[0, 4], H[1, 3] = -GRAVITY, GRAVITY

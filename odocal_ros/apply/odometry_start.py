@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.apply.errors import Errors, GRAVITY, MOST_ACCELERATION
+from odocal_ros.apply.errors import Errors, GRAVITY, MAX_ACCELERATION
 from odocal_ros.apply.stream import IMU_GAP_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
@@ -20,11 +20,11 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import level_frame, level_to_n_rotation
 from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
+from odocal_ros.nav.standstill import MAX_BIAS, REST_TURN
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.settings.nominal import Grade
 
-MOST_TILT_RATE = 0.5       # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
+MAX_TILT_RATE = 0.5       # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
 START_SPAN = 2.0           # s; judgement: duration of the samples of a start
 CONFIGURED_TILT_SIGMA = 0.01    # rad; judgement: tilt of a configured attitude
 ROAD_TILT_SIGMA = 0.1      # rad; physical: a road slope of 10 %
@@ -61,10 +61,10 @@ def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyCo
         imu.drop(row + int(gaps[-1]) + 1)      # start from the rows after the gap
         return None
     is_resting = wheels.are_still(t[0], t[-1]) and bool(
-        (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
+        (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MAX_BIAS).all())
     w_mean, up = w.mean(axis=0), f.mean(axis=0) / np.linalg.norm(f.mean(axis=0))
     tilt_rate_b = w_mean - up * (w_mean @ up)      # NaN without force: not tested
-    if not is_resting and np.linalg.norm(tilt_rate_b) > MOST_TILT_RATE:
+    if not is_resting and np.linalg.norm(tilt_rate_b) > MAX_TILT_RATE:
         imu.drop(end)       # implausible gyro data: start later
         return None
     return _start_by_gravity(end, float(t[-1] - t[0]), w, f, is_resting, vehicle, grade)
@@ -85,7 +85,7 @@ def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting:
                       vehicle: Vehicle, grade: Grade) -> Start:
     """Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated."""
     mean = f.mean(axis=0)
-    has_gravity = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_ACCELERATION)    # False for NaN
+    has_gravity = bool(abs(np.linalg.norm(mean) - GRAVITY) < MAX_ACCELERATION)    # False for NaN
     C_Lb = level_frame(mean) if has_gravity else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
     C_nb = level_to_n_rotation(-np.arctan2(forward[1], forward[0])) @ C_Lb

@@ -46,7 +46,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, FORCE_GAP = 1.0, 0.2, 10.0, 0.1
 # judgement: number of consecutive mismatches of force and motion after which the attitude is
 # invalid, if the size of the force differs from gravity by less than this, m/s^2
-MOST_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
+MAX_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
 ROWS_BEHIND = 200         # judgement: IMU rows, older ones are dropped
 # judgement: relative change of the interval of poses: their covariances are computed again
 PERIOD_CHANGE = 0.1
@@ -252,7 +252,7 @@ class Reckoning:
         self.errors.add_travel(min(float(np.linalg.norm(residual_n[:2])) * T**2 / 2,
                                    float(np.linalg.norm(velocity - self._v_corrected)) * T))
         length = float(np.linalg.norm(self._dv_n)) / T
-        if self._mismatch_count >= MOST_MISMATCHES and abs(length - GRAVITY) < GRAVITY_TOLERANCE:
+        if self._mismatch_count >= MAX_MISMATCHES and abs(length - GRAVITY) < GRAVITY_TOLERANCE:
             self.failed = f'specific force and attitude disagree for {self._mismatch_count} s'
 
     def _correct(self, correction: Floats) -> None:

@@ -12,8 +12,8 @@ from bisect import bisect_left
 from collections import deque
 import math
 
-from odocal_ros.screening.even_imu_times import LEAST_STEP
-from odocal_ros.screening.late_rows import LEAST_JITTER
+from odocal_ros.screening.even_imu_times import MIN_STEP
+from odocal_ros.screening.late_rows import MIN_JITTER
 
 # judgement: rows before the line is used; rows that it is fitted to, a quartz is stable for longer
 FIRST_ROWS, LINE_ROWS = 20, 1000
@@ -30,7 +30,7 @@ LATE_INTERVALS = 0.5       # judgement: a row later than this, in intervals, may
 # to be lost; rows after which this is no longer tested
 LATE_REST_ROWS, TESTED_LOST_ROWS = 25, 100
 LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
-MOST_LOST = 5              # judgement: largest gap, in intervals, over which the line continues
+MAX_LOST_INTERVALS = 5     # judgement: largest gap, in intervals, over which the line continues
 
 
 class RowTimes:
@@ -83,7 +83,7 @@ class RowTimes:
         if len(self._rows) == 3:
             self._compare_roughness(quantum)
         row_time = self._rows[-1][1] if self._in_use() else t
-        self._t = max(row_time, self._t + LEAST_STEP, math.nextafter(self._t, math.inf))
+        self._t = max(row_time, self._t + MIN_STEP, math.nextafter(self._t, math.inf))
         return self._t
 
     @property
@@ -99,7 +99,7 @@ class RowTimes:
         return DELAY_SIGMA * self._mean_delay / (self._row - self._hull[0][0]) / self._interval
 
     def _in_use(self) -> bool:
-        return (self._line_is_smoother and self._mean_delay > LEAST_JITTER
+        return (self._line_is_smoother and self._mean_delay > MIN_JITTER
                 and self._count > FIRST_ROWS)
 
     def _advance_line(self, t: float, step: float, expected: float) -> None:
@@ -113,7 +113,7 @@ class RowTimes:
         intervals = 1
         if expected and lateness > LATE_INTERVALS * self._interval and self._count > FIRST_ROWS:
             intervals = max(1, round(step / expected))
-        if intervals > MOST_LOST:
+        if intervals > MAX_LOST_INTERVALS:
             self._restart()
         self._last_step = step / intervals
         intervals += self._lost_at_rest(t, lateness, expected > 0)
@@ -179,7 +179,7 @@ class RowTimes:
         for k, (a, b, c) in enumerate(((t0, t1, t2), (p0, p1, p2))):
             linear = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
             self._roughness[k] += ((s1 - linear)**2 - self._roughness[k]) * share
-        speed = (s2 - s0) / max(p2 - p0, LEAST_STEP)
+        speed = (s2 - s0) / max(p2 - p0, MIN_STEP)
         self._square_speed += (speed**2 - self._square_speed) * share
         self._rounding_variance += (quantum**2 / 12 - self._rounding_variance) * share
         limit = ROUGHNESS_LIMIT if self._line_is_smoother else ROUGHNESS_REUSE_LIMIT
@@ -188,6 +188,6 @@ class RowTimes:
             self._roughness[1] <= limit**2 * self._roughness[0])
         # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
         variance = max(self._roughness[self._in_use()] / 1.5 - self._rounding_variance, 0.0)
-        self.error_s = math.sqrt(variance / max(self._square_speed, LEAST_STEP))
+        self.error_s = math.sqrt(variance / max(self._square_speed, MIN_STEP))
         if not is_known:       # times of arrival may be correct
             self.error_s = max(self.error_s, DELAY_SIGMA * self._mean_delay)

@@ -14,7 +14,7 @@ CLOCK_SET_ROWS = 10    # judgement: consecutive rows beyond STAMP_LIMIT_NS, then
 LAG_ROWS = 1000        # judgement: accepted rows over which the least lag increases again
 # judgement: consecutive rows of a clock step; of a permanent one
 STEP_ROWS, PERMANENT_ROWS = 3, 50
-LEAST_STEP_S = 0.03    # s, judgement: smaller shifts of the lag are no clock step
+MIN_STEP_S = 0.03    # s, judgement: smaller shifts of the lag are no clock step
 LAG_CHANGE_NS = 1e4    # ns per row, judgement: largest change of the median lag
 FAST_PLAY = 1.5        # judgement: least speed of a bag played faster, relative to real time
 REAL_TIME_TOLERANCE = 0.05    # judgement: relative; at other speeds of a bag, no clock steps
@@ -44,15 +44,15 @@ class StampScreen:
         self._lags: deque[int] = deque(maxlen=PERMANENT_ROWS)
 
     def clock_step_s(self, rows: int) -> float:
-        """Return the shift of the lag of the last rows, s; 0 if any is within LEAST_STEP_S."""
+        """Return the shift of the lag of the last rows, s; 0 if any is within MIN_STEP_S."""
         if len(self._lags) < rows or not self._real_time or (
-                abs(self._lags[-1] - self._median_lag_ns) * 1e-9 <= LEAST_STEP_S):
+                abs(self._lags[-1] - self._median_lag_ns) * 1e-9 <= MIN_STEP_S):
             return 0.0
         last = list(self._lags)[-rows:]
         smallest_shift = max(min(last) - self._median_lag_ns,
                              self._median_lag_ns - max(last)) * 1e-9
         shift = abs(sum(last) / rows - self._median_lag_ns) * 1e-9
-        return shift if smallest_shift > LEAST_STEP_S else 0.0
+        return shift if smallest_shift > MIN_STEP_S else 0.0
 
     def select_usable(self, rows: Sequence[Reading]) -> list[Reading]:
         """Return the rows of the next block with a usable stamp."""

@@ -25,7 +25,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 INTERVAL_ROWS = 64      # judgement: rows of the median interval
 IMU_GAP_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
 # physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
-MOST_TURN, MOST_FORCE = 70.0, 2000.0      # rad/s, m/s^2
+MAX_TURN, MAX_FORCE = 70.0, 2000.0      # rad/s, m/s^2
 USUAL_ROWS = 50           # judgement: rows of the mean step
 FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are frozen
 TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
@@ -56,7 +56,7 @@ Pair = tuple[float, float]
 
 def is_possible(w_b: Vector, f_b: Vector) -> bool:
     """Return True if turn rate, rad/s, and force, m/s^2 or NO_FORCE, are in a sensor's range."""
-    return _within(w_b, MOST_TURN) and (f_b is NO_FORCE or _within(f_b, MOST_FORCE))
+    return _within(w_b, MAX_TURN) and (f_b is NO_FORCE or _within(f_b, MAX_FORCE))
 
 
 def _within(a: Vector, limit: float) -> bool:

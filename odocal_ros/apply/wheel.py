@@ -19,7 +19,7 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
 # judgement: averaging time of the speed, s, least and largest; number of counts in this time
-LEAST_SPEED_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
+MIN_SPEED_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
 # m/s^2; physical: half of g, hard braking; largest acceleration of a wheel that locks or spins
 SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: longest burst of stamps, s; largest deviation of a row, in mean jitters of the stamps;
@@ -33,10 +33,10 @@ LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
 HUNG_JITTERS = 2.0
 # judgement: rows before the first test; number of consecutive rows that are refused, and their
 # least duration, s, before one is accepted
-TESTED_FROM_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
+TESTED_FROM_ROWS, MAX_REFUSED, REFUSED_TIME = 5, 2, 0.5
 UNEXPLAINED_TIME = 1.0    # s; judgement: later, acceleration may explain a step of the speed
 KEPT_TIME = 60.0    # s; judgement: older rows are dropped, also without IMU messages
-LEAST_BEND = 1e-3    # m; judgement: smaller errors of travel between two speeds are below slip
+MIN_TRAVEL_ERROR = 1e-3   # m; judgement: smaller ones between two speeds are below slip
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, median intervals; judgement: least gap
 
 
@@ -184,7 +184,7 @@ class Wheel:
             return False
         self._refused += 1
         self._refused_since = t if self._refused == 1 else self._refused_since
-        return not possible or self._refused <= MOST_REFUSED or (
+        return not possible or self._refused <= MAX_REFUSED or (
             t - self._refused_since < REFUSED_TIME)
 
     def _step_limit(self, dt: float) -> float:
@@ -207,7 +207,7 @@ class Wheel:
         """Return the averaging time of the speed, s; longer for coarse counts."""
         counts = SPEED_COUNTS * self.quantum
         coarse = counts / max(abs(self.speed), counts) if counts else 0.0
-        return min(SPEED_TIME, LEAST_SPEED_TIME + coarse)
+        return min(SPEED_TIME, MIN_SPEED_TIME + coarse)
 
     def _update_speed(self, dt: float, step: float, row_speed: float, deviation: float) -> None:
         """Update the speed by an accepted row; add variance after a step of the speed."""
@@ -250,7 +250,7 @@ class Wheel:
         """Add the variance of travel by a new acceleration; change : m/s, in the last dt s."""
         # the speed bends in the middle of the rows
         hidden, self._change = abs(change - self._change) * dt / 4, change
-        if hidden > LEAST_BEND:
+        if hidden > MIN_TRAVEL_ERROR:
             self._add_variance(hidden**2)
 
     def _add_refused_variance(self) -> None:

@@ -28,10 +28,10 @@ SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, Sequence[Reading], OdometerForm]
 # judgement: least and largest number of rows of the regression, one per second; s, correlation of
 # residuals
-LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
+MIN_DELAY_ROWS, MAX_DELAY_ROWS, LAGS = 60, 300, 4
 # judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
 # up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
-LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
+MIN_DELAY, DELAY_SIGMAS = 0.04, 4.0
 # judgement: ratio of the change of acceleration within a second to the central difference over
 # two, in simulated town drives
 CHANGE_RATIO = 1.2
@@ -142,7 +142,7 @@ class DelaySearch:
         # changes of speed in each of the last three seconds, m/s, by odometer and by force
         self._recent_changes: deque[tuple[float, float]] = deque(maxlen=3)
         # rows of the regression: change of acceleration, difference of the changes of speed
-        self._rows: deque[tuple[float, float]] = deque(maxlen=MOST_DELAY_ROWS)
+        self._rows: deque[tuple[float, float]] = deque(maxlen=MAX_DELAY_ROWS)
 
     def add(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
         """
@@ -162,7 +162,7 @@ class DelaySearch:
         self._rows.append(((after - before) / 2, by_force - by_odometer))
         delay, sigma = self._delay()
         delay += self._speed_delay_s
-        if abs(delay) < max(LEAST_DELAY, DELAY_SIGMAS * sigma, self._reported_s):
+        if abs(delay) < max(MIN_DELAY, DELAY_SIGMAS * sigma, self._reported_s):
             return False
         self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
                            f'{"late" if delay > 0 else "early"} relative to the odometer: add '
@@ -173,7 +173,7 @@ class DelaySearch:
 
     def _delay(self) -> tuple[float, float]:
         """Return the delay of the IMU, s, and its sigma, infinite while there are too few rows."""
-        if len(self._rows) < LEAST_DELAY_ROWS:
+        if len(self._rows) < MIN_DELAY_ROWS:
             return 0.0, np.inf
         x, y = np.array(self._rows).T
         X = np.stack([x, np.ones_like(x)], 1)

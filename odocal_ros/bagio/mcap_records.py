@@ -24,7 +24,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS 
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
 CHUNK_DAMAGED = 'a damaged chunk'
-MOST_TRUNCATED = 2**26    # judgement: bytes used of a chunk that the end of the file truncates
+MAX_TRUNCATED = 2**26    # judgement: bytes used of a chunk that the end of the file truncates
 # first fields of the records: opcode and size of each record; channel, sequence and times of a
 # message; times, size and checksum of a chunk; times, offset and size of a chunk in the index
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
@@ -58,7 +58,7 @@ def records_of(data: bytes | FileBytes, offset: int = 0) -> Iterator[tuple[int, 
         stop = offset + 9 + size
         complete = stop <= len(data)
         if op in USED and complete or op == CHUNK:      # also a truncated last chunk
-            end = stop if complete else min(stop, offset + 9 + MOST_TRUNCATED)
+            end = stop if complete else min(stop, offset + 9 + MAX_TRUNCATED)
             yield op, data[offset + 9:end], complete
         offset = stop
 

@@ -30,7 +30,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io.limits import Allowance, Damaged, is_file
 from odocal_ros.safe_io.text_formats import indented_list, one_line
 
-LEAST_LOSS = 0.5   # s, judgement: shorter losses are not reported
+MIN_LOSS = 0.5   # s, judgement: shorter losses are not reported
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ class Bag:
             seconds = (part.end_ns - part.start_ns) * 1e-9
             lost = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
             missing = ('without metadata.yaml the lost time is unknown' if end_ns is None else
-                       f'{lost:.1f} s at the end are missing' if lost > LEAST_LOSS else
+                       f'{lost:.1f} s at the end are missing' if lost > MIN_LOSS else
                        'the end is there, messages before it are missing')
             reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                   f'{seconds:.1f} s were read; {missing}'))
         lost = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
-        if not reasons and lost > LEAST_LOSS:
+        if not reasons and lost > MIN_LOSS:
             reasons.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
                                   'listed in metadata.yaml, are missing'))
         return reasons

@@ -18,7 +18,7 @@ from odocal_ros.settings.levels import FASTEST
 # limits of a slide of locked wheels; more motion without counts is a fault of the odometer
 SLIDE_DISTANCE = 100.0      # m: physical
 SLIDE_TIME = 20.0           # s: physical; after a longer time, GNSS_MOVES is the limit
-LEAST_SHARE = 0.01          # judgement: share of the path without counts that is reported
+MIN_UNCOUNTED_SHARE = 0.01   # judgement: share of the path without counts that is reported
 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -132,7 +132,7 @@ def _stopped_counter_reasons(travel: Travel, t: Floats, fixes: Floats,
     """Return a reason if the fixes, (k, 2) at (k,) s, move far without counts."""
     distance, begin, end = max(_motion_without_counts(travel, t, fixes, fix_sigma),
                                default=(0.0, 0.0, 0.0))
-    if not distance or distance < LEAST_SHARE * path_and_chord(t, fixes)[0]:
+    if not distance or distance < MIN_UNCOUNTED_SHARE * path_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {distance:.0f} m from t = {begin:.0f} '
                    f's to {end:.0f} s, but the odometer does not count'),)

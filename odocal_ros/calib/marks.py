@@ -26,7 +26,7 @@ Path = Callable[[Floats], Floats]
 MARK_WINDOW = 1.0
 # fewest fixes whose scatter is used for the correlation of their errors. Statistical: a variance
 # by 20 has a sigma of 30 %
-FEWEST_SCATTERED = 20
+MIN_SCATTERED_FIXES = 20
 # s, window in which white errors average down and slow ones do not. Physical: slow errors of
 # receivers last a minute and more
 SLOW_WINDOW = 20.0
@@ -84,7 +84,7 @@ def _variance_share(t: Floats, residual: Floats, of_one: Floats, weight: Floats,
         return white
     if not np.isnan(correlation_time):
         return _mean_variance_share(t, weight, correlation_time)
-    if n < FEWEST_SCATTERED:
+    if n < MIN_SCATTERED_FIXES:
         return 1.0
     sigma = np.sqrt(np.diag(of_one))
     z = residual[:, :2] / sigma[:2]

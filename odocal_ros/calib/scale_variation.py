@@ -28,15 +28,15 @@ BLOCK_LAGS = (1, 3)
 # judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 CORRELATIONS = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one side may differ
-MOST_DECODING = 20.0    # judgement: largest factor between units, gears or decodings of a counter
+MAX_DECODING = 20.0    # judgement: largest factor between units, gears or decodings of a counter
 WINDOWS = 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0     # s, definition
 # judgement: parts of the leg for a sigma; windows for a result
-LEG_PARTS, FEWEST_WINDOWS = 8, 12
+LEG_PARTS, MIN_WINDOWS = 8, 12
 # judgement: s, longest cell, in which the speed hardly varies, and shortest; intended number
 LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
 SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
-FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
-LEAST_SPREAD = 0.1    # judgement: of speeds over their mean; below it no offset is separable
+MIN_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
+MIN_SPREAD = 0.1    # judgement: of speeds over their mean; below it no offset is separable
 NO_ROWS = np.empty((0, 4))    # definition: no bins, or no windows
 
 
@@ -168,7 +168,7 @@ def counter_change_reasons(parts: Sections, t_fix: Floats,
     _, k, factor = min(candidates)
     begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
-    if not 1 / MOST_DECODING < factor < MOST_DECODING:
+    if not 1 / MAX_DECODING < factor < MAX_DECODING:
         return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
                        'per metre between fixes than before. Likely cause: the position or the '
                        'counter is frozen', 'Check the receiver (static hold) and the counter. '
@@ -203,7 +203,7 @@ def _window_ratio(t: Floats, fix: Floats, dead: Floats,
     chord = dead[j] - dead[i]
     size = np.hypot(*chord.T)
     i, j, chord, size = (x[size > 0] for x in (i, j, chord, size))
-    if len(i) < FEWEST_WINDOWS:
+    if len(i) < MIN_WINDOWS:
         return None
     excess = (chord * (fix[j] - fix[i] - chord)).sum(axis=1) / size     # of the fixes' chord, m
     limit = 4 * max(robust_sigma(excess), 1e-9)       # statistical: one in 16,000
@@ -242,7 +242,7 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     by dead reckoning, m.   distance : (k,) path length by dead reckoning, m; over the chord by
     ``dead_n`` it converts chords to path lengths.   travel : of the uncorrected odometer.
     """
-    if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
+    if len(t_fix) < MIN_CELLS or len(travel.t) < MIN_CELLS:
         return SpeedScale(NO_ROWS)
     cell = min(LONGEST_CELL, max(SHORTEST_CELL, (t_fix[-1] - t_fix[0]) / WANTED_CELLS))
     # arange may reach beyond its end by rounding: [:-1] then gives the last fix
@@ -259,7 +259,7 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     good = (2 * cell > duration) & straight & (rolled != 0) & same_direction
     top_speed = float(np.percentile(path / duration, 90))      # robust to outliers
     good &= path / duration > SLOWEST_CELL * top_speed
-    if good.sum() < FEWEST_CELLS:
+    if good.sum() < MIN_CELLS:
         return SpeedScale(NO_ROWS)
     length = chord[good] * path[good] / dead[good]
     rolled, change, duration = np.abs(rolled[good]), np.diff(np.abs(speed))[good], duration[good]
@@ -279,7 +279,7 @@ def _fit_cells(length: Floats, rolled: Floats, duration: Floats, change: Floats
         sigma = robust_sigma(residual[used])
         used = np.asarray(residual <= 4 * max(sigma, 1e-6))     # statistical: one in 16,000
     spread = float(np.std(mean_speed[used]) / np.mean(mean_speed[used]))
-    if used.sum() < FEWEST_CELLS or spread < LEAST_SPREAD:
+    if used.sum() < MIN_CELLS or spread < MIN_SPREAD:
         return (), used
     variance = float(np.sum((length - X @ x)[used]**2)) / max(int(used.sum()) - 3, 1)
     root = np.sqrt(np.diag(np.linalg.pinv(X[used].T @ X[used])) * variance)

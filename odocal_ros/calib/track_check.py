@@ -29,7 +29,7 @@ from odocal_ros.settings.levels import FAULT_SIGMAS, OUTLIER_SIGMAS, REMARK_SIGM
 ONE_MOTION_RATIO = 0.6, 1.6
 # smallest factor applied to stated fix sigmas. Statistical: by the median of 30 fixes, chance
 # alone gives 1.25 instead of 1 once in 30 legs
-LEAST_NOISE_FACTOR = 1.25
+MIN_NOISE_FACTOR = 1.25
 PIECE_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
 PIECE_STARTS = 10     # definition: number of starts of pieces within the length of one, as there
 # rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
@@ -65,7 +65,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     residual : (n, 3) corrected track minus fixes, m; NaN up where no height is known.
     covariance_n : (n, 3, 3) stated, m^2.   drift : possible track error by gyro drift, m, whose
     square is subtracted. The rest may include other track errors, so the factors tend to be too
-    large; below LEAST_NOISE_FACTOR they are 1.   marks : the two that the track is pinned to.
+    large; below MIN_NOISE_FACTOR they are 1.   marks : the two that the track is pinned to.
     Their errors act in proportion to the path, on average a third of each variance; the factor
     applies to them as well.
     """
@@ -79,7 +79,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     stated_variance = np.array([stated_horizontal, stated_horizontal, stated[2]])
     factors = np.sqrt(np.maximum(np.nan_to_num(observed_variance), 0.0)
                       / np.maximum(stated_variance, 1e-12))
-    return np.where(factors > LEAST_NOISE_FACTOR, factors, 1.0)
+    return np.where(factors > MIN_NOISE_FACTOR, factors, 1.0)
 
 
 def _distance_limit(sigma: float, distance: float) -> float:

@@ -36,7 +36,7 @@ PITCH_PRIOR = 0.05
 # rad: a pitch above 15 deg is due to wrong heights, not to a mounting. Physical, judgement
 PITCH_LIMIT = 0.26
 # judgement: of the path length; on a shorter chord the errors of its ends dominate
-LEAST_CHORD_SHARE = 0.2
+MIN_CHORD_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def refusal_reasons(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     # the length of the track's own chord, independent of yaw: M is a rotation times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
-        if chord_length <= LEAST_CHORD_SHARE * path:
+        if chord_length <= MIN_CHORD_SHARE * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
                            f'{chord_length:.1f} m, less than a fifth of the path length of about '
                            f'{path:.0f} m'),)

@@ -25,7 +25,7 @@ WHOLE_DRIVE_SIGMAS = 6.0
 BIAS_REST = 5.0
 # rad/s: a faster turn at rest is that of a ferry or a turntable. Physical: consumer IMUs drift by
 # 0.5 to 1.3 deg/s
-MOST_DRIFT = np.deg2rad(2.0)
+MAX_DRIFT = np.deg2rad(2.0)
 # judgement: steps of 0.1 s over which speed and turn rate are averaged; also a cell of the fit
 MEAN_STEPS = 10
 
@@ -40,7 +40,7 @@ def without_gyro_drift(pair: WheelPair) -> WheelPair:
         return pair
     a, b = np.transpose(rests)
     rate = (pair.turn[b] - pair.turn[a]) / (pair.t[b] - pair.t[a])
-    is_bias = np.abs(rate - np.median(rate)) < MOST_DRIFT
+    is_bias = np.abs(rate - np.median(rate)) < MAX_DRIFT
     bias = np.interp(pair.t[:-1], ((pair.t[a] + pair.t[b]) / 2)[is_bias], rate[is_bias])
     return replace(pair, turn=pair.turn - running_sum(bias * pair.step))
 

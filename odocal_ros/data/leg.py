@@ -25,7 +25,7 @@ from odocal_ros.data.samples import (
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
-MOST_DAYS = 7          # judgement: of a leg
+MAX_DAYS = 7          # judgement: of a leg
 # slot -> function that returns no rows
 NO_ROWS: dict[str, Callable[[], Samples]] = {
     'imu_other': OtherImuSamples.none,
@@ -128,10 +128,10 @@ class LegRecorder:
         Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
         interpolated at the mark; later ones are not, independent of the time of closing.
 
-        Raises BadData: the marks are more than MOST_DAYS apart, too long for a computation.
+        Raises BadData: the marks are more than MAX_DAYS apart, too long for a computation.
         """
         days = (stop_ns - start_ns) / 86400e9
-        if days > MOST_DAYS:
+        if days > MAX_DAYS:
             raise BadData(f'the leg lasts {days:.0f} days according to its stamps: a clock was '
                           'set during recording, or the stamps are damaged; mark a section with '
                           '--leg A:B')

@@ -18,7 +18,7 @@ from odocal_ros.errors import BadUsage, OdocalError
 
 REQUIRED_PACKAGES = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 MEMORY = 2 * 2**30       # judgement: bytes for a task, by default
-FEWEST_TASKS = 50        # judgement: least number submitted: workers may be starting
+MIN_TASKS = 50        # judgement: least number submitted: workers may be starting
 CONNECTION_LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the '
                    'command: finished bags are kept')
 
@@ -122,6 +122,6 @@ def _batch_size(client: Any) -> int:
     """Return the number of tasks to submit at a time."""
     try:
         per_worker = 2
-        return max(FEWEST_TASKS, per_worker * int(sum(client.nthreads().values())))
+        return max(MIN_TASKS, per_worker * int(sum(client.nthreads().values())))
     except OSError:
         raise OdocalError(CONNECTION_LOST) from None

@@ -27,7 +27,7 @@ from odocal_ros.safe_io.atomic_files import locked, write_text
 
 KPI = 'kpi.json'
 SIGMA_PER_MEDIAN = 1.4826        # statistical: sigma over the median of absolute errors
-FEWEST_LEGS = 3                  # judgement: legs of a reference; a tested leg is one of them
+MIN_LEGS = 3                  # judgement: legs of a reference; a tested leg is one of them
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
 # rates of a row; recall and false reject refer to good vehicles, false accept to bad ones
 SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
@@ -67,7 +67,7 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
     for row in vehicles:
         vehicle_legs = legs_since_change.get(row['vehicle'], [])
         decision = _decision(row | _sigmas_with_scatter(row, vehicle_legs, limits), limits)
-        if decision is Decision.UNDECIDED or len(vehicle_legs) < FEWEST_LEGS:
+        if decision is Decision.UNDECIDED or len(vehicle_legs) < MIN_LEGS:
             vehicle_counts['on_the_limit'] += 1
             continue
         good = decision is Decision.PASS
@@ -126,7 +126,7 @@ def _table_text(rates: dict[str, Any], output: Path) -> str:
     counts = rates['vehicles']
     lines = ['', f'legs tested against the limits: {counts["good"]} good vehicles, '
              f'{counts["bad"]} bad, {counts["on_the_limit"]} left out (undecided, or fewer than '
-             f'{FEWEST_LEGS} legs)',
+             f'{MIN_LEGS} legs)',
              table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)), WIDTHS)]
     for row in [*rates['by_minutes'], {'up_to': 'all'} | rates['all']]:
         label = 'longer' if row['up_to'] is None else row['up_to'] if row['up_to'] == 'all' \

@@ -19,14 +19,14 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.fleet import tables
-from odocal_ros.fleet.statistics import FEWEST_VEHICLES, Population, population
+from odocal_ros.fleet.statistics import MIN_VEHICLES, Population, population
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
 from odocal_ros.output.value_text import counted, MAIN_VALUES, with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
-MOST_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
+MAX_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
 TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
           'pitch_mounting_angle': 'Pitch mounting angle'}
 
@@ -58,7 +58,7 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
         median = np.median(x)
         deviation, error = ((x / median - 1) * 100, sigma / median * 100) if is_scale else (
             (x - median) * DEG, sigma * DEG)
-        keep = np.union1d(style.even_rows(len(x), MOST_POINTS // len(models)),
+        keep = np.union1d(style.even_rows(len(x), MAX_POINTS // len(models)),
                           np.flatnonzero(outlier))
         position = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
         for mask, colour in ((~outlier, style.BLUE), (outlier, style.RED)):
@@ -135,7 +135,7 @@ def _read_points(path: Path, known: set[str],
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
-        stride = max(1, file.metadata.num_rows // MOST_POINTS)
+        stride = max(1, file.metadata.num_rows // MAX_POINTS)
         points, k = [], 0
         for batch in file.iter_batches(columns=columns, batch_size=10_000, use_threads=False):
             for row in batch.to_pylist():
@@ -184,7 +184,7 @@ def _model_row(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, A
             continue
         values = population(*(np.array([row[key] for row in known], float)
                               for key in (name, f'{name}_sigma')))
-        has_few = len(known) < FEWEST_VEHICLES
+        has_few = len(known) < MIN_VEHICLES
         if name == 'scale_factor':
             cells += [f'{_mean_text(values, has_few)} {unit}',
                       '-' if has_few else f'{100 * values.spread / values.mean:.2f} %']

@@ -25,7 +25,7 @@ from odocal_ros.nav.time_series import NORMAL_MEDIAN
 Floats = NDArray[np.float64]
 # statistical: of a vehicle from the mean of its vehicle model; by chance 1 in 16,000
 MODEL_OUTLIER_SIGMAS = 4.0
-FEWEST_VEHICLES = 3            # judgement: for a spread
+MIN_VEHICLES = 3            # judgement: for a spread
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def population(values: Floats, sigmas: Floats) -> Population:
     """
     x, s = np.asarray(values, float), np.asarray(sigmas, float)
     mean, spread = float(np.median(x)), 0.0
-    if len(x) < FEWEST_VEHICLES:
+    if len(x) < MIN_VEHICLES:
         return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
     huber = 1.5    # sigmas from which a vehicle has less weight
     most_passes = 50

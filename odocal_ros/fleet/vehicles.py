@@ -35,7 +35,7 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import DAY_NS
 
-FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone may be a bad drive
+MIN_REJECTED_LEGS = 2           # judgement: last legs, all rejected; one alone may be a bad drive
 FAILED_REMEDY = 'See the column failures of vehicles.parquet for the reason of each bag.'
 
 
@@ -182,7 +182,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     calibration = combine([entry.leg for entry in current], config, imu=known_imu(config))
     rejected = driven[1 + max((k for k, entry in enumerate(driven)
                                if entry.leg.verdict is not Verdict.REJECTED), default=-1):]
-    if len(rejected) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
+    if len(rejected) >= MIN_REJECTED_LEGS and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(
             calibration, reasons=(rejected_state_reason(rejected), *calibration.reasons))
     row |= _current_state(calibration, config, driven, starts) | _changes(histories, driven) \

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.planar.fit import fit_at, LEAST_LEVEL, LEVELS, priors
+from odocal_ros.calib.planar.fit import fit_at, LEVELS, MIN_LEVEL, priors
 from odocal_ros.calib.planar.result import make_planar_result
 from odocal_ros.calib.planar.run import make_side_wheels, Run, wheel_rows, Wheels
 from odocal_ros.calib.result import MethodResult
@@ -231,7 +231,7 @@ def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
     levels = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
               'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,
               'white': 0.0 if robot.at_rests else 1.0, 'gyro': 1.0}
-    return {name: max(value, LEAST_LEVEL * LEVELS[name]) for name, value in levels.items()}
+    return {name: max(value, MIN_LEVEL * LEVELS[name]) for name, value in levels.items()}
 
 
 def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:

@@ -43,7 +43,7 @@ STOP_ACCELERATION, STOP_SPEED = 1.5, 5.0
 # physical: path length is proportional to sigma^-power, for white and for time-correlated errors
 # of the fixes
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
-MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
+MAX_STOPS = 50    # judgement: limit of a useful number of stops and starts
 # codes that disappear with more driving
 TEMPORARY_CODES = PROVISIONAL_CODES | {Code.ODOMETER_STILL}
 DRIVE_ON = 'drive straights, and turn on the spot in both directions'
@@ -138,7 +138,7 @@ def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
     if ratio > 1:
         of_one_stop = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
         stops = math.ceil(max(running.agility, of_one_stop / 2) * (ratio**2 - 1) / of_one_stop)
-        times = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
+        times = 'often' if stops > MAX_STOPS else f'{stops} time{"s" * (stops > 1)}'
         manoeuvre = f'for the yaw: stop and start {times}, or make as many turns'
     value = '' if e.value is None or e.sigma is None else format_value(
         math.degrees(e.value), math.degrees(e.sigma))

@@ -25,7 +25,7 @@ from odocal_ros.screening.late_rows import ON_TIME_WINDOW, sampling_times
 # judgement: a tenth of the time between keyframes; cells of a topic, 26 minutes of this width, so
 # that the time of an update is bounded
 FIRST_CELL_NS = 100_000_000
-MOST_CELLS = 16_000
+MAX_CELLS = 16_000
 SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: rows that much later have no effect
 RHYTHM_NS = 3 * SETTLED_NS       # judgement: rows that much earlier determine the rhythm
 UNROLLED = data.OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
@@ -70,7 +70,7 @@ class ThinnedLeg:
         cells = _cell_rows(data.take(rows, slice(None, first_open)), cell[:first_open], averaged)
         if slot in self._cells:
             cells = data.join([self._cells[slot], cells])
-        while len(cells.stamp_ns) > MOST_CELLS:
+        while len(cells.stamp_ns) > MAX_CELLS:
             width_ns *= 2
             cells = _cell_rows(cells, cells.stamp_ns // width_ns, averaged)
         self._cells[slot], self._width_ns[slot] = cells, width_ns
@@ -100,7 +100,7 @@ class ThinnedLeg:
     def fix_rate(self) -> float:
         """Return the fix rate by the median interval, Hz; NaN with too few fixes."""
         steps = np.concatenate([np.empty(0, np.int64), *self._fix_steps])
-        self._fix_steps = [steps[-MOST_CELLS:]]
+        self._fix_steps = [steps[-MAX_CELLS:]]
         rising = steps[steps > 0]
         return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
 

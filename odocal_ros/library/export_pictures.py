@@ -17,7 +17,7 @@ from odocal_ros.library.series import Series
 from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure
 from odocal_ros.output.program_files import features
 
-MOST_POINTS = 400     # judgement: of a line or of the fixes, for a small file
+MAX_POINTS = 400     # judgement: of a line or of the fixes, for a small file
 NOT_ON_A_MAP = ('the positions are in a local frame, which has no place on a map; use '
                 'trajectory.csv or trajectory.tum')
 # estimates of SpeedScale and their units in the names of columns
@@ -27,7 +27,7 @@ FIT_UNITS = {'factor': 'm_per_unit', 'offset': 'm_per_s', 'lag': 's'}
 def draw_map(result: Calibration, path: Path) -> None:
     """Write the features as a picture; BadUsage: the positions are in a local frame."""
     shapes = [feature for number, leg in enumerate(result.legs, 1)
-              for feature in features(number, leg, MOST_POINTS)]
+              for feature in features(number, leg, MAX_POINTS)]
     if not shapes:
         raise BadUsage(f'export: {path}: {NOT_ON_A_MAP}')
     with apply_style():

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from odocal_ros.library.read_bag import JournalNotes
 
 LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of this
-MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
+MAX_DRIVE_TIME = 36_000.0      # of a planned drive, judgement: ten hours
 
 
 def from_figures(speed: float, distance: float, standstill: float, turns: int,
@@ -48,9 +48,9 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     ramp, cruise = top / acceleration, max(0.0, distance / top - top / acceleration)
     duration = 2 * (standstill + ramp) + cruise
     most_metres = 1e6
-    if distance > most_metres or duration > MOST_SECONDS:
+    if distance > most_metres or duration > MAX_DRIVE_TIME:
         raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {duration / 3600:.1f} h; '
-                       f'the limits are {most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h')
+                       f'the limits are {most_metres / 1000:g} km and {MAX_DRIVE_TIME / 3600:g} h')
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
         raise BadUsage(f'--turns {turns}: the limit is {int(cruise / turn_time)}: a turn takes '
@@ -169,9 +169,9 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     slow = mean_speed < max(slow_speed, slow_share * np.median(mean_speed))
     begin = np.where(slow, t[b - 1], t[a])
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
-    if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
+    if len(grid) < 2 or t[-1] - t[0] > MAX_DRIVE_TIME:
         raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; required: above 0 s, '
-                       f'at most {MOST_SECONDS:g} s')
+                       f'at most {MAX_DRIVE_TIME:g} s')
     number = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)      # of the step
     moving = (grid >= begin[number]) & (grid <= t[b][number])
     speed = np.where(moving, (step_length / np.maximum(t[b] - begin, 1e-3))[number], 0.0)

@@ -17,10 +17,10 @@ from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import cautions, Reason, Verdict
 from odocal_ros.safe_io.text_formats import error_text
 
-MOST_REASONS = 3     # judgement: in an answer
+MAX_REASONS = 3     # judgement: in an answer
 KMH = 3.6    # definition: km/h per m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
-FEWEST_MARKS = 2         # judgement: marks from which the hint no longer asks for ~/mark
+MIN_MARKS = 2         # judgement: marks from which the hint no longer asks for ~/mark
 DRIVE = 'drive '
 DRIVE_ON = ('then drive on, with stops and left and right turns, until this hint shows OK for '
             'scale and yaw')
@@ -46,7 +46,7 @@ def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg
         text = (f'leg {leg_id}{sections}, {sum(part.distance for part in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
     sentences = [text, within_limits]
-    for reason in cautions(calibration.reasons)[:MOST_REASONS]:
+    for reason in cautions(calibration.reasons)[:MAX_REASONS]:
         sentences += [str(reason), reason.remedy]
     if advice and advice not in sentences:
         sentences.append(f'Next: {advice}')
@@ -166,7 +166,7 @@ def manoeuvres(view: SessionView) -> list[str]:
     if view.max_speed < min_speed:
         required.append(f'{DRIVE}faster than leg.min_speed, {min_speed:.3g} m/s '
                         f'({KMH * min_speed:.0f} km/h)')
-    if view.config.reference.points and len(view.session.marks_of_leg()) < FEWEST_MARKS:
+    if view.config.reference.points and len(view.session.marks_of_leg()) < MIN_MARKS:
         required.append('call ~/mark at rest on each point')
     if view.two_wheels and 'smoother' in deciding_methods(view.session.config.method):
         required += _wheel_manoeuvres(view)

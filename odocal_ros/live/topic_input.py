@@ -37,7 +37,7 @@ from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config
 
 # judgement: number of suggested topics; minimum similarity of names by difflib, 1 is equal
-MOST_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4
+MAX_SUGGESTIONS, NAME_SIMILARITY = 2, 0.4
 SEARCH_PERIOD_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: queue, one message per publisher of static transforms
@@ -125,7 +125,7 @@ class Input:
                  if usable & set(types) and name not in own_topics
                  and self._node.count_publishers(name)]
         # many types can be an odometer: only topics with similar names
-        return difflib.get_close_matches(self.topic, names, MOST_SUGGESTIONS,
+        return difflib.get_close_matches(self.topic, names, MAX_SUGGESTIONS,
                                          0.0 if self.allowed else NAME_SIMILARITY)
 
     def duplicate_publishers(self) -> str:

@@ -33,7 +33,7 @@ from odocal_ros.safe_io.text_formats import brief_line
 
 # of each level of a DiagnosticStatus: OK, WARN, ERROR, STALE
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
-MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
+MAX_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
 HINT_S = 0.1      # judgement: s in which the hint that is sent with a status arrives
 
 
@@ -160,6 +160,6 @@ class StatusListener:
                     status = self._status.status[0]
                     self._status, self._until = None, math.inf
                     yield (status.level, {brief_line(kv.key): brief_line(kv.value)
-                                          for kv in status.values[:MOST_VALUES]}, self._hint)
+                                          for kv in status.values[:MAX_VALUES]}, self._hint)
         except ExternalShutdownException:
             return

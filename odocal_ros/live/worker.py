@@ -35,7 +35,7 @@ from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
-MOST_POSES = 2000    # judgement: of a published path
+MAX_POSES = 2000    # judgement: of a published path
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
 # judgement: s that a stopping node waits for a job, and for files; launch terminates it after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
@@ -119,14 +119,14 @@ def leg_paths(result: LegResult | None, config: Config) -> Paths:
 
 
 def _path(track_n: Floats | None, header: Header) -> PathMessage:
-    """Return at most MOST_POSES positions of a track, (n, 3) m, as a message."""
+    """Return at most MAX_POSES positions of a track, (n, 3) m, as a message."""
     if track_n is None or not len(track_n):
         return PathMessage(header=header)
     upright = Quaternion(w=1.0)
     return PathMessage(header=header, poses=[
         PoseStamped(header=header, pose=Pose(
             position=Point(x=float(x), y=float(y), z=float(z)), orientation=upright))
-        for x, y, z in track_n[even_rows(len(track_n), MOST_POSES)]])
+        for x, y, z in track_n[even_rows(len(track_n), MAX_POSES)]])
 
 
 class Worker:

@@ -22,7 +22,7 @@ from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.settings.config import Config
 
 STATIC = '_static'      # suffix of the topic of static transforms
-MOST_NAMES, MOST_LETTERS = 12, 40     # judgement: in a text: frames, and characters of each
+MAX_NAMES, MAX_LETTERS = 12, 40     # judgement: in a text: frames, and characters of each
 Transform = tuple[str, str, int, tuple[float, ...]]     # child, parent, stamp ns, values
 
 
@@ -109,8 +109,8 @@ class TransformReader(Reader):
         chain = self._chain
         between_frames = f'from {chain.parent} to {chain.child}'
         if chain.top() != chain.parent:
-            names = ', '.join(repr(name[:MOST_LETTERS]) for name in chain.frames[:MOST_NAMES])
-            return (f'no transform {between_frames}: {chain.top()[:MOST_LETTERS]!r} has no parent '
+            names = ', '.join(repr(name[:MAX_LETTERS]) for name in chain.frames[:MAX_NAMES])
+            return (f'no transform {between_frames}: {chain.top()[:MAX_LETTERS]!r} has no parent '
                     f'frame (frames received: {names or "none"}); set reference.frames, or record '
                     'the static transforms')
         if not chain.is_moving():

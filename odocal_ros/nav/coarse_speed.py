@@ -24,19 +24,19 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.nav.time_series import MISSING_INTERVALS
 
-LEAST_CROSSING = 0.02      # judgement: in cells, minimum sigma of a speed at an edge
-LEAST_CELLS = 3.0          # judgement: cells that the values must span
+MIN_CROSSING = 0.02      # judgement: in cells, minimum sigma of a speed at an edge
+MIN_SPAN_CELLS = 3.0          # judgement: cells that the values must span
 # judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 GRID_COHERENCE = 0.9
 # judgement: cells of the values' span; FFT size with zero padding; FFT size of the quick test
 GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
-LEAST_NUMBER = 1e-300      # format: floats below it are integers of a wrong type; 1 / x overflows
+MIN_NUMBER = 1e-300      # format: floats below it are integers of a wrong type; 1 / x overflows
 # judgement: minimum share of moving rows that repeat the one before
 HELD_SHARE = 0.3
 # statistical: changes needed to estimate a step; least ratio of the smallest one to their tenth
 # percentile. If changes have any size, the smallest of 50 is a fifth of it; if speeds are held,
 # both are one step plus the change in one row
-FEWEST_CHANGES, LEAST_SMALLEST_CHANGE = 50, 0.6
+MIN_CHANGES, MIN_SMALLEST_CHANGE = 50, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class CoarseSpeed:
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
         width = np.r_[speed_change[single], np.full(len(row), q)]
-        sigma = np.hypot(width / np.sqrt(12), LEAST_CROSSING * q)
+        sigma = np.hypot(width / np.sqrt(12), MIN_CROSSING * q)
         order = np.argsort(when, kind='stable')
         return SpeedInstants(when[order], value[order], np.sign(value[order]), sigma[order])
 
@@ -181,7 +181,7 @@ def find_grid_step(value: Floats) -> float | None:
     """
     value = np.abs(value[value != 0])
     span = np.ptp(value) if len(value) else 0.0
-    if span < LEAST_NUMBER:
+    if span < MIN_NUMBER:
         return None
     u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)
@@ -192,7 +192,7 @@ def find_grid_step(value: Floats) -> float | None:
         return None
     phase = _coherence(u, GRID_PADDED)
     f = np.arange(len(phase)) * ((GRID_CELLS - 1) / GRID_PADDED / span)
-    high = np.flatnonzero((phase > GRID_COHERENCE) & (f > LEAST_CELLS / span))
+    high = np.flatnonzero((phase > GRID_COHERENCE) & (f > MIN_SPAN_CELLS / span))
     if not len(high):
         return None
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
@@ -218,7 +218,7 @@ def _may_be_grid(u: Ints) -> bool:
     differ by at most pi / 4 to either side: there it is at least (c - sqrt(1 - c^2)) / sqrt(2).
     """
     limit = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
-    lowest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
+    lowest = int(MIN_SPAN_CELLS * GRID_ROUGH / GRID_CELLS) - 1
     return bool(_coherence(u, GRID_ROUGH)[lowest:].max() >= limit)
 
 
@@ -262,7 +262,7 @@ class HeldSpeed(CoarseSpeed):
         """Return the speeds at changes, which are correct except for sampling."""
         v = self.sent
         row = np.flatnonzero((np.diff(v, prepend=v[:1]) != 0) & (v != 0))
-        sigma = np.full(len(row), LEAST_CROSSING * self.step)
+        sigma = np.full(len(row), MIN_CROSSING * self.step)
         return SpeedInstants(self.t[row], v[row], np.sign(v[row]), sigma)
 
 
@@ -271,10 +271,10 @@ def find_held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
     change = np.diff(value)
     size = np.abs(change[(value[1:] != 0) & (value[:-1] != 0)])
     changes = size[size > 0]
-    if len(changes) < FEWEST_CHANGES or len(changes) > (1 - HELD_SHARE) * len(size):
+    if len(changes) < MIN_CHANGES or len(changes) > (1 - HELD_SHARE) * len(size):
         return None
     step = float(changes.min())
-    if step < LEAST_SMALLEST_CHANGE * np.percentile(changes, 10):
+    if step < MIN_SMALLEST_CHANGE * np.percentile(changes, 10):
         return None
     last = np.maximum.accumulate(np.where(change != 0, np.arange(1, len(value)), 0))
     side = np.append(0.0, np.sign(change)[np.maximum(last - 1, 0)])

@@ -19,7 +19,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 # positions is up to v w T^2 / 8 = 16 mm off the path
 LONGEST_STEP_NS = 500_000_000
 RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
-MOST_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
+MAX_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
 StampedPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
 Values = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
 
@@ -78,9 +78,9 @@ class FrameChain:
                 for other in self._moving.values():
                     other.drop_oldest(len(other.stamps))
                     other.newest_ns = -1
-            if len(edge.stamps) == MOST_WAITING:
+            if len(edge.stamps) == MAX_WAITING:
                 self._computed.append(self._compute_positions())
-                edge.drop_oldest(len(edge.stamps) - MOST_WAITING + 1)
+                edge.drop_oldest(len(edge.stamps) - MAX_WAITING + 1)
             edge.add(stamp_ns, received_ns, values)
 
     def add_static(self, child: str, parent: str, values: Values) -> None:

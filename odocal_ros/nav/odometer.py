@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code, Reason
 RESET_FACTOR = 5.0
 # s to each side of a row for smoothing. Judgement: in which a vehicle accelerates evenly
 SMOOTHING_REACH = 0.2
-FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
+MIN_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
 def _quantum(step: Floats) -> float:
     """Return the common divisor of steps of a counter, 1 if they hardly change."""
     size = np.abs(step)
-    changes = np.count_nonzero(np.diff(size)) > FEWEST_STEPS
+    changes = np.count_nonzero(np.diff(size)) > MIN_STEPS
     if not changes or (size % 1).any() or size.max() > 2**53:
         return 1.0
     return float(np.gcd.reduce(size.astype(np.int64)))
@@ -160,7 +160,7 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
 def _find_resets(t: Floats, step: Floats, is_integer: bool) -> Bools:
     """Return a mask of impossible steps: far above the speed of the drive, single or in pairs."""
     dt = np.diff(t)
-    if len(step) < FEWEST_STEPS or not step.any():
+    if len(step) < MIN_STEPS or not step.any():
         return np.zeros(len(step), bool)
     usual = np.median(dt)
     rate = np.abs(step) / np.maximum(dt, usual)    # for bursts of stamps

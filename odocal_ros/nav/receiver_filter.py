@@ -18,7 +18,7 @@ from scipy.linalg import solve_banded
 from odocal_ros.data.arrays import Floats, Ints
 
 # s^2, judgement: the error is proportional to ``square`` below
-LEAST_LAG2 = 1e-4
+MIN_LAG2 = 1e-4
 
 
 def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
@@ -35,8 +35,8 @@ def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, squa
             return track.smoothed(at + tau, tau) - track.at(at)
         return _tracking_error(t, place, velocity, at, np.sqrt(-square / 2))
 
-    if abs(square) <= LEAST_LAG2:
-        small = -LEAST_LAG2 if square < 0 else LEAST_LAG2
+    if abs(square) <= MIN_LAG2:
+        small = -MIN_LAG2 if square < 0 else MIN_LAG2
         rate = error(small) / small
         return rate * square, rate
     value = error(square)

@@ -19,7 +19,7 @@ REST_GRID = 0.1       # s, judgement: grid of the detector
 REST_WINDOW = 0.5     # s, judgement: each side
 REST_TRAVEL = 0.03    # m, judgement: largest travel in the window at rest
 REST_TURN = 0.02      # rad/s, judgement: largest drift of the gyro at rest
-MOST_BIAS = 0.12      # rad/s, each axis, physical: largest bias of a gyro (cheap phones: 0.1)
+MAX_BIAS = 0.12      # rad/s, each axis, physical: largest bias of a gyro (cheap phones: 0.1)
 
 
 def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: float,
@@ -94,6 +94,6 @@ def _not_turning(rate: Floats, at_rest: Bools, edges: Floats, shortest: float) -
     if not medians:
         return at_rest
     bias = min(medians, key=np.linalg.norm)
-    if np.abs(bias).max() > MOST_BIAS:
+    if np.abs(bias).max() > MAX_BIAS:
         return np.zeros_like(at_rest)
     return reduce_columns(np.logical_and, np.abs(rate - bias) < REST_TURN)

@@ -17,7 +17,7 @@ Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 # judgement: quaternions that a scan multiplies in sequence; 40 to 800 are equally fast
 SCAN_BLOCK = 64
 SAMPLES_AT_A_TIME = 16384    # judgement: intervals at a time, whose arrays stay in the cache
-LEAST_INTERVAL = 1e-9    # s; judgement: of the stamps, keeps the slope of equal stamps finite
+MIN_INTERVAL = 1e-9    # s; judgement: of the stamps, keeps the slope of equal stamps finite
 # judgement: largest ratio of adjacent intervals for a cubic through them
 EVEN_RATIO = 2.0
 
@@ -73,7 +73,7 @@ def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     twist : rise of the chord minus slope of the cubic in the middle times the interval.
     From divided differences of the rates over intervals h, (m,), with rises (3, m) over them.
     """
-    safe = np.maximum(h, LEAST_INTERVAL)
+    safe = np.maximum(h, MIN_INTERVAL)
     curve = np.diff(rise / safe) / (safe[:-1] + safe[1:])       # half the second derivative
     before, step, after = safe[:-2], safe[1:-1], safe[2:]
     even = ((EVEN_RATIO * before > step) & (before < EVEN_RATIO * step)

@@ -18,7 +18,7 @@ from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import motion_reasons, path_and_chord, speed_reason
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import mounting, with_axes
-from odocal_ros.calib.two_point import LEAST_CHORD_SHARE
+from odocal_ros.calib.two_point import MIN_CHORD_SHARE
 from odocal_ros.calib.value_limits import far_from_nominal
 from odocal_ros.data.arrays import Floats, lengths, medians
 from odocal_ros.data.leg import LegRecorder
@@ -208,7 +208,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
 
 def is_closed(leg: dict[str, Any]) -> bool:
     """Return True if a leg ends where it starts: ratio of chord to path length."""
-    return bool(leg['chord'] < LEAST_CHORD_SHARE * leg['distance'])
+    return bool(leg['chord'] < MIN_CHORD_SHARE * leg['distance'])
 
 
 def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:

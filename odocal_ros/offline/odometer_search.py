@@ -31,14 +31,14 @@ from odocal_ros.offline.survey import FixPath, Match
 from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 
 # judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
-MOST_MESSAGES, MOST_FIELDS, MOST_VALUES = 10_000, 128, 400_000
-MOST_ELEMENTS = 16       # judgement: of an array
-MOST_BYTES = 2**14       # judgement: of a message; images and point clouds are longer
+MAX_MESSAGES, MAX_FIELDS, MAX_VALUES = 10_000, 128, 400_000
+MAX_ELEMENTS = 16       # judgement: of an array
+MAX_BYTES = 2**14       # judgement: of a message; images and point clouds are longer
 # fields that are not searched: stamps, and positions, whose axis may grow with distance
 NOT_SEARCHED = ('header', 'stamp', 'seq', 'pose', 'latitude', 'longitude', 'altitude')
 INCREMENT_WORDS = ('delta', 'diff', 'increment', 'since')
 ROLLOVERS = (2**8, 2**16, 2**32)      # format: of counters of 8, 16 and 32 bits
-MOST_TOPICS = 20       # judgement: topics of unknown types that are searched
+MAX_TOPICS = 20       # judgement: topics of unknown types that are searched
 RECEIVER_WORDS = (*GNSS, 'navsat', 'nmea', 'ubx')      # topics of GNSS receivers
 STANDARD_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
                      'diagnostic_msgs')
@@ -69,7 +69,7 @@ class Fields:
 
     def _take(self, raw: bytes, time_ns: int, deserialize: Deserialize) -> None:
         try:
-            view = MessageView(deserialize(raw) if len(raw) <= MOST_BYTES else None)
+            view = MessageView(deserialize(raw) if len(raw) <= MAX_BYTES else None)
             if not self.paths:
                 self._find_fields(view.message)
             values = [float(view.value(path)) for path in self.paths]
@@ -85,12 +85,12 @@ class Fields:
 
     def _find_fields(self, message: object) -> None:
         """Find the numeric fields of the first message; raise BadData if there are none."""
-        found = list(islice(_numbers(message, ''), MOST_FIELDS))
+        found = list(islice(_numbers(message, ''), MAX_FIELDS))
         if not found:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in found]
         self.is_integer = [isinstance(value, Integral) for _, value in found]
-        self._stride = max(1, -(-self.count // min(MOST_MESSAGES, MOST_VALUES // len(found))))
+        self._stride = max(1, -(-self.count // min(MAX_MESSAGES, MAX_VALUES // len(found))))
 
     def facts(self, path: FixPath) -> dict[str, Any]:
         """Return the number of fields and those that follow the path of the fixes."""
@@ -154,7 +154,7 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
     if isinstance(value, (int, float, np.number)):
         yield path, value
     elif isinstance(value, (list, np.ndarray)):
-        for k, one in enumerate(value[:MOST_ELEMENTS]):
+        for k, one in enumerate(value[:MAX_ELEMENTS]):
             yield from _numbers_of(one, f'{path}[{k}]')
     else:
         yield from _numbers(value, f'{path}.')
@@ -207,7 +207,7 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
     usable = {*requested, *without_estimates(possible)}
     found = [name for name, info in topics.items()
              if info.count and name not in known and name in usable]
-    return {name: Fields(topics[name].count) for name in found[:MOST_TOPICS]}
+    return {name: Fields(topics[name].count) for name in found[:MAX_TOPICS]}
 
 
 def _may_be_odometer(info: TopicInfo) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_chord
 from odocal_ros.data.arrays import Floats, Ints, lengths, median, medians, reduce_columns
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.nav.coarse_speed import LEAST_NUMBER
+from odocal_ros.nav.coarse_speed import MIN_NUMBER
 from odocal_ros.screening.fix_screen import has_position, usable_fixes
 from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
 from odocal_ros.screening.inputs import Inputs, LocatedFixes, median_origin
@@ -32,7 +32,7 @@ AXES = 'xyz'
 # up to 0.98, so this does not exclude them
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
 RATE_LIMIT_HZ = 1e5    # judgement: no sensor is faster; almost equal stamps give such rates
-FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
+MIN_STEPS = 10      # judgement: cells of a path that can be compared
 # s, judgement: delays have a standard deviation of 0.24 s if stamps are rounded down to seconds,
 # of some ms if a receiver has its epochs at whole seconds
 WHOLE_SECONDS_LIMIT = 0.15
@@ -185,13 +185,13 @@ class FixPath:
 
     def match(self, t_ns: Ints, travel: Floats) -> Match:
         """Return the comparison with a travel, (n,) in any unit at (n,) rising arrival times."""
-        if len(t_ns) < FEWEST_STEPS:
+        if len(t_ns) < MIN_STEPS:
             return NO_MATCH
         inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
         step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
         length, run = self.length[inside], np.abs(step)
-        moved = (run > LEAST_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
-        if len(length) < FEWEST_STEPS or not moved.any() or not np.isfinite(run).all():
+        moved = (run > MIN_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
+        if len(length) < MIN_STEPS or not moved.any() or not np.isfinite(run).all():
             return NO_MATCH
         error = np.abs(length - np.median(length[moved] / run[moved]) * run)
         outliers = 0.05      # share of cells with a reset of a counter or a jump of the fixes
@@ -211,7 +211,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     """Return the path of the usable fixes by arrival time; None if it is too short."""
     use, covariance_n, _ = usable_fixes(rows, len(rows.stamp_ns), gnss)
     use &= np.append(True, np.diff(rows.received_ns) > 0)
-    if use.sum() < FEWEST_STEPS:
+    if use.sum() < MIN_STEPS:
         return None
     t_ns = rows.received_ns[use]
     t = (t_ns - t_ns[0]) * 1e-9

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.leg import MOST_DAYS
+from odocal_ros.data.leg import MAX_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
 from odocal_ros.offline.survey import FixPath
@@ -109,7 +109,7 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
     sides_found = [''] * k
     cell = 0.5    # s, interval in which turn and travel are compared
     # with damaged stamps a recording may seem to last for years
-    grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
+    grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MAX_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return sides_found
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))

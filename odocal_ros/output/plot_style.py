@@ -21,8 +21,8 @@ from odocal_ros.safe_io.atomic_files import whole_file
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, description, SVG
-MOST_POINTS = 1200   # judgement: of a line
-MOST_MARKS = 400     # judgement: of single marks
+MAX_POINTS = 1200   # judgement: of a line
+MAX_MARKS = 400     # judgement: of single marks
 STYLE: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
     'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
@@ -90,10 +90,10 @@ def peak_rows(y: Floats) -> Ints:
     """Return rows, (m,) int, of a line: both ends, the least and greatest y of equal blocks."""
     y = np.asarray(y, float)
     n = len(y)
-    if n <= MOST_POINTS:
+    if n <= MAX_POINTS:
         return np.arange(n)
     columns = np.nan_to_num(y.reshape(n, -1).T)
-    edges = np.linspace(0, n, MOST_POINTS // (2 * len(columns)) + 1).astype(int)
+    edges = np.linspace(0, n, MAX_POINTS // (2 * len(columns)) + 1).astype(int)
     keep = {0, n - 1}
     for a, b in zip(edges[:-1], edges[1:], strict=True):
         for column in columns[:, a:b]:
@@ -101,7 +101,7 @@ def peak_rows(y: Floats) -> Ints:
     return np.array(sorted(keep))
 
 
-def even_rows(n: int, limit: int = MOST_MARKS) -> Ints:
+def even_rows(n: int, limit: int = MAX_MARKS) -> Ints:
     """Return at most ``limit`` row numbers of n, both ends included: (m,) int."""
     return np.unique(np.linspace(0, n - 1, min(n, limit)).round().astype(int)) if n else \
         np.empty(0, int)

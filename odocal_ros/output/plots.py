@@ -211,7 +211,7 @@ def _fixes(evidence: Evidence, name: str) -> style.Drawing:
     figure, (ax,) = style.new_figure_column(2.7)
     for status in np.unique(evidence.fix_status):
         rows = np.flatnonzero(evidence.fix_status == status)
-        rows = rows[style.even_rows(len(rows), style.MOST_MARKS // 2)]
+        rows = rows[style.even_rows(len(rows), style.MAX_MARKS // 2)]
         label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', style.GREY))
         ax.plot(evidence.t_fix[rows], evidence.fix_sigma[rows], shape, color=colour,
                 markersize=3.5, markeredgewidth=0 if shape != 'x' else 1, label=label)

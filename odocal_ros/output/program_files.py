@@ -29,7 +29,7 @@ from odocal_ros.safe_io.text_formats import date_text, parameter_block
 from odocal_ros.settings.config import Config, with_settings
 
 TRACK = 'track.geojson'
-MOST_TRACK_POINTS = 5000          # judgement: points of a feature: maps do not show more
+MAX_TRACK_POINTS = 5000          # judgement: points of a feature: maps do not show more
 TRACK_TEXT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
               'calibrated values; as_configured: with the previous values; fixes: of the '
               'receiver; both tracks start at the start mark')
@@ -179,7 +179,7 @@ def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -
     """Return file name -> text, empty if no leg has a track."""
     # a file stays small with many legs: three tracks of each share this number of points
     tracks, file_points = 3 * max(1, len(calibration.legs)), 150_000
-    most_points = max(2, min(MOST_TRACK_POINTS, file_points // tracks))
+    most_points = max(2, min(MAX_TRACK_POINTS, file_points // tracks))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
               for feature in features(n, leg, most_points)]
     if not shapes:

@@ -30,7 +30,7 @@ from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
-MOST_BYTES = 2_600_000     # judgement: of figures; a page stays under 3 MB with its tables
+MAX_BYTES = 2_600_000     # judgement: of figures; a page stays under 3 MB with its tables
 TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Warnings',
           Verdict.ACCEPTED: 'Notes'}
 
@@ -134,7 +134,7 @@ def _budgets(methods: dict[str, result.MethodResult],
 def _draw_figures(
         calibration: result.Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
     """Return the content of each leg, the figure of all legs, and the legs without figures."""
-    # if figures exceed MOST_BYTES, only those of the newest legs are shown
+    # if figures exceed MAX_BYTES, only those of the newest legs are shown
     from odocal_ros.output.plots import leg_figures
     from odocal_ros.output.scale_plots import comparison_figure
     numbered, size = list(enumerate(calibration.legs, 1)), 0
@@ -143,12 +143,12 @@ def _draw_figures(
     with apply_style():
         comparison = comparison_figure(calibration, 'all')
         for number, leg, evidence in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
-            if figures and size > MOST_BYTES:
+            if figures and size > MAX_BYTES:
                 break
             drawn = leg_figures(evidence, f'leg{number}', _relative(leg),
                                 before_label([leg]), _smoothed(leg))
             size += sum(len(drawing) for _, _, drawing in drawn)
-            if not figures or size <= MOST_BYTES:
+            if not figures or size <= MAX_BYTES:
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]

@@ -18,7 +18,7 @@ from odocal_ros.output.value_text import ANGLES, finite_estimate, with_sigma
 
 STYLES = (('o', style.BLUE), ('s', style.RED), ('^', style.GREEN), ('D', style.PINK),
           ('v', 'black'), ('P', style.GREY))
-MOST_LEGS = 40    # judgement: bars that are distinguishable in a picture
+MAX_LEGS = 40    # judgement: bars that are distinguishable in a picture
 # title, (text, method, value, sigma) of each value, band of the result: middle and half width
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 
@@ -85,7 +85,7 @@ def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing
     """Draw scale, yaw and pitch by method and leg; empty for single values."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, method.estimates)
             for m, method in calibration.methods.items()] if len(calibration.legs) > 1 else []
-    for number, leg in list(enumerate(calibration.legs, 1))[-MOST_LEGS:]:
+    for number, leg in list(enumerate(calibration.legs, 1))[-MAX_LEGS:]:
         rows += [(f'leg {number}, {m.replace("_", " ")}', m, method.estimates)
                  for m, method in leg.methods.items()]
     panels = [(title, points, band) for title, points, band in (
@@ -143,5 +143,5 @@ def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
     text = 'Bars: one sigma to each side; grey band: the result.' + (
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
         'random errors would.' if legs > 1 else '') + (
-        f' Of {legs} legs, the newest {MOST_LEGS}.' if legs > MOST_LEGS else '')
+        f' Of {legs} legs, the newest {MAX_LEGS}.' if legs > MAX_LEGS else '')
     return 'Side by side', text, style.svg(figure, f'{name}-compared', text)

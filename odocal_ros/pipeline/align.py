@@ -34,7 +34,7 @@ from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings import nominal
 from odocal_ros.settings.config import Config
 
-FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
+MIN_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])      # begin and end, s
 # (yaw, sigma) rad, or None and the reason
 HeadingOrRefusal = tuple[tuple[float, float] | None, str]
@@ -75,7 +75,7 @@ def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
     for begin, end in spans[spans[:, 0] > alignment.t] if alignment.standstill else ():
         rows = slice(*np.searchsorted(inputs.t_imu, (begin + REST_EDGE, end - REST_EDGE)))
         t = inputs.t_imu[rows]
-        if len(t) < FEWEST_AT_REST:
+        if len(t) < MIN_AT_REST:
             continue
         C_nb = rotations.matrix_from_quat(rotations.quat_at(np.mean(t, keepdims=True), *epochs))[0]
         residual_rate = inputs.w_b[rows].mean(axis=0) - earth_rate_n @ C_nb - alignment.gyro_bias
@@ -142,7 +142,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
     """Return the white noise of gyro and accelerometer, per sqrt(Hz), of the noisiest axis."""
     pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
     t, signals = inputs.t_imu[pick], {'gyro': inputs.w_b[pick], 'accel': inputs.f_b[pick]}
-    if len(t) < FEWEST_AT_REST:
+    if len(t) < MIN_AT_REST:
         return {}
     root_hz = np.sqrt((len(t) - 1) / (t[-1] - t[0]))
     return {name: float((np.diff(x, axis=0).std(axis=0) / np.sqrt(2)).max() / root_hz)

@@ -26,12 +26,12 @@ from odocal_ros.settings import config as settings
 from odocal_ros.settings.nominal import grade_of, nominal_scale
 
 # judgement: s between nodes, 0.1 rad of a turn; number of nodes
-NODE_INTERVAL, MOST_NODES = 0.1, 20_000
-FEWEST_POSITIONS = 10       # judgement: as for other methods
+NODE_INTERVAL, MAX_NODES = 0.1, 20_000
+MIN_POSITIONS = 10       # judgement: as for other methods
 # least distance for a slope, m and in sigmas of a height, judgement: longer than a room is high
 SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
 # rad/sqrt(s), judgement: effect of tilt and vibration of a robot, not included in the grade
-GYRO_LEAST = 1e-3
+MIN_GYRO_NOISE = 1e-3
 BY_AXLE = 'left before right of each axle from front to rear.'
 # reasons about the IMU, which the planar estimator does not need
 IMU_CODES = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
@@ -91,9 +91,9 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | Non
     low = max(0.0, *(one.t[0] for one in travels))
     high = min(inputs.t_stop, *(one.t[-1] for one in travels))
     inside = np.flatnonzero((inputs.t_fix >= low) & (inputs.t_fix <= high))
-    if len(inside) < FEWEST_POSITIONS:
+    if len(inside) < MIN_POSITIONS:
         return None, [Reason(Code.NO_FIX, f'{len(inside)} positions while the wheels have data; '
-                             f'required: {FEWEST_POSITIONS}')]
+                             f'required: {MIN_POSITIONS}')]
     t, node, used = _nodes(inputs.t_fix[inside])
     used = inside[used]
     place = np.nan_to_num(inputs.geodetic)
@@ -115,7 +115,7 @@ def _wheel_count_reason(kind: str, count: int) -> Reason | None:
     """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
         settings.MECANUM: ('4', count == len(planar.MECANUM_ROWS), BY_AXLE),
-        settings.OMNI: (f'{settings.FEWEST_OMNI} or more', count >= settings.FEWEST_OMNI,
+        settings.OMNI: (f'{settings.MIN_OMNI_WHEELS} or more', count >= settings.MIN_OMNI_WHEELS,
                         'counter-clockwise, the first at odometer.wheel_offset.')}.get(
         kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
     return None if fits else Reason(
@@ -126,7 +126,7 @@ def _wheel_count_reason(kind: str, count: int) -> Reason | None:
 def shortened_by_slopes(inputs: Inputs) -> float:
     """Return the relative shortening of the path by slopes: mean slope^2 / 2, minus its noise."""
     has_height = ~np.isnan(inputs.geodetic[:, 2])
-    if has_height.sum() < FEWEST_POSITIONS:
+    if has_height.sum() < MIN_POSITIONS:
         return 0.0
     geodetic = inputs.geodetic[has_height]
     place = median_origin(inputs.t_fix[has_height], geodetic).to_n(geodetic)
@@ -143,7 +143,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
 
 def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
     """Return times of nodes, nodes with a position, and rows of positions, one per 0.1 s."""
-    interval = max(NODE_INTERVAL, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
+    interval = max(NODE_INTERVAL, float(t_fix[-1] - t_fix[0]) / MAX_NODES)
     number = np.floor((t_fix - t_fix[0]) / interval + 1e-6)
     used = np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
     kept = t_fix[used]
@@ -171,7 +171,7 @@ def known_values(run: planar.Run, config: settings.Config) -> planar.PriorKnowle
         width=config.odometer.track_width * (run.wheels.kind not in settings.HOLONOMIC),
         offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
         offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,
-        gyro_noise=max(grade.gyro_noise, GYRO_LEAST),
+        gyro_noise=max(grade.gyro_noise, MIN_GYRO_NOISE),
         gyro_scale_sigma=max(grade.gyro_scale_error, 1e-6),
         gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
     if not config.gnss.correlation_time > 0:

@@ -37,7 +37,7 @@ from odocal_ros.settings.config import Config
 # called with the number of passes, and Stage.change
 PassCallback = Callable[[int, float], None]
 SHOWN_WITHOUT_DECIMALS = 10.0     # judgement: sigmas, from which on a change is
-FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
+MIN_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
 class Paths(NamedTuple):
@@ -219,7 +219,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
                               prepared.origin.height)}
     pin, between, path_length, section_reasons = _compared_section(prepared, after, start)
     fields['reference_n'] = prepared.fixes_n[between]
-    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
+    if pin is None or between.sum() < MIN_TRACK_FIXES:
         return fields, section_reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residual_before, residual_after = (
@@ -243,7 +243,7 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     if start is None:
         return {}, ()
     pin, between, path_length, reasons = _compared_section(prepared, path, start)
-    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
+    if pin is None or between.sum() < MIN_TRACK_FIXES:
         return {}, reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residuals = track_check.track_residuals(path, pin, fixes)

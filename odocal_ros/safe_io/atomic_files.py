@@ -28,7 +28,7 @@ import uuid
 
 from odocal_ros.errors import BadUsage
 
-MOST_SAME_NAME = 1000         # judgement: folders of one name
+MAX_SAME_NAME = 1000         # judgement: folders of one name
 PART = '.part'                # suffix of files being written; no result or bag has it
 # errors after which files are written into the folder one by one
 RENAME_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
@@ -80,14 +80,14 @@ def whole_file(path: Path) -> Iterator[WholeFile]:
 def new_folder(root: Path, name: str) -> Path:
     """Create a new folder; its name has a number if the folder exists."""
     root.mkdir(parents=True, exist_ok=True)
-    for count in range(1, MOST_SAME_NAME + 1):
+    for count in range(1, MAX_SAME_NAME + 1):
         folder = root / (name if count == 1 else f'{name}-{count}')
         try:
             folder.mkdir()
         except FileExistsError:
             continue
         return folder
-    raise OSError(errno.EEXIST, f'it holds {MOST_SAME_NAME} folders named {name}; delete some')
+    raise OSError(errno.EEXIST, f'it holds {MAX_SAME_NAME} folders named {name}; delete some')
 
 
 def write_text(path: Path, text: str) -> None:

@@ -27,7 +27,7 @@ INVISIBLE = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\
 VERDICT_STYLE = re.compile('(\x1b\\[1;3[123]m(?:ACCEPTED|CAUTION|REJECTED)\x1b\\[0m)')
 LONGEST_LINE = 2000       # judgement: characters of one line of a log, a panel or an error
 FRAME = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_./-]{0,199}')
-MOST_YAML_NODES = 30_000      # judgement: mappings, lists and values; reading takes seconds
+MAX_YAML_NODES = 30_000      # judgement: mappings, lists and values; reading takes seconds
 
 
 def one_line(text: object) -> str:
@@ -153,7 +153,7 @@ def safe_loader(aliases: bool = False) -> Any:
                 raise yaml.composer.ComposerError(
                     None, None, f'nested deeper than {deepest} levels', mark)
             self.nodes += 1
-            check(self.nodes, MOST_YAML_NODES, 'the YAML text', 'values')
+            check(self.nodes, MAX_YAML_NODES, 'the YAML text', 'values')
             self.depth += 1
             try:
                 node = super().compose_node(parent, index)

@@ -31,7 +31,7 @@ CELL_STEPS = 10                 # judgement: steps of a cell of the fit, 1 s
 SMOOTHING = np.full(11, 1 / 11)      # judgement: running mean of the speed, 1.1 s
 SLOW_SPEED_SHARE = 0.05         # judgement: of the top speed, below which a turn rate is noise
 # judgement: share of the path by which a steered axle rolls farther; less has no effect on scale
-LEAST_STEERED_SHARE = 2e-5
+MIN_STEERED_SHARE = 2e-5
 
 
 def pair_wheels(wheels: Sequence[Wheel]) -> list[tuple[Wheel, ...]]:
@@ -131,7 +131,7 @@ def _squared_distance(axle: Travel, other: Travel, imu: Imu, between: tuple[floa
         return 0.0, 0.0
     x, covariance, _ = robust_fit(design[keep], y[keep], pair.least_sigma(y[keep]))
     additional, total = abs(x[1]) * np.abs(design[keep, 1]).sum(), np.abs(y[keep]).sum()
-    if additional <= LEAST_STEERED_SHARE * total:
+    if additional <= MIN_STEERED_SHARE * total:
         return 0.0, 0.0
     return float(x[1]), float(np.sqrt(covariance[1, 1]))
 

@@ -24,7 +24,7 @@ TESTED_ROWS = 20_000      # judgement: largest number of tested rows
 TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance
 # definition: a row and the two before and after it, whose cubic predicts its values
 OFFSETS, MIDDLE, NEIGHBOURS = np.arange(-2, 3), 2, (0, 1, 3, 4)
-LEAST_STEP = 1e-9         # s, judgement: minimum difference between rows
+MIN_STEP = 1e-9         # s, judgement: minimum difference between rows
 SMOOTHER_SIGMAS = 4.0     # statistical: significance of smoother rows: by chance once in 30,000
 
 
@@ -103,8 +103,8 @@ class _EvenTimes:
         even_times, last = work_array(len(t)), -np.inf
         for piece in chunks(len(t)):
             rows = np.arange(piece.start, piece.stop)
-            times = np.maximum.accumulate(np.maximum(self.at(t, rows) - LEAST_STEP * rows, last))
-            even_times[piece], last = times + LEAST_STEP * rows, times[-1]
+            times = np.maximum.accumulate(np.maximum(self.at(t, rows) - MIN_STEP * rows, last))
+            even_times[piece], last = times + MIN_STEP * rows, times[-1]
         return even_times
 
 
@@ -130,6 +130,6 @@ def _weights(times: Floats) -> Floats:
         if i != j:
             difference = times[:, i] - times[:, j]
             weights[:, i] *= (times[:, MIDDLE] - times[:, j]) / np.where(
-                difference == 0, LEAST_STEP, difference)
+                difference == 0, MIN_STEP, difference)
     weights[:, MIDDLE] = 1.0
     return weights

@@ -31,7 +31,7 @@ VELOCITY_GAP = 2.0    # s, judgement: a longer one hides a change of speed
 # far more with wrong axes, units and frames
 VELOCITY_RATIO_LIMIT = 0.1
 COMPARISON_INTERVAL = 1.0     # s between the fixes that are compared: judgement
-LEAST_DISPLACEMENT = 1.0      # m in this time, judgement: displacements then have a direction
+MIN_DISPLACEMENT = 1.0      # m in this time, judgement: displacements then have a direction
 # judgement: a displacement is smooth if its deviation from odometer and gyro is below a quarter of
 # the median deviation, or below half of it and 3 cm, the noise of odometer and gyro
 SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
@@ -264,7 +264,7 @@ def _deviations(t: Floats, fix_steps: Complexes,
     """
     dt = np.diff(t)
     complete = dt < MISSING_INTERVALS * np.median(dt)
-    moving = complete & (np.abs(track_steps) > LEAST_DISPLACEMENT)
+    moving = complete & (np.abs(track_steps) > MIN_DISPLACEMENT)
     before = np.maximum.accumulate(np.where(moving, np.arange(len(track_steps)), -1))[:-1]
     rows = np.flatnonzero(complete[1:] & (before >= 0)) + 1
     before = before[rows - 1]

@@ -44,10 +44,10 @@ TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, RETURN_SHARE = 0.8, 50.0, 20.0,
 SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
 GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
 ROLLING_SHARE = 0.1               # of the top speed: least mean speed of a moving vehicle
-# physical: smaller than any range, larger than gravity at rest
-LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
+# physical: smaller than the range of any sensor, larger than gravity at rest
+MIN_GYRO_RANGE, MIN_ACCELEROMETER_RANGE = 1.0, 1.5 * G      # rad/s, m/s^2
 # statistical: coarse steps also repeat the largest value, but less often than the next smaller one
-FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0
+MIN_AT_LIMIT, TIMES_NEXT = 5, 3.0
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -209,15 +209,15 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
     """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
     saturated = []
     for sensor, x_i, scale, unit, min_limit in (
-            ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
-            ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
+            ('gyro', w_i, imu.gyro_scale, 'rad/s', MIN_GYRO_RANGE),
+            ('accelerometer', f_i, imu.accel_scale, 'm/s^2', MIN_ACCELEROMETER_RANGE)):
         for axis, x in zip('xyz', columns(x_i), strict=True):
             for extreme, inside, none in ((np.max, np.less, -np.inf),
                                           (np.min, np.greater, np.inf)):
                 limit = extreme(x, initial=0.0)
                 at_limit = x == limit
                 count, size = int(np.count_nonzero(at_limit)), abs(limit * scale)
-                if size < min_limit or count < FEWEST_AT_LIMIT:
+                if size < min_limit or count < MIN_AT_LIMIT:
                     continue
                 following = extreme(x, where=inside(x, limit), initial=none)
                 if count > TIMES_NEXT * np.count_nonzero(x == following):

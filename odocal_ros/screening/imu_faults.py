@@ -23,28 +23,28 @@ from odocal_ros.settings.nominal import G
 
 # judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter before or
 # after the turn
-LEAST_IMU_TURN, GRAVITY_SCATTER = 45.0, 20.0
+MIN_IMU_TURN, GRAVITY_SCATTER = 45.0, 20.0
 # judgement: largest ratio of gravity after a turn and before; 1.4 in a bend at 45 deg
 GRAVITY_RATIO = 1.15
 # judgement, deg: a larger turn is by reversing with an unsigned counter (180 deg)
 LARGEST_YAW_TURN = 135.0
-YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_IMU_TURN
+YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond MIN_IMU_TURN
 REMEDY = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
-TENTHS, LEAST_TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+TENTHS, MIN_TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
 # judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
 # at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
-LEAST_RATIO, MOST_RATIO = 0.6, 1.6
+MIN_RATIO, MAX_RATIO = 0.6, 1.6
 MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
 # judgement, for the test of alternating rows: rows of a block; least and largest number of blocks,
 # from the end of the leg; ratio of an outlier to the median; largest share of repeated rows
-MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
+MEAN_ROWS, MIN_MEANS, MAX_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
 # statistical: F of the regression of odd minus even rows on a constant and the signals. For one
 # IMU it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
-LEAST_F = 30.0
+MIN_F_STATISTIC = 30.0
 # judgement: least explained variance, a tenth of that of white noise in a mean of a block. White
 # samples in differences with the weights 1/4, 1/2, 1/4 give a mean 8/3 of the variance of a row
 # over the number of rows. Smooth signals without noise are below the limit
-LEAST_POWER = 0.1 * 8 / 3
+MIN_EXPLAINED_VARIANCE = 0.1 * 8 / 3
 # judgement: the difference by a vibration near half the rate changes slowly, as its phase does.
 # Largest correlation of adjacent residuals, and largest share of their product in the explained
 # sum of squares; two IMUs exceed at most one of them
@@ -54,7 +54,7 @@ CORRELATION_LIMIT, SLOW_SHARE_LIMIT = 0.5, 0.05
 def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
     """Return the edges of tenths of the leg, (11,) rows, and their median force, (10, 3) in b."""
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
-    if not inputs.has_accelerometer or edges[1] < LEAST_TENTH_ROWS:
+    if not inputs.has_accelerometer or edges[1] < MIN_TENTH_ROWS:
         return edges[:0], np.empty((0, 3))
     return edges, np.array([medians(inputs.f_b[a:b])
                             for a, b in zip(edges[:-1], edges[1:], strict=True)])
@@ -64,7 +64,7 @@ def unit_change_reasons(inputs: Inputs) -> tuple[Reason, ...]:
     """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
     edges, force = _tenths(inputs)
     gravity = np.linalg.norm(force, axis=1).tolist()
-    wrong = [k for k, g in enumerate(gravity) if not LEAST_RATIO * G < g < MOST_RATIO * G]
+    wrong = [k for k, g in enumerate(gravity) if not MIN_RATIO * G < g < MAX_RATIO * G]
     if not wrong or len(wrong) == len(gravity):      # all tenths: the unit of the whole leg
         return ()
     begin, end = inputs.t_imu[edges[wrong[0]]], inputs.t_imu[edges[wrong[-1] + 1] - 1]
@@ -83,7 +83,7 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
         # a bend, or another unit, also changes the magnitude
         ratio = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
         turn_deg = _angle_between(before, after)
-        if (turn_deg > LEAST_IMU_TURN and 1 / GRAVITY_RATIO < ratio < GRAVITY_RATIO
+        if (turn_deg > MIN_IMU_TURN and 1 / GRAVITY_RATIO < ratio < GRAVITY_RATIO
                 and all(_angle_between(one, mean) < GRAVITY_SCATTER for side, mean in zip(
                     sides, (before, after), strict=True) for one in side)):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
@@ -104,7 +104,7 @@ def forward_turn_reasons(binned: Accelerations | None) -> tuple[Reason, ...]:
             continue
         turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
         sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
-        if LEAST_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
+        if MIN_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
             turns.append((sigma, -turn_deg, float(binned.t[a]), float(binned.t[b])))
     if not turns:
         return ()
@@ -164,9 +164,9 @@ def _share_of_second_imu(x: Floats) -> float:
     IMU adds a constant (another bias) and a combination of the signals (other axes); the F test
     decides whether a fit of both is significant.   x : (n, 3) rows.
     """
-    x = x[-MOST_MEANS * MEAN_ROWS - 2:]
+    x = x[-MAX_MEANS * MEAN_ROWS - 2:]
     count = (len(x) - 2) // MEAN_ROWS
-    if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED_SHARE:
+    if count < MIN_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED_SHARE:
         return 0.0
     odd_minus_even = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
         * (x[1:-1] - (x[:-2] + x[2:]) / 2)
@@ -182,14 +182,14 @@ def _share_of_second_imu(x: Floats) -> float:
     difference, design = difference[good] / noise, design / noise
     blocks = blocks / noise[:, None]
     freedom = len(difference) - design.shape[1]
-    if freedom < FEWEST_MEANS // 2:
+    if freedom < MIN_MEANS // 2:
         return 0.0
     residual = difference - design @ np.linalg.lstsq(design, difference, rcond=None)[0]
     unexplained, total = (residual**2).sum(axis=0), (difference**2).sum(axis=0)
     lagged = (residual[1:] * residual[:-1]).sum(axis=0)
     explained, power = total - unexplained, (blocks**2).mean(axis=(0, 1))
-    significant = (explained * freedom > LEAST_F * design.shape[1] * unexplained) & (
-        explained / len(difference) > LEAST_POWER * power / MEAN_ROWS)
+    significant = (explained * freedom > MIN_F_STATISTIC * design.shape[1] * unexplained) & (
+        explained / len(difference) > MIN_EXPLAINED_VARIANCE * power / MEAN_ROWS)
     vibrating = lagged > np.maximum(CORRELATION_LIMIT * unexplained, SLOW_SHARE_LIMIT * explained)
     if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:
         return 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints, median, running_sum, runs
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.even_imu_times import LEAST_STEP, TESTED_ROWS
+from odocal_ros.screening.even_imu_times import MIN_STEP, TESTED_ROWS
 from odocal_ros.screening.odometer_rows import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: some row in it is on time
@@ -25,7 +25,7 @@ NODE_STEP = 5             # judgement: rows between the nodes of the cubic that 
 NODES = (-2 * NODE_STEP, -NODE_STEP, NODE_STEP, 2 * NODE_STEP)
 MEDIAN_WINDOW = 20.0      # s, judgement: minimum length for the median delay
 MEDIAN_SIGMA = 5e-4       # s, judgement: required sigma of this median; 1 cm at 15 m/s
-LEAST_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm that is corrected
+MIN_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm that is corrected
 ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
@@ -99,8 +99,8 @@ def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
 
 
 def _rising(t: Floats) -> Floats:
-    """Return strictly rising times: each at least LEAST_STEP after the previous one."""
-    order = LEAST_STEP * np.arange(len(t))
+    """Return strictly rising times: each at least MIN_STEP after the previous one."""
+    order = MIN_STEP * np.arange(len(t))
     rising: Floats = np.maximum.accumulate(t - order) + order
     return rising
 
@@ -143,7 +143,7 @@ def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
 
 def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
     """Return roughness of travel on a rhythm over that at t, by rows that are not on it."""
-    rows = np.flatnonzero(np.abs(t - even) > LEAST_JITTER)
+    rows = np.flatnonzero(np.abs(t - even) > MIN_JITTER)
     rows = rows[::1 + len(rows) // TESTED_ROWS]
     deviation = np.array([np.abs(_cubic_deviation(x, travel, rows)) for x in (t, even)])
     deviation = deviation[:, deviation.any(axis=0)]       # of rows in motion
@@ -151,7 +151,7 @@ def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
         return 1.0
     percentile = 90    # a lost row makes the rhythm wrong for some adjacent rows
     at_stamps, at_even = np.percentile(deviation, percentile, axis=1)
-    return float(at_even / max(at_stamps, LEAST_STEP))
+    return float(at_even / max(at_stamps, MIN_STEP))
 
 
 def _rhythm_of_earliest(t: Floats, interval: float) -> Floats:

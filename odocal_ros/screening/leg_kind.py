@@ -27,7 +27,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import G
 
-LEAST_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
+MIN_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
 GRAVITY_ROWS = 20_000  # judgement: largest number of rows in the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
@@ -47,7 +47,7 @@ def missing_force_cause(imu: samples.ImuSamples, accel_scale: float = 1.0) -> st
     with np.errstate(all='ignore'):
         some = thinned(imu.f_i, GRAVITY_ROWS)
         some = some[np.isfinite(some).all(axis=1)]
-        if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < LEAST_GRAVITY:
+        if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < MIN_GRAVITY:
             return 'publishes accelerations without gravity'
     dead = np.logical_and.reduce([(imu.w_i[rows] == 0).all(axis=0) for rows in chunks(
         len(imu.w_i))] or [np.zeros(3, bool)])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Ints, running_sum, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel, without_rollover
+from odocal_ros.nav.odometer import MIN_STEPS, RESET_FACTOR, Travel, without_rollover
 from odocal_ros.nav.time_series import MISSING_INTERVALS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import is_impossible, speed_glitches
@@ -68,7 +68,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
-    if len(step) < FEWEST_STEPS or not step.any():
+    if len(step) < MIN_STEPS or not step.any():
         return false
     dt = np.diff(t)
     rate = step / np.maximum(dt, np.median(dt))
@@ -111,7 +111,7 @@ def held_counts(value: Values, modulus: int) -> Bools:
     interval_rows = np.diff(update)
     # an update of several counts after rows without one: judgement, fewer are rounding
     fewest_counts = 3.0
-    if len(update) < FEWEST_STEPS or np.median(interval_rows) < 2 or (
+    if len(update) < MIN_STEPS or np.median(interval_rows) < 2 or (
             np.median(size[update - 1]) < fewest_counts * size[update - 1].min()):
         return np.zeros(len(value), bool)
     moving = interval_rows < 2 * np.median(interval_rows)
@@ -146,7 +146,7 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     A counter has travel across gaps, but not across resets, which ``travel`` has corrected.
     """
     none = np.empty(0)
-    if len(travel.t) < FEWEST_STEPS:
+    if len(travel.t) < MIN_STEPS:
         return travel, none, none
     dt, step = np.diff(travel.t), np.diff(travel.s)
     usual = np.median(dt)

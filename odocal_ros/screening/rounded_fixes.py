@@ -18,7 +18,7 @@ from odocal_ros.settings.levels import FIX_NOISE_LIMIT
 FINEST_ANGLE = 1e-10    # rad, physical: 0.6 mm: finer steps have no effect
 # statistical: least number of differences; those of unrounded values are all multiples of one
 # step once in 10^9
-FEWEST_DIFFERENCES = 10
+MIN_DIFFERENCES = 10
 OFF_GRID = 0.02         # judgement: of a step, limit of the deviation of a multiple
 
 
@@ -62,7 +62,7 @@ def common_step(angle: Floats) -> float:
     """Return the greatest common divisor of differences of values, (n,) rad; 0: none."""
     differences = np.diff(np.unique(angle))
     differences = differences[differences > FINEST_ANGLE]
-    if len(differences) < FEWEST_DIFFERENCES:
+    if len(differences) < MIN_DIFFERENCES:
         return 0.0
     step = float(differences.min())
     while step > FINEST_ANGLE:

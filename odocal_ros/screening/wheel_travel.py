@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
-from odocal_ros.nav.odometer import FEWEST_STEPS, make_travel, mean_travel, Travel
+from odocal_ros.nav.odometer import make_travel, mean_travel, MIN_STEPS, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.late_rows import sampling_times
 from odocal_ros.screening.odometer_rows import (
@@ -47,7 +47,7 @@ class RolloverSpan:
 
 def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
     """Return the span of a counter's uncorrected rollovers, by rows (n,) and steps (n - 1,)."""
-    if len(step) < FEWEST_STEPS or not step.any():
+    if len(step) < MIN_STEPS or not step.any():
         return None
     median_reach = 7    # steps on each side of a jump, whose median is the usual step
     padded = np.pad(step, median_reach, mode='edge')

@@ -26,7 +26,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM, OMNI = 'differential', 'skid', 'mecanum', 'omni'
-HOLONOMIC, FEWEST_OMNI = (MECANUM, OMNI), 3    # definition: move sideways; least omni wheels
+HOLONOMIC, MIN_OMNI_WHEELS = (MECANUM, OMNI), 3    # definition: drives that move sideways
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 

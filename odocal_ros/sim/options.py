@@ -13,14 +13,14 @@ import math
 from typing import Any
 
 from odocal_ros.errors import BadUsage, unknown_name
-from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, FEWEST_OMNI, MECANUM, OMNI
+from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, MECANUM, MIN_OMNI_WHEELS, OMNI
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim.real_effects import NONE3, RealEffects, Vector
 
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
-MOST_WHEEL_TOPICS, MOST_WHEELS = 2, 8    # definition: as in odometer.wheels
+MAX_WHEEL_TOPICS, MAX_WHEELS = 2, 8    # definition: as in odometer.wheels
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
@@ -195,8 +195,8 @@ def resolved(options: SimOptions) -> SimOptions:
         options = replace(options, front_steers=False, wheelbase=options.track_width,
                           wheels=4 if options.drive == MECANUM else options.wheels)
     if options.drive == OMNI:
-        options = replace(options, wheels=max(options.wheels, FEWEST_OMNI))
-    if options.wheel_count > MOST_WHEEL_TOPICS and options.odometer == 'counts':
+        options = replace(options, wheels=max(options.wheels, MIN_OMNI_WHEELS))
+    if options.wheel_count > MAX_WHEEL_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
     scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]
     if options.scenario == 'paper':
@@ -227,8 +227,8 @@ def _check(options: SimOptions) -> None:
                 _check_number(option.name, number)
     if options.wheel_count > 1 and options.odometer == 'speed':
         raise BadUsage('--two-wheels and --wheels require --odometer counts or angle, not speed')
-    if not 1 <= options.wheels <= MOST_WHEELS:
-        raise BadUsage(f'--wheels {options.wheels}: required: 1 to {MOST_WHEELS}')
+    if not 1 <= options.wheels <= MAX_WHEELS:
+        raise BadUsage(f'--wheels {options.wheels}: required: 1 to {MAX_WHEELS}')
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: required: A:B, seconds with 0 <= A < B')

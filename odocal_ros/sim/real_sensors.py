@@ -23,7 +23,7 @@ from odocal_ros.sim.real_effects import RealEffects
 
 # physical: frequency, Hz, width, Hz, and relative power of wheel hop and of the engine
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
-LEAST_GAP_NS = 50_000    # judgement: between the stamps of one batch
+MIN_GAP_NS = 50_000    # judgement: between the stamps of one batch
 # definition: ages of positions in a filter, in time constants: the nodes of two-point Gauss rules
 # on pieces, short enough for the corners of a route; and the lengths of the pieces, half each
 AGE_EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
@@ -136,7 +136,7 @@ def delayed_stamps(ns: Ints, rng: np.random.Generator, latency: float, jitter: f
     """Return stamps, ns, of samples at ``ns``: late (none early), in order, in batches."""
     delay = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
     stamp = ns + np.rint(delay * 1e9).astype(np.int64)
-    offsets_ns = LEAST_GAP_NS * np.arange(len(ns))
+    offsets_ns = MIN_GAP_NS * np.arange(len(ns))
     if batch > 1:
         last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
         stamp = stamp[last]

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.apply.row_times import RowTimes
-from odocal_ros.apply.wheels import DelaySearch, LEAST_DELAY_ROWS
+from odocal_ros.apply.wheels import DelaySearch, MIN_DELAY_ROWS
 from odocal_ros.data.samples import take
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -209,7 +209,7 @@ def test_without_a_delay_nothing_is_reported():
 
 
 def test_a_minute_is_needed_and_unusable_seconds_do_not_count():
-    assert not searched(0.2, seconds=LEAST_DELAY_ROWS)[1]
+    assert not searched(0.2, seconds=MIN_DELAY_ROWS)[1]
     search = DelaySearch(0.0, 0.01, [])
     assert not any(search.add(FORWARD, None, (0.0, 0.0, GRAVITY), 1.0) for _ in range(500))
 

@@ -193,7 +193,7 @@ def test_unconstrained_state_is_reported():
 
 # bytes per keyframe: chain 16e3, derivatives 13.4e3, sums and rows 8e3; the rest is for the
 # blocks in process, 5e6 for any length
-MOST = 41.5e3
+MAX_BYTES = 41.5e3
 
 
 def peak_of_a_pass(duration):
@@ -217,7 +217,7 @@ def peak_of_a_pass(duration):
 def test_memory_of_a_pass_grows_little_with_the_leg():
     keyframes, peak = peak_of_a_pass(1152.0)
     assert keyframes > 1100
-    assert peak / keyframes == pytest.approx(MOST / 2, abs=MOST / 2)
+    assert peak / keyframes == pytest.approx(MAX_BYTES / 2, abs=MAX_BYTES / 2)
 
 
 def resident(peak=False):

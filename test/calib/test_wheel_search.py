@@ -16,7 +16,7 @@ from odocal_ros.calib.wheel_search import parameter_sets
 from odocal_ros.calib.wheel_search.minimisation import least_squares
 from odocal_ros.calib.wheel_search.parameter_sets import Ranges, ranges_of, Space
 from odocal_ros.calib.wheel_search.planar import inflation
-from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
+from odocal_ros.calib.wheel_search.search import MAX_ROWS, search
 from odocal_ros.errors import BadUsage
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import WheelsConfig
@@ -121,7 +121,7 @@ def test_values_for_json_are_finite_and_short(levels):
     found = search(leg, ranges_of(WheelsConfig(levels=levels)))
     entry = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert entry['array']['rows'] == len(found.sets) == {2: 8, 7: 49, 15: 289}[levels]
-    assert len(entry['array']['shown']) == min(MOST_ROWS, len(found.sets))
+    assert len(entry['array']['shown']) == min(MAX_ROWS, len(found.sets))
     assert entry['best_row'] in entry['array']['shown']
     assert entry['before']['mean'] > entry['after']['mean']
     assert entry['left_and_right_held_together'] is True

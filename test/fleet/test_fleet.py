@@ -22,7 +22,7 @@ import pytest
 from odocal_ros.fleet import calibrate_bags
 from odocal_ros.fleet.bag_jobs import computed_rows
 from odocal_ros.fleet.bags import find_bags
-from odocal_ros.fleet.engine import FEWEST_TASKS, task_results
+from odocal_ros.fleet.engine import MIN_TASKS, task_results
 from odocal_ros.fleet.rows import DONE, FAILED, read_rows
 from odocal_ros.offline.cli import main
 
@@ -255,7 +255,7 @@ def test_the_scheduler_receives_tasks_in_portions(client):
     for i, result, error in task_results(client, abs, range(-400, 0), 'abs', keys):
         found[i], most = (result, error), max(most, len(client.futures))
     assert found == {i: (400 - i, None) for i in range(400)}
-    assert most <= 2 * FEWEST_TASKS      # more when half are left
+    assert most <= 2 * MIN_TASKS      # more when half are left
 
 
 def test_a_process_that_has_read_rows_ends_without_an_error(output):

@@ -11,7 +11,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from odocal_ros.fleet.kpi import FEWEST_LEGS, kpi
+from odocal_ros.fleet.kpi import kpi, MIN_LEGS
 from odocal_ros.fleet.page import remarks
 from odocal_ros.fleet.statistics import covariance, history, MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.fleet.tables import VALUES
@@ -55,9 +55,9 @@ def test_rates_agree_with_a_manual_count():
 
 
 def test_rates_use_only_the_legs_since_the_last_change():
-    legs = [leg('a', 1.02, period=1)] * 4 + [leg('a', 1.0, period=2)] * FEWEST_LEGS
+    legs = [leg('a', 1.02, period=1)] * 4 + [leg('a', 1.0, period=2)] * MIN_LEGS
     found = kpi([row('a', 1.0, 1e-4)], legs, LIMITS)['all']
-    assert (found['legs'], found['recall']) == (FEWEST_LEGS, 1.0)
+    assert (found['legs'], found['recall']) == (MIN_LEGS, 1.0)
 
 
 def test_a_vehicle_that_drifts_across_the_limit_is_on_the_limit():

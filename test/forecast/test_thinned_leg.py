@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
+from odocal_ros.forecast.thinned_leg import MAX_CELLS, ThinnedLeg
 from odocal_ros.nav.time_series import running_integral
 
 SECOND = 10**9
@@ -40,7 +40,7 @@ def test_the_number_of_cells_is_limited_and_no_turn_is_lost():
     t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
     rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
     leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
-    assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
+    assert MAX_CELLS / 2 < len(leg.imu.stamp_ns) <= MAX_CELLS
     # the cells are 1.6 s wide then: a trapezoid misses at most a cell at each end
     turned = running_integral(seconds(leg, leg.imu), leg.imu.w_i[:, 2])[-1]
     assert turned == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)

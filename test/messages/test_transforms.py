@@ -186,7 +186,7 @@ def test_the_reason_for_missing_positions_is_reported(frames, static, message_):
 
 
 def test_a_block_may_exceed_the_number_of_waiting_transforms(monkeypatch):
-    monkeypatch.setattr('odocal_ros.nav.frame_chain.MOST_WAITING', 25)
+    monkeypatch.setattr('odocal_ros.nav.frame_chain.MAX_WAITING', 25)
     assert read(reader())[1].tobytes() == read(reader(), block=1)[1].tobytes()
     assert len(read(reader())[0][0]) == len(T_MAP) - 1
     # the oldest are dropped while the static transform is missing

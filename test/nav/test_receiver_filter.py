@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.receiver_filter import LEAST_LAG2, own_odometer_error, smoothing_error
+from odocal_ros.nav.receiver_filter import MIN_LAG2, own_odometer_error, smoothing_error
 
 W = np.array([0.5, 0.7])
 
@@ -29,7 +29,7 @@ def test_smoothing_error_of_a_sine_is_the_filter_response(square, error, tau):
     # a cubic over 0.2 s has a curvature error of (0.2 w)^2 / 12; the initial transient is at
     # exp(-35 / (2.5 sqrt(2)))
     assert_allclose(off, want, rtol=0, atol=3e-3 * np.abs(want).max())
-    h = 1e-3 * max(abs(square), LEAST_LAG2)
+    h = 1e-3 * max(abs(square), MIN_LAG2)
     above, below = (smoothing_error(t, *swaying(t), at, square + x)[0] for x in (h, -h))
     # the difference in the product is one-sided, over 1e-4 of tau^2
     assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())

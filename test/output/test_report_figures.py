@@ -47,7 +47,7 @@ def test_gaps_and_unused_fixes_are_marked_on_the_track(good):
 
 
 def test_the_newest_of_many_legs_are_shown_side_by_side(good, monkeypatch):
-    monkeypatch.setattr(scale_plots, 'MOST_LEGS', 2)
+    monkeypatch.setattr(scale_plots, 'MAX_LEGS', 2)
     with apply_style():
         result = replace(good, legs=good.legs[:1] * 3)
         (_, says, drawing), = scale_plots.comparison_figure(result, 'all')

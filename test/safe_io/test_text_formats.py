@@ -170,7 +170,7 @@ def test_foreign_colours_are_escaped_and_long_lines_are_cut():
 
 
 def test_folders_of_one_name_are_numbered_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(atomic_files, 'MOST_SAME_NAME', 3)
+    monkeypatch.setattr(atomic_files, 'MAX_SAME_NAME', 3)
     made = [atomic_files.new_folder(tmp_path / 'root', 'leg').name for _ in range(3)]
     assert made == ['leg', 'leg-2', 'leg-3']
     with pytest.raises(OSError, match='holds 3 folders named leg'):

@@ -96,11 +96,11 @@ def test_late_stamps_are_in_order_and_in_batches():
     assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
     assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
     wild = real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.02, 0.02)
-    assert (np.diff(wild) >= real_sensors.LEAST_GAP_NS).all()
+    assert (np.diff(wild) >= real_sensors.MIN_GAP_NS).all()
     assert (wild >= ns).all()
     batch = real_sensors.delayed_stamps(ns, make_rng(3, 'test'), 0.002, 0.0, 4)
-    assert set(np.diff(batch).tolist()) == {real_sensors.LEAST_GAP_NS,
-                                            40_000_000 - 3 * real_sensors.LEAST_GAP_NS}
+    assert set(np.diff(batch).tolist()) == {real_sensors.MIN_GAP_NS,
+                                            40_000_000 - 3 * real_sensors.MIN_GAP_NS}
     assert (batch[:4] - ns[3] >= 2_000_000).all()
 
 

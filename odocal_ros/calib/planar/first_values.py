@@ -19,7 +19,7 @@ from odocal_ros.data.arrays import Complexes, Floats, Ints, running_sum
 # track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
 RATIOS = np.linspace(-0.03, 0.03, 13)
-MOST_MINIMA, SAME_COST = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
+MAX_MINIMA, SAME_COST = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
 SWAPPED = 0.3     # judgement: cost by mirrored positions over cost, if the wheels are swapped
 # m, wheel path over which dead reckoning is compared. Judgement: several moves and turns
 WINDOW = 6.0
@@ -59,7 +59,7 @@ def first_values(run: Run, width: float) -> FirstValues:
     padded = np.pad(lowest, 1, constant_values=np.inf)
     minima = np.flatnonzero((lowest <= padded[:-2]) & (lowest <= padded[2:]))
     refined = []      # (cost, (log width, ratio - 1))
-    for k in minima[np.argsort(lowest[minima])][:MOST_MINIMA]:
+    for k in minima[np.argsort(lowest[minima])][:MAX_MINIMA]:
         guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
         better = minimize(lambda x: align(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
                           options={'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]],

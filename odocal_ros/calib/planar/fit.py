@@ -35,8 +35,8 @@ WIDE_HYPERPRIOR, HYPERPRIOR_SIGMAS = 3.0, dict.fromkeys(('along', 'turn', 'spin'
 STUDENT_FREEDOM = 4.0
 # m/s, added to the speed of wheels, moving and at rest, for noise that grows with time. Judgement
 SPEED_IN_MOTION, SPEED_AT_REST = 0.1, 1e-3
-LEAST_LEVEL = 1e-4  # judgement: lowest level, over its median: no sensor is without noise
-MOST_PASSES = 80
+MIN_LEVEL = 1e-4  # judgement: lowest level, over its median: no sensor is without noise
+MAX_PASSES = 80
 # judgement: of a fit that has converged: sigmas of a constant, logarithm of a level
 LARGEST_LAST_STEP = 0.02
 
@@ -53,7 +53,7 @@ def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], 
     levels, passes, converged = dict(LEVELS), 0, False
     student_weights = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
     first_gains = np.array([scale, scale, scale / initial.width])
-    while passes < MOST_PASSES and not converged:
+    while passes < MAX_PASSES and not converged:
         passes += 1
         rows = _rows(run, known, state, c, first_gains, student_weights)
         equations = {name: Equations(r, len(state)) for name, r in rows.items()}
@@ -148,7 +148,7 @@ def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
         prior_slope = np.log(LEVELS[name] / levels[name]) / hyperprior_sigma**2
         step = ((chi2 - freedom) / 2 + prior_slope) / (
             max(chi2, freedom) / 2 + 1 / hyperprior_sigma**2)
-        lowest = np.log(LEAST_LEVEL * LEVELS[name] / levels[name])
+        lowest = np.log(MIN_LEVEL * LEVELS[name] / levels[name])
         steps[name] = float(max(np.clip(step, -1.5, 1.5), lowest))
     return steps
 

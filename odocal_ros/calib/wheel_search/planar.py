@@ -28,7 +28,7 @@ from odocal_ros.nav.rotations import arctan2, wrap
 CHUNK = 500_000          # judgement: distances in memory at once: 4 MB, which stays in the cache
 # statistical: sigmas beyond which the influence of a fix is constant: one in seven white fixes
 HUBER = 2.0
-LEAST_SIGMA = 1e-4       # m, judgement: lower limit of a stated sigma
+MIN_SIGMA = 1e-4       # m, judgement: lower limit of a stated sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     if not robust:
         mean: Floats = d2.mean(axis=1)
         return mean
-    z2 = d2 / np.maximum(sigma, LEAST_SIGMA)**2
+    z2 = d2 / np.maximum(sigma, MIN_SIGMA)**2
     tail = z2 > HUBER**2
     mean = np.where(tail, 2 * HUBER * np.sqrt(np.where(tail, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
     return mean
@@ -195,7 +195,7 @@ def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     """Return the least-squares weight of each fix, by (k,) squared distances, m^2: (k,)."""
     if not robust:
         return np.ones(len(d2))
-    sigma = np.maximum(sigma, LEAST_SIGMA)
+    sigma = np.maximum(sigma, MIN_SIGMA)
     return np.minimum(1.0, HUBER * sigma / np.maximum(np.sqrt(d2), 1e-12)) / sigma**2
 
 

@@ -30,7 +30,7 @@ from odocal_ros.reasons import Code, Reason
 
 HEADING_MEANS = ('counter-clockwise rotation of the track: error of the configured heading minus '
                  'yaw mounting angle, which positions cannot separate')
-MOST_ROWS = 100      # judgement: of an array kept in calibration.json
+MAX_ROWS = 100      # judgement: of an array kept in calibration.json
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ class SearchResult:
         """Return the content for calibration.json, angles in deg."""
         r, d = self.refined, self.direct
         shown = np.arange(len(self.sets))
-        if len(shown) > MOST_ROWS:      # the best ones, in the order of the array
-            shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MOST_ROWS])
+        if len(shown) > MAX_ROWS:      # the best ones, in the order of the array
+            shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MAX_ROWS])
         return {
             'ranges': [{'parameter': n, 'half': float(_deg(k, h)), 'at_the_end': float(
                 _deg(k, w)), 'unit': 'deg' if n == 'heading' else '1', 'why': y}
