@@ -119,7 +119,7 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
         weighted = Equations(problem, state, priors, variance_factors, progress.fitted).at(levels)
         solved = damp_step(weighted.solved(), progress.previous_step)
         progress.update(count, solved)
-        state = state.updated(solved.step, solved.step_constants)
+        state = state.updated(solved.step, solved.step_constants).with_mean_up()
         weighted.apply_step(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved, progress.largest_step)

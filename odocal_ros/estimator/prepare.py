@@ -40,9 +40,8 @@ from odocal_ros.settings.nominal import (
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)
 SPACING = 1.0
-# m/rad, physical: a pitch centre 1.4 m ahead of the odometer times the mean crossfall of a leg,
-# 1.4 %: roads fall by 2 to 2.5 % to the side for drainage
-LIFT_SIGMA = 0.02
+# rad, physical: roads fall by 2 to 2.5 % to the side for drainage, most of a leg to the same one
+MEAN_ROLL_SIGMA = 0.02
 # s, physical: height errors by ionosphere and orbits change by one sigma in this time
 HEIGHT_TIME = 900.0
 
@@ -165,7 +164,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     bias_up = np.hypot(accel_bias, grade.accel_scale_error * G)
     accel_bias_sigma = np.maximum([accel_bias, accel_bias, bias_up], 1e-6)
     mean = np.zeros(layout.M)
-    sigma[layout.LIFT] = LIFT_SIGMA
+    sigma[layout.MEAN_ROLL] = MEAN_ROLL_SIGMA
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)

@@ -18,7 +18,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.nav.rotations import exp_so3
+from odocal_ros.nav.rotations import exp_so3, skew
 
 # unknowns of a keyframe in order, and their numbers. The travel error is that of the odometer
 # reading, in scale units, bounded by rounding; the slow error is the time-correlated one of a fix
@@ -58,7 +58,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
-             'body_centre_height', 'sway_by_force', 'lift_by_turning',
+             'body_centre_height', 'sway_by_force', 'mean_roll',
              'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
              'speed_offset', 'velocity_delay', 'velocity_lag_square', 'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
@@ -110,12 +110,15 @@ BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
 # displacements of the axle by the tilt of the body, (S12): points about which it pitches, m ahead
 # of the odometer: on hills; in addition on bumps; in turns about its own left axis, on banked
 # ground. Height above the odometer, m, of the centre about which it tilts on its springs; its sway
-# there by lateral force, m per m/s^2. Lift of the axle by turns, m/rad: the third point times the
-# mean roll of the ground, which tilts the axis of turns
-BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
-LIFT = constants_from('lift_by_turning')
+# there by lateral force, m per m/s^2
+BODY_TILT = constants_from('pitch_centre', 'sway_by_force')
+# rad, left side up: mean roll of the ground of a leg. The mean attitude less this one determines
+# the roll of the IMU in the vehicle
+MEAN_ROLL = constants_from('mean_roll')
+# constants of C_bv, in the order of its derivatives
+AXES = (YAW, PITCH, MEAN_ROLL.start)
 # constants that other legs do not share: those of its ground and its fixes
-LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
+LEG_CONSTANTS = constants_from('mean_roll', 'fix_error_up')
 # deviations from ideal sensors and an ideal vehicle, (S28)
 IMPERFECTIONS = constants_from('gyro_scale_z', 'sway_by_force')
 # their kinds, with one common size each: numbers of constants
@@ -153,7 +156,8 @@ class State:
     travel_error: Floats  # (N,) scale units
     slow_n: Floats        # (N, 3) m, time-correlated fix error
     constants: Floats     # (M,) as CONSTANTS, ln K first
-    # (3,) up axis of n in b, mean of the leg: it determines the roll of the IMU in the vehicle
+    # (3,) up axis of n in b, mean of the leg: with the mean roll of the ground, it determines the
+    # roll of the IMU in the vehicle
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @cached_property
@@ -169,7 +173,7 @@ class State:
     @cached_property
     def C_bv(self) -> Floats:
         """Return the rotation from vehicle to body axes: (3, 3)."""
-        return C_bv(self.forward, self.up_b)
+        return vehicle_axes(self.forward, self.up_b, self.constants[MEAN_ROLL.start])
 
     def keyframe_arrays(self) -> dict[str, Floats]:
         """Return the arrays with a row for each keyframe, by field name."""
@@ -181,20 +185,22 @@ class State:
         return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
 
     @cached_property
-    def C_bv_gradient(self) -> tuple[Floats, Floats]:
-        """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
+    def C_bv_gradient(self) -> tuple[Floats, Floats, Floats]:
+        """Return the derivatives of C_bv by AXES: yaw, pitch and mean roll: three (3, 3)."""
         yaw, pitch = self.constants[[YAW, PITCH]]
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-        forward, left, _ = self.C_bv.T
+        forward, left, _ = vehicle_axes(self.forward, self.up_b, 0.0).T
         size = np.linalg.norm(np.cross(self.up_b, forward))
+        roll = exp_so3(np.array([self.constants[MEAN_ROLL.start], 0.0, 0.0]))
 
         def gradient(by_forward: Floats) -> Floats:
             by_left = np.cross(self.up_b, by_forward) / size
             by_left = by_left - left * (left @ by_left)
             return np.stack([by_forward, by_left, np.cross(by_forward, left)
-                             + np.cross(forward, by_left)], -1)
+                             + np.cross(forward, by_left)], -1) @ roll
         return (gradient(np.array([-sy * cp, -cy, -sy * sp])),
-                gradient(np.array([-cy * sp, 0.0, cy * cp])))
+                gradient(np.array([-cy * sp, 0.0, cy * cp])),
+                self.C_bv @ skew(np.array([1.0, 0.0, 0.0])))
 
     def updated(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state after a step of every unknown: (N, n), (M,)."""
@@ -217,11 +223,16 @@ def limit_pitch(constants: Floats) -> Floats:
     return out
 
 
-def C_bv(forward: Floats, up: Floats) -> Floats:
-    """Return the axes forward, left (level), up of the vehicle in columns: (3, 3); (3,) in b."""
+def vehicle_axes(forward: Floats, up: Floats, roll: float) -> Floats:
+    """
+    Return the axes forward, left, up of the vehicle in columns, C_bv: (3, 3).
+
+    forward, up : (3,) in b; up : that of n.   roll : rad, left side up.
+    """
     left = np.cross(up, forward)
     left = left / np.linalg.norm(left)
-    return np.stack([forward, left, np.cross(forward, left)], -1)
+    level = np.stack([forward, left, np.cross(forward, left)], -1)
+    return level @ exp_so3(np.array([roll, 0.0, 0.0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,11 +67,12 @@ def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
 
 def _vehicle_attitude(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
-    from odocal_ros.estimator.state import C_bv
+    from odocal_ros.estimator.state import vehicle_axes
     estimates = leg.methods['smoother'].estimates
     yaw, pitch = (estimates[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']
-    return _at_track(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
+    return _at_track(smoothed, C_nb) @ vehicle_axes(
+        forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0), smoothed['mean_roll']['value'])
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:

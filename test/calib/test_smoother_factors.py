@@ -37,7 +37,7 @@ LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'step
 SWING = {'fixes': 1e-2, 'steps': 0.03, 'motion': 2e-3}
 # derivatives of velocity rows are means over a second: correct for the mean of its rows, except
 # for motion before and after the second of a jump in turn rate, or of 2 m/s^2
-MEANS = dict.fromkeys((layout.YAW, layout.PITCH, *COLUMNS[layout.GNSS_ARM]), 0.02) | dict.fromkeys(
+MEANS = dict.fromkeys((*layout.AXES, *COLUMNS[layout.GNSS_ARM]), 0.02) | dict.fromkeys(
     (*COLUMNS[layout.GYRO], *COLUMNS[layout.ACCEL]), 0.13) | {layout.VELOCITY_DELAY: 0.1}
 
 
@@ -63,7 +63,7 @@ def moved():
         *3 * [layout.FIX_ERROR_BY_SIGMA.start - 3]], 1.0)
     # derivatives by biases treat these as constant over HILL_INTERVALS: no bump centre or body
     # centre of real size, because derivatives neglect how they change the effect of the others
-    c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
+    c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.MEAN_ROLL] = 0.0, np.log(5.0), 0.01
     c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
                                 0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3, 0.0, 0.0]
     c[layout.FIX_LAG2] = 2.1e-4    # not zero, where the filter changes its type

@@ -12,7 +12,7 @@ springs, about a centre above the ground. Moving means over HILL_INTERVALS separ
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.state import State
+from odocal_ros.estimator.state import BODY_TILT, State
 from odocal_ros.nav.rotations import level_left, rotate
 
 # judgement: intervals of a hill or a bank; faster tilt is of the body: bumps, squat
@@ -30,9 +30,10 @@ class BodyTilt:
     The tilt of the body in the K intervals between N keyframes.
 
     rate_n : (K, 3) rad/s, mean turn rates.   level_left : (K, 3) level axes to the left, at begin.
-    pitch_increments : (K, 4) rad, nose down: about ``level_left``; the part faster than hills; by
-        turns on banked ground; and the turn about up.
-    displacements : (K, 3, 6) m in n, of the odometer by a unit of each of BODY_TILT.
+    pitch_increments : (K, 3) rad, nose down: about ``level_left``; the part faster than hills; by
+        turns on banked ground.
+    by_mean_roll : (K, 3) m in n, derivative of the displacement by the mean roll of the ground.
+    displacements : (K, 3, 5) m in n, of the odometer by a unit of each of BODY_TILT.
     """
 
     def __init__(self, state: State, mean_rate: Floats, side_force: Floats) -> None:
@@ -44,12 +45,14 @@ class BodyTilt:
         # about the left axis of the vehicle, which differs on banked ground
         about_left = np.einsum('ki,ki->k', self.rate_n, C @ left) * T
         self.pitch_increments = np.stack(
-            [about_level, about_level - moving_mean(about_level), about_left - about_level,
-             mean_rate @ up * T], -1)
+            [about_level, about_level - moving_mean(about_level), about_left - about_level], -1)
         # nose down about a point ahead, the odometer goes up
         lifts = (C @ up)[:, :, None] * self.pitch_increments[:, None]
-        self.displacements = np.concatenate(
-            [lifts[:, :, :3], _horizontal(state, side_force), lifts[:, :, 3:]], axis=2)
+        self.displacements = np.concatenate([lifts, _horizontal(state, side_force)], axis=2)
+        centres = state.constants[BODY_TILT][:3]
+        turn = mean_rate @ up * T
+        self.by_mean_roll = (C @ up) * (centres[2] * turn)[:, None] - (C @ left) * (
+            self.pitch_increments @ centres)[:, None]
 
 
 def _horizontal(state: State, side_force: Floats) -> Floats:

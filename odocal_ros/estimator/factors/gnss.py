@@ -103,9 +103,8 @@ class Fixes(PointRows):
         J[:, :, layout.BG], c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         if n > layout.SIZE_WITHOUT_SLOW:
             J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
-        by_yaw, by_pitch = self.state.C_bv_gradient
-        c[:, :, layout.YAW] = -self.C_nb @ (by_yaw @ self.arm_v)
-        c[:, :, layout.PITCH] = -self.C_nb @ (by_pitch @ self.arm_v)
+        for column, gradient in zip(layout.AXES, self.state.C_bv_gradient, strict=True):
+            c[:, :, column] = -self.C_nb @ (gradient @ self.arm_v)
         c[:, :, layout.GNSS_ARM] = -self.C_nb @ self.state.C_bv
         # a stamp that is late by d belongs to the position d earlier
         c[:, :, layout.GNSS_DELAY] = self.v_n
@@ -224,9 +223,9 @@ class VelocityRows(ExternalRows):
         J[:, :, layout.BG] = by_gyro[:, :, :3] + by_rate
         c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
             by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
-        by_yaw, by_pitch = state.C_bv_gradient
         W = C_nb @ skew(rate)
-        c[:, :, layout.YAW], c[:, :, layout.PITCH] = -W @ (by_yaw @ arm_v), -W @ (by_pitch @ arm_v)
+        for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
+            c[:, :, column] = -W @ (gradient @ arm_v)
         c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
         c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = acceleration, -by_lag
         c[:, :, layout.ACCEL] = C @ force_signals(

@@ -32,8 +32,8 @@ ROWS = D.stop
 # attributes of Motion with a row for each interval
 INTERVAL_ATTRIBUTES = (
     'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
-    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'rate_n', 'level_left',
-    'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
+    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'tilt_by_mean_roll', 'rate_n',
+    'level_left', 'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
     'displacement_by_state', 'residual')
 
 
@@ -135,6 +135,13 @@ class Motion:
         """Return the displacement of the odometer by tilt, delta D of (S12): (K, 3) m."""
         return self.by_tilt @ self.state.constants[layout.BODY_TILT]
 
+    @property
+    def lean_angles(self) -> Floats:
+        """Return pitch and yaw of the forward axis by BODY_LEAN, (S12): (2, K) rad."""
+        lean = self.lean_accelerations * self.state.constants[layout.BODY_LEAN]
+        out: Floats = lean.reshape(-1, 2, 2).sum(axis=1).T
+        return out
+
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
         state, T, c = self.state, self.T, self.state.constants
@@ -148,11 +155,11 @@ class Motion:
             self.left @ self.angle_covariances @ self.left, 0.0) / 2
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \
             + self.half_pitch_variance[:, None] * c[layout.SCALE_BY_PITCHING]
-        lean = self.lean_accelerations * c[layout.BODY_LEAN]
-        pitch, yaw = lean.reshape(-1, 2, 2).sum(axis=1).T
+        pitch, yaw = self.lean_angles
         self.tilt = BodyTilt(state, self.sums.mean_rate, self.lean_accelerations[:, 1])
         self.rate_n, self.level_left = self.tilt.rate_n, self.tilt.level_left
         self.by_tilt = self.tilt.displacements
+        self.tilt_by_mean_roll = self.tilt.by_mean_roll
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
@@ -204,9 +211,9 @@ class Motion:
         # by the pitch of BODY_TILT. A bias changes little over HILL_INTERVALS: it does not
         # affect the part of bumps
         lift = T * (C @ self.up)[:, :, None]
-        hills, _, turns, _, _, tilted = state.constants[layout.BODY_TILT]
+        hills, _, turns, _, _ = state.constants[layout.BODY_TILT]
         a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
-                               + turns * self.left + tilted * self.up)[:, None]
+                               + turns * self.left)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
@@ -242,12 +249,16 @@ class Motion:
         by_scale = c[:, D, layout.LN_K] / self.scale_ratio
         c[:, D, layout.TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
         c[:, D, layout.SCALE_BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
-        for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
+        for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
             tilt = np.einsum('ki,ki->k', self.displacement_by_state,
                              (C + self.C_end) @ gradient[:, 2] / 2)
             c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
                 + swing @ gradient @ self.arm_v + self.wheel_displacement * (
                     tilt * self.slope_gradient)[:, None]
+        # lean about axes that roll
+        pitch, yaw = self.lean_angles
+        by_roll = state.scale * (np.outer(pitch, -self.left) - np.outer(yaw, self.up))
+        c[:, D, layout.MEAN_ROLL.start] -= rotate(C @ s.S, by_roll) + self.tilt_by_mean_roll
         for i, axis in enumerate((self.up, -self.left)):
             by_angle = C @ s.S @ (state.scale * axis)
             columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)

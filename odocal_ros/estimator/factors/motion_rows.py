@@ -27,7 +27,7 @@ from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BG, State
+from odocal_ros.estimator.state import BG, MEAN_ROLL, State
 
 # sources in the budget, by level
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
@@ -95,7 +95,24 @@ class MotionRows(Factor):
         if self.motion.fitted:
             estimates = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
             self.signals.fit_forces(rows, constants, gyro, estimates)
+            constants[:, D, MEAN_ROLL.start] += self.derivative_by_roll(rows, units)
         return begin, end, constants
+
+    def derivative_by_roll(self, rows: slice, units: Floats) -> Floats:
+        """
+        Return derivatives by the mean roll that turns the axes of road noise: (k, 3) m.
+
+        With a wrong roll, the vertical motion of bumps is in part lateral, (S12). The lateral or
+        vertical row, whichever has less noise, has the derivative: the residual of the other one.
+        """
+        side, up = ((units[:, D, self.noise_mask(*names)]**2).sum(axis=(1, 2))
+                    for names in ODOMETER_AXES[1:])
+        weighted = np.einsum('kij,ki->kj', self.whiten[rows], self.r[rows])[:, D]
+        axes = self.noise.axes[rows, 1:]       # left, up
+        axes = np.where((side < up)[:, None, None], axes, axes[:, ::-1])
+        other = (up - side) * np.einsum('ki,ki->k', axes[:, 1], weighted)
+        out: Floats = axes[:, 0] * other[:, None]
+        return out
 
     def add(self, out: Normal) -> None:
         n = self.n

@@ -218,7 +218,7 @@ class SpeedSteps(PointRows):
         c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_gradient, K * self.instants.side
         c[:, layout.TYRES] = (self.speed_gradient / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
-        for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
+        for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
