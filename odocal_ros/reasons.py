@@ -218,9 +218,9 @@ class Code(Enum):
                                    'correct the start values: odometer.nominal_scale and the '
                                    'heading.')
     # all the samples at once
-    NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, and look for two '
-                             'publishers on one topic. Then drive a leg with stops and turns. '
-                             'The other methods may still have a result.')
+    NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, and the number of '
+                             'publishers with ros2 topic info. Then drive a leg with stops and '
+                             'turns. The other methods may still have a result.')
     SCALE_NOT_DETERMINED = REJECT, 'Drive farther, or use more accurate fixes (such as RTK).'
     YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: the yaw is estimated '
                                    'from accelerations.')

@@ -169,8 +169,8 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     try:
         fit = fit_at_truth(problem, ideal, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        reason = Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}. '
-                        'Likely cause: too little data for the unknowns')
+        reason = Reason(Code.NOT_CONVERGED, f'no uncertainty can be predicted: {error}. Likely '
+                        'cause: the planned drive has too few fixes or too little motion')
         return refused_result([reason], '1')
     return make_result(ideal.leg, problem, fit, sigmas.config)
 
