@@ -257,11 +257,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'least-squares solution.',
     },
     'Smoother': {
-        Code.NOT_CONVERGED: 'The fit gave no usable values; the text of the reason states why: '
-        'the data do not determine all unknowns, an estimate became infinite, wheels and '
-        'positions contradict each other, or the estimated scale error is larger than that of '
-        'any IMU. Usual causes: invalid samples, two sensors on one topic, wrong units, axes or '
-        'clocks, or too little motion.',
+        Code.NOT_CONVERGED: 'The fit gave no usable values; the text of the reason states why. '
+        'The data do not determine all unknowns, an estimate became infinite, wheels and '
+        'positions contradict each other, or no IMU has the estimated scale error. Usual causes: '
+        'invalid samples, two sensors on one topic, wrong units, axes or clocks, or too little '
+        'motion.',
         Code.SCALE_NOT_DETERMINED: 'The uncertainty of the scale is too large to state a value.',
         Code.YAW_NOT_DETERMINED: 'The uncertainty of the yaw mounting angle is too large to '
         'state a value.',

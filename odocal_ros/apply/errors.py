@@ -27,6 +27,7 @@ P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # definition: errors that gravity corrects; heading is not
 BY_REST = np.r_[3:9]                # definition: errors that a turn rate at rest corrects
+# definition: the same as index arrays, for entries of the diagonal
 POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N)
 EYE, AXES = np.eye(N), np.eye(3)
 POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state

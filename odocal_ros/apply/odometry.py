@@ -28,7 +28,7 @@ from odocal_ros.settings.nominal import grade_of
 RESTARTS = 'odometry restarts'      # first words of the note on a restart
 
 
-def clock_difference_text(difference_s: float) -> str:
+def stamp_difference_text(difference_s: float) -> str:
     """Return the text on a lead of the odometer stamps over the IMU stamps, s."""
     return (f'odometer stamps differ from IMU stamps by {difference_s:+.3g} s; the limit is '
             f'{CLOCK_DIFFERENCE_LIMIT:g} s. Likely cause: the drivers use different clocks. '
@@ -123,7 +123,7 @@ class Odometry:
         """Return the poses whose samples have arrived since the last call."""
         clock_difference_s = self.clock_difference_s()
         if clock_difference_s and self._path is not None:
-            self.restart(clock_difference_text(clock_difference_s))
+            self.restart(stamp_difference_text(clock_difference_s))
         if self._path is None and not clock_difference_s:
             self._path = self._start_path()
         if self._path is None:

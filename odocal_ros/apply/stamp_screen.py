@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from odocal_ros.data.samples import Reading
 
-LATEST_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, minus a time_offset
+LATEST_STAMP_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, minus a time_offset
 STAMP_LIMIT_NS = 200_000_000    # judgement: lag below the least one; age before the newest stamp
 CLOCK_SET_ROWS = 10    # judgement: consecutive rows beyond STAMP_LIMIT_NS, then the clock was set
 LAG_ROWS = 1000        # judgement: accepted rows over which the least lag increases again
@@ -60,7 +60,7 @@ class StampScreen:
         self.jump_row = self.dropped = 0
         for k, row in enumerate(rows):
             stamp, received = row[:2]
-            if not 0 < stamp < LATEST_NS:
+            if not 0 < stamp < LATEST_STAMP_NS:
                 self.dropped += 1
                 continue
             lag = received - stamp

@@ -25,9 +25,9 @@ SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: longest burst of stamps, s; largest deviation of a row, in mean jitters of the stamps;
 # rows of the mean jitter
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
-# judgement: largest part of one row in the mean jitter, in mean jitters plus s: lost counts are
-# no jitter
-LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
+# judgement: limit of the lateness of a row in the mean jitter, because lost counts are not jitter:
+# this multiple of the mean, plus s
+LATENESS_RATIO, LATENESS_OFFSET = 2.0, 1e-3
 # judgement: least deviation of a counter that stops abruptly, in mean jitters; the rows of one
 # that holds its values have 3
 HUNG_JITTERS = 2.0
@@ -117,8 +117,9 @@ class Wheel:
         after = bisect_left(self.t, t)
         if not 0 < after < len(self.t):
             return 0.0
-        sag = SPEED_CHANGE / 2 * (t - self.t[after - 1]) * (self.t[after] - t) / 2
-        return sag**2
+        # half of the deviation of a line from a parabola with this acceleration
+        sigma = SPEED_CHANGE / 2 * (t - self.t[after - 1]) * (self.t[after] - t) / 2
+        return sigma**2
 
     def forget(self, t: float) -> None:
         """Drop the rows before a time, s, except the last one."""
@@ -166,7 +167,7 @@ class Wheel:
             if self._refused_error:
                 self._add_refused_variance()
         if self.form.quantity == 'rate':
-            self._add_bend_variance((value - before) * self.scale, dt)
+            self._add_acceleration_variance((value - before) * self.scale, dt)
         if self._unexplained_speed:      # the speed used for refused rows may be false
             self._add_speed_variance(dt)
         self._value = value
@@ -232,7 +233,7 @@ class Wheel:
         self._refused = 0
         if self.form.quantity != 'rate':
             lateness = min(deviation / max(abs(self.speed), 1.0),
-                           LATEST_ROW * self._jitter + LATE_FLOOR)
+                           LATENESS_RATIO * self._jitter + LATENESS_OFFSET)
             self._jitter += (lateness - self._jitter) / JITTER_ROWS
         change = (step / dt - self.speed) * min(1.0, dt / self._speed_time())
         self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
@@ -246,12 +247,12 @@ class Wheel:
         if self._unexplained_time > UNEXPLAINED_TIME:      # real acceleration explains more of it
             self._unexplained_speed = max(self._unexplained_speed - SPEED_CHANGE * dt, 0.0)
 
-    def _add_bend_variance(self, change: float, dt: float) -> None:
-        """Add the variance of travel by a new acceleration; change : m/s, in the last dt s."""
-        # the speed bends in the middle of the rows
-        hidden, self._change = abs(change - self._change) * dt / 4, change
-        if hidden > MIN_TRAVEL_ERROR:
-            self._add_variance(hidden**2)
+    def _add_acceleration_variance(self, change: float, dt: float) -> None:
+        """Add the variance of travel by a changed acceleration; change : m/s in the last dt s."""
+        # the acceleration changes in the middle between two speeds
+        error, self._change = abs(change - self._change) * dt / 4, change
+        if error > MIN_TRAVEL_ERROR:
+            self._add_variance(error**2)
 
     def _add_refused_variance(self) -> None:
         """Add the variance of refused travel, which may be real: one common error."""

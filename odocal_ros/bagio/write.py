@@ -151,13 +151,13 @@ def _merged(topics: Sequence[Topic],
     block = int(np.clip(2**26 // widest, 1, BLOCK))      # bytes, where messages are large
     done = [0] * len(topics)
     for first in range(0, len(which), block):
-        turn = which[first:first + block]
+        in_block = which[first:first + block]
         queues = []
         for i, topic in enumerate(topics):
-            rows = slice(done[i], done[i] + int(np.count_nonzero(turn == i)))
+            rows = slice(done[i], done[i] + int(np.count_nonzero(in_block == i)))
             done[i] = rows.stop
             queues.append(_messages(topic, rows))
-        for i in turn.tolist():
+        for i in in_block.tolist():
             yield (i, *next(queues[i]))
         if progress:
             progress(min(1.0, (first + block) / len(which)))

@@ -65,8 +65,8 @@ def level_axes(up: Floats) -> tuple[Floats, list[str]]:
                   for axis in nearest]
 
 
-def turning(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
-            gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
+def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
+                gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.least_motion)

@@ -49,7 +49,7 @@ class LinkedEquations:
         eigenvalues, _, scale = self._eigen
         return float(np.log(np.maximum(eigenvalues, LEG_ROUNDING)).sum() - 2 * np.log(scale).sum())
 
-    def least_cost(self) -> float:
+    def minimum_cost(self) -> float:
         """Return the weighted sum of squares at the solution."""
         eigenvalues, V, _ = self._eigen
         return self.cost - float(((self.g @ V)**2) @ (1 / np.maximum(eigenvalues, LEG_ROUNDING)))
@@ -197,7 +197,7 @@ class LinkedLegs:
         at, size = [self.names.index(n) for n in scatter], np.array(list(scatter.values()))
         size = size / self.unit[at]
         equations = self.equations(self.information(), scatter)
-        out = -(equations.least_cost() + equations.log_determinant) / 2
+        out = -(equations.minimum_cost() + equations.log_determinant) / 2
         D = self.information().D[:, at][:, :, at][[not b.scatter_likelihood
                                                    for b in self.marginals]]
         return float(out - np.linalg.slogdet(

@@ -5,8 +5,9 @@
 Marginal information of a leg on the constants of vehicle and IMU, without their priors.
 
 A fit estimates states, errors of one leg, and constants (scale, mounting angles, lever arms,
-delays, IMU errors). With all but the constants eliminated, it is what the leg contributes to a
-combination with other legs: docs/method.md (S33) to (S34). A file keeps it for later days.
+delays, IMU errors). The information on the constants, with all other unknowns eliminated, is what
+the leg contributes to a combination with other legs: docs/method.md (S33) to (S34).
+calibration.json stores it for legs of later days.
 """
 
 from collections.abc import Sequence

@@ -21,12 +21,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import AXES, bin_accelerations, ORIENTATION_BINS
 from odocal_ros.screening.inputs import Inputs
 
-# rad of yaw from nominal: beyond it a nominal rotation or heading is wrong; beyond it reversed.
-# Judgement: unintended mounting angles are below 20 deg, and quarter turns are configured
+# rad of yaw from nominal: beyond the first the nominal rotation or heading is wrong, beyond the
+# second reversed. Judgement: unintended angles are below 20 deg, and quarter turns are configured
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
 # rad, largest angle between a measured axis and the quarter turn assigned to it: a third of a
 # quarter turn; the axis must be determined with half of it as its sigma. Judgement
-MEANT_AXIS = np.deg2rad(30.0)
+AXIS_LIMIT = np.deg2rad(30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Mounting:
     @property
     def unclear(self) -> str:
         """Return the reason why the rotation is not known, '' if it is."""
-        sigma, deviation, limit = np.rad2deg([self.forward_sigma, self.deviation, MEANT_AXIS])
+        sigma, deviation, limit = np.rad2deg([self.forward_sigma, self.deviation, AXIS_LIMIT])
         if self.C_bi is not None:
             return ''
         if self.forward_i is not None:
@@ -84,18 +84,18 @@ def _listed(C_bi: Floats, digits: int = 10) -> str:
     return f'[{",".join(f"{x:.{digits}g}" for x in _rpy(C_bi))}]'
 
 
-def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
-    """Return reasons, with the setting in IMU_AXES by the screened inputs."""
+def with_mounting_remedy(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
+    """Return reasons, with the setting to make in IMU_AXES, estimated from screened inputs."""
     if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
-    estimate = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
-                        inputs.travel, 1.0)
+    estimate = estimate_mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
+                                 inputs.travel, 1.0)
     return [replace(r, do=r.do or remedy(estimate)) if r.code is Code.IMU_AXES else r
             for r in reasons]
 
 
-def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
-             metres_per_unit: float) -> Mounting:
+def estimate_mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
+                      metres_per_unit: float) -> Mounting:
     """
     Return the mounting of an IMU.
 
@@ -113,9 +113,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
         C = np.stack([forward_i, np.cross(up_i, forward_i), up_i])
         nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
         deviation = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
-        meant = nearest if deviation < MEANT_AXIS + sigma else None
-        return Mounting(meant, up_i, forward_i, sigma, False, deviation)
-    if abs(up_i[2]) > np.cos(MEANT_AXIS):     # upright or upside down: x is forward, most likely
+        C_bi = nearest if deviation < AXIS_LIMIT + sigma else None
+        return Mounting(C_bi, up_i, forward_i, sigma, False, deviation)
+    if abs(up_i[2]) > np.cos(AXIS_LIMIT):     # upright or upside down: x is forward, most likely
         C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
         return Mounting(C_bi, up_i, None, sigma, True, float(np.arccos(abs(up_i[2]))))
     return Mounting(None, up_i, None, sigma, True, 0.0)
@@ -131,8 +131,8 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
         return None, np.pi
     A, F = binned.onward + 1j * binned.inward, binned.force
     fits = _angle(A, F), _angle(A.conj(), F)
-    theta, sigma = next((fit for fit in fits if fit[1] <= MEANT_AXIS / 2), fits[0])
-    if sigma > MEANT_AXIS / 2:
+    theta, sigma = next((fit for fit in fits if fit[1] <= AXIS_LIMIT / 2), fits[0])
+    if sigma > AXIS_LIMIT / 2:
         return None, sigma
     return np.cos(theta) * binned.e1 + np.sin(theta) * binned.e2, sigma
 

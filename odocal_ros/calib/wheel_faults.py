@@ -149,7 +149,7 @@ def _is_finished(pair: WheelPair, residual: Floats, event: Event) -> bool:
 
 
 def _slope(pair: WheelPair, event: Event) -> float:
-    """Return the size of a slip over its path, between a tenth and nine tenths of its size."""
+    """Return the size of a slip per path length, from a tenth to nine tenths of its size."""
     begin, end = np.interp(event[:2], pair.t, _mean_path(pair))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from odocal_ros.apply.odometry import clock_difference_text, Odometry, RESTARTS
+from odocal_ros.apply.odometry import Odometry, RESTARTS, stamp_difference_text
 from odocal_ros.apply.pose import Pose, TWIST
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.inputs import WHEELS
@@ -196,7 +196,7 @@ class OdometryNode(CheckedNode):
         missing = list(filter(None, (source.missing_reason() for source in inputs)))
         clock_difference_s = self._odometry.clock_difference_s()
         if not missing and clock_difference_s:
-            missing = [clock_difference_text(clock_difference_s)]
+            missing = [stamp_difference_text(clock_difference_s)]
         if not missing:
             self._log_due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         elif not self._log_due_ns:

@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code, Reason
 RESET_FACTOR = 5.0
 # s to each side of a row for smoothing. Judgement: in which a vehicle accelerates evenly
 SMOOTHING_REACH = 0.2
-MIN_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
+MIN_STEPS = 20     # judgement: steps required for a search for resets or a divisor
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class Travel:
 
     def smoothed(self) -> 'Travel':
         """
-        Return travel with the rounding of counts averaged, by parabolas.
+        Return travel with the rounding of counts smoothed by parabolas (Savitzky-Golay).
 
-        The slope between rounded rows is no speed: rounding would change with the delay, and a fit
-        with few other errors would not converge. Rows beside gaps and at the ends are kept.
+        The slope between rounded rows is not the speed: a fit of the delay would not converge with
+        it if there are few other errors. Rows beside gaps and at the ends are not smoothed.
         """
         step = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
         m = int(SMOOTHING_REACH / step)        # rows to each side
@@ -168,7 +168,7 @@ def _find_resets(t: Floats, step: Floats, is_integer: bool) -> Bools:
         return np.zeros(len(step), bool)
     limit = RESET_FACTOR * np.percentile(rate[rate > 0], 95)
     resets = rate > (max(limit, 3 / usual) if is_integer else limit)
-    # motion has long runs, even if the vehicle is mostly at rest; a reset or a false row has not
+    # motion lasts for several steps; a reset is one large step, a false row is two
     for begin, end in runs(resets):
         if end - begin > 2:
             resets[begin:end] = False

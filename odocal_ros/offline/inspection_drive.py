@@ -16,8 +16,8 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import motion_reasons, path_and_chord, speed_reason
-from odocal_ros.calib.gyro_axes import turning
-from odocal_ros.calib.mounting import mounting, with_axes
+from odocal_ros.calib.gyro_axes import check_turns
+from odocal_ros.calib.mounting import estimate_mounting, with_mounting_remedy
 from odocal_ros.calib.two_point import MIN_CHORD_SHARE
 from odocal_ros.calib.value_limits import far_from_nominal
 from odocal_ros.data.arrays import Floats, lengths, medians
@@ -113,7 +113,7 @@ def _travel_between_fixes(inputs: Inputs) -> float:
 def _unit_options(inputs: Inputs, config: Config,
                   findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
-    findings += with_axes(
+    findings += with_mounting_remedy(
         gravity_turn_reasons(inputs) or imu_orientation.unit_and_axis_reasons(
             inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
         or unit_change_reasons(inputs), inputs)
@@ -146,7 +146,7 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
     if not is_configured and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
-    axes = mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
+    axes = estimate_mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
     if not inputs.has_accelerometer:
         axes = replace(axes, C_bi=None)      # gravity is assumed
     agrees = axes.C_bi is not None and np.allclose(
@@ -160,8 +160,8 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         'needed': axes.rpy is not None and not agrees and not is_configured}
     orientation = imu_orientation.estimate_orientation(inputs, located.rough) \
         if inputs.has_accelerometer and located.rough else None
-    ratio, axis_faults = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
-                                 config.imu.gyro_scale)
+    ratio, axis_faults = check_turns(replace(inputs, w_b=w_i @ inputs.C_bi.T), located,
+                                     orientation, config.imu.gyro_scale)
     content['drive']['gyro_over_course'] = ratio
     findings += axis_faults
     # no rotation corrects a mirrored axis

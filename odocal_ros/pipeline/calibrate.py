@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from odocal_ros.calib.drive import ferry_intervals
-from odocal_ros.calib.mounting import with_axes
+from odocal_ros.calib.mounting import with_mounting_remedy
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import by_step, Floats, Ints, release_mapped_memory
 from odocal_ros.data.leg import Leg, part_of
@@ -110,7 +110,7 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     if gravity_turns := gravity_turn_reasons(inputs):
         imu_reasons, z_down = gravity_turns, False
     imu_reasons = imu_reasons or unit_change_reasons(inputs)
-    reasons += tuple(with_axes(imu_reasons, inputs))
+    reasons += tuple(with_mounting_remedy(imu_reasons, inputs))
     release_mapped_memory()
     if z_down:      # forward-right-down: rotated to forward-left-up
         C = matrix_from_rpy([np.pi, 0.0, 0.0])

@@ -10,8 +10,8 @@ from itertools import chain
 import numpy as np
 
 from odocal_ros.calib import drive
-from odocal_ros.calib.gyro_axes import turning
-from odocal_ros.calib.mounting import with_axes
+from odocal_ros.calib.gyro_axes import check_turns
+from odocal_ros.calib.mounting import with_mounting_remedy
 from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
 from odocal_ros.data.arrays import release_mapped_memory, running_sum
 from odocal_ros.data.leg import Leg
@@ -50,12 +50,12 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *drive.odometer_span_reasons(inputs.travel, inputs.t_stop))
-    axis_faults = forward_turn_reasons(accelerations) or turning(
+    axis_faults = forward_turn_reasons(accelerations) or check_turns(
         inputs, located, orientation, config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
     axes = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
-    reasons = (*reasons, *with_axes(axes, inputs))
+    reasons = (*reasons, *with_mounting_remedy(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
     prepared = _dead_reckoned(leg, inputs, config, located, orientation, reasons, alignment,

@@ -35,7 +35,8 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
         **_robot(options),
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
-        # above by the IMU's own axes, here by its housing: equal for perpendicular axes
+        # the angles above are those of the sensor axes, these of the housing: equal if the axes
+        # are perpendicular
         'yaw_mounting_housing_deg': {'value': math.degrees(truth.yaw_housing)},
         'pitch_mounting_housing_deg': {'value': math.degrees(truth.pitch_housing)},
         'roll_mounting_deg': {'value': math.degrees(options.roll)},

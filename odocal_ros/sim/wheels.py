@@ -154,7 +154,7 @@ def tyre_slip(state: State, real: RealEffects) -> Floats:
 
 
 def leg_factor(state: State, real: RealEffects, slipped: Floats) -> float:
-    """Return the true path over that of the count with a cold wheel; slipped: at starts, m."""
+    """Return the true path over the one counted by a cold wheel; slipped : (n,) m, at starts."""
     if not (real.speed_law or real.warming or real.tyre_slip or slipped.any()):
         return 1.0
     path_length = np.diff(state.travel)
@@ -182,10 +182,10 @@ def quantized(speed: Floats, real: RealEffects) -> Floats:
         speed = np.sign(speed) * steps * real.speed_step
     if real.dead_band:
         speed = np.where(np.abs(speed) < real.dead_band, 0.0, speed)
-    return with_least_change(speed, real.speed_hold) if real.speed_hold else speed
+    return held_until_step(speed, real.speed_hold) if real.speed_hold else speed
 
 
-def with_least_change(speed: Floats, step: float) -> Floats:
+def held_until_step(speed: Floats, step: float) -> Floats:
     """Return speeds, each held until the next is 0 or differs by a step."""
     out = speed.tolist()
     for k, now in enumerate(out[1:], 1):

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import f as f_distribution
 
 from odocal_ros.calib.gyro_axes import by_gravity, level_axes
-from odocal_ros.calib.mounting import mounting
+from odocal_ros.calib.mounting import estimate_mounting
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, faults, screen_leg
@@ -141,8 +141,8 @@ def test_mirrored_axis_does_not_hide_the_mounting(sensor, wrong, yaw):
     sent = {name: getattr(made.imu, name) for name in ('w_i', 'f_i')}
     sent[sensor] = sent[sensor] * wrong
     inputs, _ = screen(made.leg(), settings(made))
-    found = mounting(inputs.t_imu, sent['w_i'] @ C, sent['f_i'] @ C, inputs.travel,
-                     made.options.nominal_scale)
+    found = estimate_mounting(inputs.t_imu, sent['w_i'] @ C, sent['f_i'] @ C, inputs.travel,
+                              made.options.nominal_scale)
     assert found.C_bi == pytest.approx(matrix_from_rpy((0.0, 0.0, yaw)) @ C, abs=1e-9)
 
 
