@@ -15,8 +15,8 @@ from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Code
 from odocal_ros.safe_io.text_formats import brief_line
 
-# judgement: delay of the first log of missing inputs, and longest interval of its repetitions
-SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
+# judgement: delay of the first log of missing inputs, and largest interval of its repetitions
+MISSING_LOG_DELAY_NS, MAX_MISSING_LOG_INTERVAL_NS = 5 * 10**9, 3600 * 10**9
 LOSS_FACTOR = 10  # judgement: growth of a count of lost messages after which it is reported again
 NUMBER = re.compile(r'\d+')
 
@@ -89,7 +89,7 @@ class Console:
         self._ready_logged = self._missing_logged = False
         self._topics = TopicReport()
         self._due_ns = 0             # time of the next log of missing inputs
-        self._pause_ns = SILENCE_FIRST_NS      # until the one after it
+        self._pause_ns = MISSING_LOG_DELAY_NS      # until the one after it
         self._missing_text = ''      # missing inputs of the last view, numbers removed
         self._leg_id = 0             # the leg whose faults are logged
         self._reported: set[Code] = set()      # logged faults of this leg
@@ -107,19 +107,19 @@ class Console:
     def _log_missing(self, view: SessionView, steady_ns: int) -> None:
         text = NUMBER.sub('', '; '.join(view.missing))
         if self._missing_logged and text != self._missing_text:    # other publishers, other inputs
-            self._pause_ns = SILENCE_FIRST_NS
-            self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
+            self._pause_ns = MISSING_LOG_DELAY_NS
+            self._due_ns = min(self._due_ns, steady_ns + MISSING_LOG_DELAY_NS)
         self._missing_text = text
         if not self._due_ns:     # an input lost after the start is logged at once
-            self._due_ns = steady_ns + (0 if self._ready_logged else SILENCE_FIRST_NS)
+            self._due_ns = steady_ns + (0 if self._ready_logged else MISSING_LOG_DELAY_NS)
         if steady_ns >= self._due_ns:
             self._log.warning('waiting: ' * (not self._ready_logged) + '; '.join(view.missing))
             self._missing_logged = True
-            self._pause_ns = min(2 * self._pause_ns, SILENCE_SELDOM_NS)
+            self._pause_ns = min(2 * self._pause_ns, MAX_MISSING_LOG_INTERVAL_NS)
             self._due_ns = steady_ns + self._pause_ns
 
     def _log_complete(self, view: SessionView) -> None:
-        self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
+        self._due_ns, self._pause_ns = 0, MISSING_LOG_DELAY_NS
         if not self._ready_logged:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in view.rates_hz.items() if hz)
             action = ('legs start and end automatically' if view.config.leg.automatic else

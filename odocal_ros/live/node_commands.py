@@ -11,8 +11,8 @@ import sys
 from odocal_ros.errors import BadUsage
 
 WAIT_S = 10.0      # judgement: s in which a node sends a status, or its latched one arrives
-START_IT = 'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID'
-NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
+NO_STATUS_REMEDY = 'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID'
+INSTALL_REMEDIES = {'rich': 'pip install rich (or apt install python3-rich)',
          'rclpy': "source ROS 2 Jazzy, or install odocal_ros with the extra 'ros'"}
 
 
@@ -53,14 +53,14 @@ def run(args: Namespace) -> int:
     except ModuleNotFoundError as error:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '
-                       f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
+                       f'{INSTALL_REMEDIES.get(name, INSTALL_REMEDIES["rclpy"])}') from None
     if args.once:
         with StatusListener(args.node, WAIT_S) as listener:
             for level, status, hint in listener:
                 print_panel(panel(level, args.node, status, hint))
                 return 0
-        raise BadUsage(f'no status on {args.node}/status for {WAIT_S:g} s: {START_IT}')
-    waiting = Panel(f'no status on {args.node}/status yet: {START_IT}', title=args.node)
+        raise BadUsage(f'no status on {args.node}/status for {WAIT_S:g} s: {NO_STATUS_REMEDY}')
+    waiting = Panel(f'no status on {args.node}/status yet: {NO_STATUS_REMEDY}', title=args.node)
     with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
         for level, status, hint in listener:
             shown.update(panel(level, args.node, status, hint), refresh=True)

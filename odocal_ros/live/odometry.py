@@ -24,7 +24,7 @@ from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS, TopicReport
+from odocal_ros.live.console import MAX_MISSING_LOG_INTERVAL_NS, MISSING_LOG_DELAY_NS, TopicReport
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import CheckedNode, run
 from odocal_ros.live.topic_input import Input, SEARCH_PERIOD_S
@@ -104,7 +104,7 @@ class OdometryNode(CheckedNode):
             header=Header(frame_id=frames.base)))
         # steady times, ns: last search for publishers, next log of missing inputs (0: none is due)
         self._searched_ns = self._log_due_ns = 0
-        self._has_published, self._pause_ns = False, SILENCE_FIRST_NS
+        self._has_published, self._pause_ns = False, MISSING_LOG_DELAY_NS
         self._logged_ns: dict[str, int] = {}      # last log of each kind of text
         self._topics = TopicReport()
         self.add_on_set_parameters_callback(params.refuse_after_start(ApplyConfig))
@@ -175,7 +175,7 @@ class OdometryNode(CheckedNode):
             self.get_logger().warning(text)
 
     def _feed(self, source: Input) -> None:
-        """Hand the new messages of an input to the dead reckoning."""
+        """Feed the new messages of an input to the dead reckoning."""
         raws, sent_ns = source.take()
         for slot, rows in source.readings(raws, sent_ns) if raws else ():
             if slot != 'imu_other':
@@ -198,12 +198,12 @@ class OdometryNode(CheckedNode):
         if not missing and clock_difference_s:
             missing = [stamp_difference_text(clock_difference_s)]
         if not missing:
-            self._log_due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
+            self._log_due_ns, self._pause_ns = 0, MISSING_LOG_DELAY_NS
         elif not self._log_due_ns:
             self._log_due_ns = now_ns + self._pause_ns
         elif now_ns > self._log_due_ns:
             self.get_logger().warning('nothing is published: ' + '; '.join(missing))
-            self._pause_ns = SILENCE_SELDOM_NS
+            self._pause_ns = MAX_MISSING_LOG_INTERVAL_NS
             self._log_due_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:

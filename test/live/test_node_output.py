@@ -20,7 +20,7 @@ from std_msgs.msg import Float64, String
 from odocal_ros.live import node_commands as commands
 from odocal_ros.live.console import Console
 from odocal_ros.live.messages import LATCHED
-from odocal_ros.live.node_commands import NEEDS
+from odocal_ros.live.node_commands import INSTALL_REMEDIES
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.topic_input import SEARCH_PERIOD_S
 from odocal_ros.live.watch import StatusListener
@@ -56,7 +56,8 @@ def test_without_rich_an_error_names_the_package_to_install(tmp_path):
     (tmp_path / 'rich.py').write_text('raise ModuleNotFoundError("no", name="rich")\n')
     ended = watch(tmp_path, ROOT)
     assert (ended.returncode, ended.stdout) == (2, '')
-    assert ended.stderr == f'odocal: odocal watch needs the package rich: {NEEDS["rich"]}\n'
+    assert ended.stderr == (
+        f'odocal: odocal watch needs the package rich: {INSTALL_REMEDIES["rich"]}\n')
 
 
 def test_the_panel_shows_a_running_node(start, connect):
