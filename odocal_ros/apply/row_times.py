@@ -134,8 +134,8 @@ class RowTimes:
         if self._assumed_lost:
             row, t_before, interval = self._before_loss
             received = self._row + 1 - self._assumed_lost - row
-            least_lost = round((t - t_before) / interval) - received
-            only_late = min(self._assumed_lost, max(self._assumed_lost - least_lost, 0))
+            min_lost = round((t - t_before) / interval) - received
+            only_late = min(self._assumed_lost, max(self._assumed_lost - min_lost, 0))
             self._hull = [(r - only_late if r > row else r, s) for r, s in self._hull]
             is_tested = self._row - row < TESTED_LOST_ROWS
             self._assumed_lost = self._assumed_lost - only_late if is_tested else 0

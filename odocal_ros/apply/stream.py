@@ -187,9 +187,9 @@ def is_single(rows: Sequence[Row]) -> bool:
     if len(rows) < SINGLE_ROWS:
         return False
     before, row, after = rows[-3:]
-    least_share = 1 - glitches.EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
-    if not (_largest(before.w_b, row.w_b) > least_share * glitches.SINGLE_TURN
-            or _largest(before.f_b, row.f_b) > least_share * glitches.SINGLE_FORCE):
+    min_share = 1 - glitches.EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
+    if not (_largest(before.w_b, row.w_b) > min_share * glitches.SINGLE_TURN
+            or _largest(before.f_b, row.f_b) > min_share * glitches.SINGLE_FORCE):
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
     for k, (a, b, c, least) in enumerate(zip(*values, SINGLE_LIMITS, strict=True)):

@@ -147,8 +147,8 @@ class Wheel:
         dt = t - self.t[-1]
         self._rows += 1
         step = self._raw_travel(value, before, dt) * self.scale
-        least_gap = max(MISSING_TIME, GAP_FACTOR * self.mean_interval)
-        has_gap = dt > least_gap and self._rows > TESTED_FROM_ROWS
+        min_gap = max(MISSING_TIME, GAP_FACTOR * self.mean_interval)
+        has_gap = dt > min_gap and self._rows > TESTED_FROM_ROWS
         if has_gap:
             step += self._travel_in_gap(dt, step)
         row_speed = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s

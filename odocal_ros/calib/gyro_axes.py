@@ -69,7 +69,7 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
                 gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
-                       inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.least_motion)
+                       inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.min_motion)
     reasons = gyro_reasons(ratio, gyro_scale)
     if not any(one.code is Code.GYRO_SIGN for one in reasons):
         return ratio, gyro_axes(inputs, located, orientation) or reasons
@@ -140,7 +140,7 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
     """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
         return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
-                          located.fixes_n, located.fix_sigma, inputs.least_motion)
+                          located.fixes_n, located.fix_sigma, inputs.min_motion)
 
     def one_motion(ratio: float | None) -> bool:
         return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]

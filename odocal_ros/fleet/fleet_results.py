@@ -84,10 +84,10 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
 def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
     """Yield groups of vehicles with enough bags for one task."""
     group: list[VehicleJob] = []
-    least_bags = 500
+    min_bags = 500
     for job in jobs:
         group.append(job)
-        if sum(len(entry.bags) for entry in group) >= least_bags:
+        if sum(len(entry.bags) for entry in group) >= min_bags:
             yield tuple(group)
             group = []
     if group:

@@ -93,12 +93,12 @@ def _limit_axis(ax: Any, points: np.ndarray) -> None:
 def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Drawing | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
     current = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
-    most_lines = 6    # vehicles that are highlighted
+    max_lines = 6    # vehicles that are highlighted
     shown = [row['vehicle'] for row in vehicles if row['vehicle'] in current and any(
-        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
+        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:max_lines]
     shown += [row['vehicle'] for row in vehicles
               if row['vehicle'] in current and tables.needs_inspection(row)
-              and row['vehicle'] not in shown][:most_lines - len(shown)]
+              and row['vehicle'] not in shown][:max_lines - len(shown)]
     points = _read_points(legs, set(current), set(shown))
     if not points:
         return None
@@ -152,14 +152,14 @@ def _read_points(path: Path, known: set[str],
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     """Return the page of a fleet with its rows in ``output``, the worst vehicle first."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
-    most_rows = 2000    # vehicles in the table
+    max_rows = 2000    # vehicles in the table
     return render_page(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model_row(*kind, rows) for kind, rows in sorted(
             tables.group_by_model(row for row in vehicles if row['legs']).items())],
         figures=fleet_figures(vehicles, output / tables.LEGS),
-        vehicles=[_vehicle_row(row) for row in vehicles[:most_rows]],
-        left=max(0, len(vehicles) - most_rows))
+        vehicles=[_vehicle_row(row) for row in vehicles[:max_rows]],
+        left=max(0, len(vehicles) - max_rows))
 
 
 def _facts(vehicles: Sequence[dict[str, Any]]) -> str:

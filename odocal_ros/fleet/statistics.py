@@ -149,8 +149,8 @@ def population(values: Floats, sigmas: Floats) -> Population:
     if len(x) < MIN_VEHICLES:
         return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
     huber = 1.5    # sigmas from which a vehicle has less weight
-    most_passes = 50
-    for _ in range(most_passes):
+    max_passes = 50
+    for _ in range(max_passes):
         previous = mean
         spread = _spread(np.abs(x - mean), s)
         total = np.hypot(s, max(spread, 1e-300))

@@ -50,8 +50,8 @@ class PlannedDrive:
         for name, row in rows.items():
             row.setflags(write=False)
             object.__setattr__(self, name, row)
-        least_motion = 1.0    # m: less is no drive
-        if self.distance < least_motion:
+        min_motion = 1.0    # m: less is no drive
+        if self.distance < min_motion:
             raise BadUsage(f'the planned drive never moves ({self.distance:.2f} m between the '
                            'marks); give it a speed and a distance')
 

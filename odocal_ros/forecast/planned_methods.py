@@ -182,9 +182,9 @@ def keyframe_spacing(drive: PlannedDrive) -> float:
     It grows with the duration. Sigmas are 5 to 10 % too large at WIDEST_SPACING, more beyond two
     hours, longer than a live leg may last; never too small.
     """
-    enough_intervals, most_intervals = 600, 1440
+    enough_intervals, max_intervals = 600, 1440
     usual = np.clip(drive.duration / enough_intervals, SPACING, WIDEST_SPACING)
-    return float(max(usual, drive.duration / most_intervals))
+    return float(max(usual, drive.duration / max_intervals))
 
 
 def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:

@@ -117,8 +117,8 @@ def scale_by_speed(result: Calibration) -> Series:
 def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
     from odocal_ros.output.scale_plots import draw_by_speed, fit_text
-    most_legs = 8     # in one picture, the newest
-    legs = _legs_with_speed_scale(result)[-most_legs:]
+    max_legs = 8     # in one picture, the newest
+    legs = _legs_with_speed_scale(result)[-max_legs:]
     figure = new_figure(7.0, 3.2 * len(legs))
     axes = figure.subplots(len(legs), 1, squeeze=False)[:, 0]
     for ax, (number, speed_scale) in zip(axes, legs, strict=True):

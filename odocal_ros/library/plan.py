@@ -61,8 +61,8 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
     """Yield (text, drive, sigmas) of drives that are longer or have more manoeuvres."""
     yield (f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance),
            sigmas)
-    least_rest = 60.0    # s
-    rest = max(least_rest, *before.two_point.standing)
+    min_rest = 60.0    # s
+    rest = max(min_rest, *before.two_point.standing)
     yield (f'standing {duration_text(rest)} longer at both marks',
            drive.lengthen_rests(rest), sigmas)
     yield 'one more stop and start', planned_drive.add_stop_and_start(drive), sigmas

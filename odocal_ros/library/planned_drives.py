@@ -47,10 +47,10 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     top = min(speed, math.sqrt(distance * acceleration))
     ramp, cruise = top / acceleration, max(0.0, distance / top - top / acceleration)
     duration = 2 * (standstill + ramp) + cruise
-    most_metres = 1e6
-    if distance > most_metres or duration > MAX_DRIVE_TIME:
+    max_metres = 1e6
+    if distance > max_metres or duration > MAX_DRIVE_TIME:
         raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {duration / 3600:.1f} h; '
-                       f'the limits are {most_metres / 1000:g} km and {MAX_DRIVE_TIME / 3600:g} h')
+                       f'the limits are {max_metres / 1000:g} km and {MAX_DRIVE_TIME / 3600:g} h')
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
         raise BadUsage(f'--turns {turns}: the limit is {int(cruise / turn_time)}: a turn takes '
@@ -112,10 +112,10 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         raise BadUsage(f'{path}: is not a GPX file ({error}); export the track again as '
                        'GPX') from None
     points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
-    most_points = 1_000_000
-    if not 2 <= len(points) <= most_points:
+    max_points = 1_000_000
+    if not 2 <= len(points) <= max_points:
         raise BadUsage(f'{path}: holds {len(points)} track points; required: 2 to '
-                       f'{most_points:,}. Export a track, not waypoints')
+                       f'{max_points:,}. Export a track, not waypoints')
     try:
         level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
         heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
@@ -154,12 +154,12 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, points = t[rising], position_n[rising]
     used = [0]
-    least_step = 5.0    # m between points used: nearer ones are receiver noise
+    min_step = 5.0    # m between points used: nearer ones are receiver noise
     for k in range(1, len(t)):
-        if np.hypot(*(points[k] - points[used[-1]])[:2]) >= least_step:
+        if np.hypot(*(points[k] - points[used[-1]])[:2]) >= min_step:
             used.append(k)
     if len(used) < 2:
-        raise BadUsage(f'{path}: the track never moves {least_step:g} m; give a driven track')
+        raise BadUsage(f'{path}: the track never moves {min_step:g} m; give a driven track')
     a, b = np.array(used[:-1]), np.array(used[1:])
     step = points[b] - points[a]
     step_length, horizontal = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)

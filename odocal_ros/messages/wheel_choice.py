@@ -168,6 +168,6 @@ def _contains(name: str, words: Sequence[str]) -> bool:
 
 
 def _list_text(keys: Sequence[str]) -> str:
-    most_shown = 12
-    hidden_count = len(keys) - most_shown
-    return ', '.join(keys[:most_shown]) + (f' and {hidden_count} more' if hidden_count > 0 else '')
+    max_shown = 12
+    hidden_count = len(keys) - max_shown
+    return ', '.join(keys[:max_shown]) + (f' and {hidden_count} more' if hidden_count > 0 else '')

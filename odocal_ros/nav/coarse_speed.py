@@ -121,11 +121,11 @@ class CoarseSpeed:
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
         speed_change = _rate_limits(middle, edge, q) * h
         jump = np.where(speed_change > q, 2, jump)    # there a step may pass two edges, or none
-        least_cell = 2    # cells from zero: the first may have a dead band
-        single = (jump == 1) & (outer >= least_cell) & (inner > 0)
+        min_cell = 2    # cells from zero: the first may have a dead band
+        single = (jump == 1) & (outer >= min_cell) & (inner > 0)
         if not self.interpolated:
             single &= h <= MISSING_INTERVALS * usual
-        run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= least_cell)
+        run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= min_cell)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
         # one row of each run, at varying places: the middle one of a run at an extremum of the
         # speed would be the fastest. Multiples of the golden ratio are evenly distributed
@@ -185,8 +185,8 @@ def find_grid_step(value: Floats) -> float | None:
         return None
     u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)
-    fewest_values = 20    # distinct values needed to detect a grid
-    if len(u) < fewest_values:
+    min_values = 20    # distinct values needed to detect a grid
+    if len(u) < min_values:
         return _step_of_few_values(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
     if not _may_be_grid(u):
         return None
@@ -198,9 +198,9 @@ def find_grid_step(value: Floats) -> float | None:
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
     step = _refine_step(value, 1 / float(f[peak]))
-    fewest_cells = 6    # cells with values
+    min_cells = 6    # cells with values
     # values accumulate at the begin of a cruise: two or three such speeds are on some grid
-    return step if len(np.unique(np.rint(value / step))) >= fewest_cells else None
+    return step if len(np.unique(np.rint(value / step))) >= min_cells else None
 
 
 def _coherence(u: Ints, size: int) -> Floats:

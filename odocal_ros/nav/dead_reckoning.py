@@ -79,8 +79,8 @@ class Track:
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
         after = np.minimum(k + 1, last)         # a track may have a single epoch
-        least_epoch_step = 1e-9    # s, shorter than any step
-        step = np.maximum(self.t[after] - self.t[k], least_epoch_step)
+        min_epoch_step = 1e-9    # s, shorter than any step
+        step = np.maximum(self.t[after] - self.t[k], min_epoch_step)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
         P, P_after = self.P.take(k, axis=0), self.P.take(after, axis=0)
         P *= 1 - x

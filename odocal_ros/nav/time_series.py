@@ -98,8 +98,8 @@ def gaps_longer(t: Floats, limit: float) -> Floats:
 
 def gaps_in_rhythm(t: Floats) -> Floats:
     """Return begin and end of the steps far longer than the median interval: (k, 2) s."""
-    fewest_intervals = 10    # least number of rows for an interval
-    if len(t) < fewest_intervals:
+    min_intervals = 10    # least number of rows for an interval
+    if len(t) < min_intervals:
         return np.empty((0, 2))
     shortest_gap = 0.2    # s
     return gaps_longer(t, max(GAP_INTERVALS * float(np.median(np.diff(t))), shortest_gap))

@@ -75,14 +75,14 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, content: dict
     located = locate_fixes(inputs, config)
     still_reasons = [reason for reason in motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
-        inputs.least_motion) if reason.code is Code.ODOMETER_STILL]
+        inputs.min_motion) if reason.code is Code.ODOMETER_STILL]
     if still_reasons:       # scale, speeds, standstills and axes are computed from the counts
         findings += still_reasons
         return options
     stops, speeds = survey.stops_and_speeds(inputs, located.rough, config)
-    path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.least_motion)
+    path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.min_motion)
     travel = _travel_between_fixes(inputs)
-    is_long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
+    is_long = path_length > 2.5 * inputs.min_motion      # judgement: then it is accurate to 1 %
     scale = path_length / travel if is_long and travel else located.rough or None
     # speeds with the printed scale
     scale_ratio = scale / located.rough if scale and located.rough else 1.0
@@ -182,7 +182,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         in_leg = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
         path_length, chord = path_and_chord(inputs.t_fix[in_leg], located.fixes_n[in_leg],
-                                            inputs.least_motion)
+                                            inputs.min_motion)
         return {'start': base + start, 'stop': base + stop, 'distance': path_length,
                 'chord': chord} | more
 

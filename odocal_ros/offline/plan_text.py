@@ -107,11 +107,11 @@ def _sigma_text(parameter: str, sigma: float | None) -> str:
 def _budget_lines(plan: Plan) -> list[str]:
     """Return the main error sources of each method that will provide a value."""
     budgets = []
-    least_share = 0.01    # share of the variance from which a source has its row
+    min_share = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
         method = plan.methods[name]
         hidden = [p for p in MAIN_VALUES if method.estimates[p].sigma is None]
-        lines = budget_lines(method.details.get('budget'), 1.0, least_share, hidden)
+        lines = budget_lines(method.details.get('budget'), 1.0, min_share, hidden)
         if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
         budgets += [*lines, ''] if lines else []

@@ -59,8 +59,8 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     step = np.diff(stamp) * 1e-9
     rising = step[step > 0]
     median_step = median(rising) if len(rising) else 0.0
-    gap_factor, least_gap = 5.0, 0.1    # a gap is longer than 5 median intervals, and than 0.1 s
-    gaps = np.flatnonzero(step > max(gap_factor * median_step, least_gap))
+    gap_factor, min_gap = 5.0, 0.1    # a gap is longer than 5 median intervals, and than 0.1 s
+    gaps = np.flatnonzero(step > max(gap_factor * median_step, min_gap))
     longest = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     delay: Floats = np.multiply(received - stamp, 1e-9)
     spread = None if headerless or not len(delay) else float(
@@ -248,8 +248,8 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
     if not located.rough or len(inputs.t_fix) < 3:
         return []
-    most_fixes = 600    # fixes tested for straight sections, evenly selected
-    selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, most_fixes).astype(int))
+    max_fixes = 600    # fixes tested for straight sections, evenly selected
+    selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, max_fixes).astype(int))
     t, position = inputs.t_fix[selected], located.fixes_n[selected, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(position[None] - position[:, None]).transpose(2, 0, 1))

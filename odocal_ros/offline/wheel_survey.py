@@ -73,9 +73,9 @@ class Values:
         s = _travelled(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
         unlimited = 4 * np.pi    # rad: a joint with a larger range turns without limit
-        least_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
-        least_span = unlimited if self.msgtype == JOINTS else 0
-        rolls = (span > least_span) & (span > least_share * span.max())
+        min_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
+        min_span = unlimited if self.msgtype == JOINTS else 0
+        rolls = (span > min_span) & (span > min_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
         matches = [path.match(received_ns, x) for x in s.T] if path else []
         if any(match.follows for match in matches):

@@ -99,9 +99,9 @@ def _draw_marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
     if len(unused):
         ax.plot(*at(unused), '.', color=style.GREY, markersize=3, zorder=4, label='fix not used')
     step = np.diff(evidence.t_fix)
-    least_gap = 5.0    # median intervals between fixes
+    min_gap = 5.0    # median intervals between fixes
     gaps = [('no fix used', evidence.t_fix[k], evidence.t_fix[k + 1]) for k in np.flatnonzero(
-        step > max(least_gap * np.median(step), 1.0))] if len(step) else []
+        step > max(min_gap * np.median(step), 1.0))] if len(step) else []
     gaps += [(f'no {name}', begin, end) for name, begin, end in evidence.gaps]
     labelled = set()
     for label, begin, end in gaps:

@@ -179,9 +179,9 @@ def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -
     """Return file name -> text, empty if no leg has a track."""
     # a file stays small with many legs: three tracks of each share this number of points
     tracks, file_points = 3 * max(1, len(calibration.legs)), 150_000
-    most_points = max(2, min(MAX_TRACK_POINTS, file_points // tracks))
+    max_points = max(2, min(MAX_TRACK_POINTS, file_points // tracks))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
-              for feature in features(n, leg, most_points)]
+              for feature in features(n, leg, max_points)]
     if not shapes:
         return {}
     collection = {'type': 'FeatureCollection', 'name': 'odocal', 'about': TRACK_TEXT,
@@ -190,8 +190,8 @@ def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -
     return {TRACK: json.dumps(collection, allow_nan=False, ensure_ascii=False) + '\n'}
 
 
-def features(number: int, leg: LegResult, most_points: int) -> list[dict[str, Any]]:
-    """Return the features of a leg, of at most ``most_points`` points; none in a local frame."""
+def features(number: int, leg: LegResult, max_points: int) -> list[dict[str, Any]]:
+    """Return the features of a leg, of at most ``max_points`` points; none in a local frame."""
     if leg.origin is None:
         return []
 
@@ -204,10 +204,10 @@ def features(number: int, leg: LegResult, most_points: int) -> list[dict[str, An
                                  ('as_configured', leg.track_before_n, _line),
                                  ('fixes', leg.reference_n, lambda rows: {
                                      'type': 'MultiPoint', 'coordinates': rows.tolist()})):
-        positions = _positions(rows, leg, most_points)
+        positions = _positions(rows, leg, max_points)
         if rows is not None and len(positions):
             found.append(feature(geometry(positions), kind, points=len(positions), of=len(rows)))
-    track = _positions(leg.track_n, leg, most_points)
+    track = _positions(leg.track_n, leg, max_points)
     if len(track):
         for name, row, stamp_ns in (('start', 0, leg.start_ns), ('stop', -1, leg.stop_ns)):
             point = {'type': 'Point', 'coordinates': track[row].tolist()}
@@ -215,11 +215,11 @@ def features(number: int, leg: LegResult, most_points: int) -> list[dict[str, An
     return found
 
 
-def _positions(rows_n: Floats | None, leg: LegResult, most_points: int) -> Floats:
+def _positions(rows_n: Floats | None, leg: LegResult, max_points: int) -> Floats:
     """Return rows of n, m, as (k, 2 or 3) longitude, latitude, deg, and height, m, if known."""
     if rows_n is None or leg.origin is None or not len(rows_n):
         return np.empty((0, 3))
-    rows_n = np.array(rows_n, dtype=float)[even_rows(len(rows_n), most_points)]
+    rows_n = np.array(rows_n, dtype=float)[even_rows(len(rows_n), max_points)]
     rows_n = rows_n[np.isfinite(rows_n[:, :2]).all(axis=1)]
     geodetic = Origin(*leg.origin).to_geodetic(np.nan_to_num(rows_n))
     degrees = np.rad2deg(geodetic[:, 1::-1]).round(DEGREE_PLACES)

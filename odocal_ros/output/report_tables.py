@@ -133,14 +133,14 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
                          strict=True) if names else ((), ())
     variances = [sum(_number(row, n)**2 for row in table.values()) for n in names]
     rows, small = [], []
-    least_share = 0.005    # of a variance
+    min_share = 0.005    # of a variance
     for source, row in table.items():
         shares = [_number(row, n)**2 / variance if variance else 0.0
                   for n, variance in zip(names, variances, strict=True)]
-        if max(shares, default=0.0) < least_share:
+        if max(shares, default=0.0) < min_share:
             small.append(label(source, local))
             continue
-        cells = [None if part < least_share else (significant(_number(row, n) * factor), part)
+        cells = [None if part < min_share else (significant(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
     totals = [significant(math.sqrt(variance) * factor)

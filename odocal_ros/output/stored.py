@@ -64,8 +64,8 @@ def read_stored(path: Path) -> Stored:
     name = str(path)
     try:
         path = path / MAIN if path.is_dir() else path
-        most_bytes = 2**28    # a day of legs is a thousandth of it
-        content = json.loads(read_bytes(path, most_bytes).decode(), parse_constant=_no_constant)
+        max_bytes = 2**28    # a day of legs is a thousandth of it
+        content = json.loads(read_bytes(path, max_bytes).decode(), parse_constant=_no_constant)
         return stored_from(content, name)
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)

@@ -193,8 +193,8 @@ def _gyro_scale_line(calibration: result.Calibration) -> str:
     scale = texts.finite_estimate(calibration.estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
     error = method.details.get('gyro_scale_z') if method else None
-    least_error = 0.005
-    if not error or abs(error['value']) < max(least_error, 3 * error['sigma']):
+    min_error = 0.005
+    if not error or abs(error['value']) < max(min_error, 3 * error['sigma']):
         return ''
     return _line('gyro scale z', texts.with_sigma(1 - error['value'], error['sigma']))
 
@@ -281,6 +281,6 @@ def _budget_lines(calibration: result.Calibration, width: int, small: bool) -> l
     if method is None or not scale.value:
         return []
     hidden = {name for name in estimates if texts.finite_estimate(estimates, name).value is None}
-    least_share = 0.01    # of a variance: smaller sources have no line
-    return tables.budget_lines(method.details.get('budget'), scale.value, least_share, hidden,
+    min_share = 0.01    # of a variance: smaller sources have no line
+    return tables.budget_lines(method.details.get('budget'), scale.value, min_share, hidden,
                                width, small, result.has_local_positions(calibration.legs))

@@ -169,14 +169,14 @@ def source_label(name: str, local: bool = False) -> str:
     return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
-def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_share: float,
+def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_share: float,
                  hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
                  name_small: bool = True, local: bool = False) -> list[str]:
     """
     Return the lines of a budget, none without one.
 
     table : source to one-sigma effect on each parameter, as in calibration.json.   scale : scale
-    factor of the scale column.   least_share : of the variance; smaller sources have no line.
+    factor of the scale column.   min_share : of the variance; smaller sources have no line.
     hidden : parameters that are not determined: their column stays empty.   width : columns of the
     screen.   name_small : list the smaller sources.   local : positions in a local frame.
     """
@@ -190,17 +190,17 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, least_sh
     for name, row in table.items():
         shares = [row.get(p, 0.0)**2 / variance if variance and p not in hidden else 0.0
                   for p, variance in zip(PARAMETERS, variances, strict=True)]
-        if max(shares) < least_share:
+        if max(shares) < min_share:
             small.append(source_label(name, local))
             continue
-        cells = ['-' if share < least_share else
+        cells = ['-' if share < min_share else
                  f'{significant(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
         lines.append(texts.table_row([source_label(name, local), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))
     if not (small and name_small):
         return lines
-    limit = f'{least_share:.1%}'.replace('.0%', '%').replace('%', ' %')
+    limit = f'{min_share:.1%}'.replace('.0%', '%').replace('%', ' %')
     return lines + textwrap.wrap(f'under {limit}: {", ".join(small)}', width, initial_indent='  ',
                                  subsequent_indent='    ')
 

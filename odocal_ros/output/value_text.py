@@ -157,8 +157,8 @@ def _name_legs(group: list[tuple[Reason, list[str]]]) -> list[Reason]:
     reason, numbers = group[0]
     if not numbers[0]:
         return [reason]
-    most_listed = 2    # different texts of a code; of more, the first one is shown
-    if len(group) <= most_listed:
+    max_listed = 2    # different texts of a code; of more, the first one is shown
+    if len(group) <= max_listed:
         return [replace(one, text=f'{_legs_text(legs)}: {one.text}') for one, legs in group]
     all_legs = sorted({int(n) for _, legs in group for n in legs})
     return [replace(reason, text=f'{_legs_text(list(map(str, all_legs)))}; of leg {numbers[0]}: '

@@ -53,9 +53,9 @@ class LegSearch:
         # first stamp of each topic that a leg needs, 0 before it
         self._first_ns = dict.fromkeys(('imu', 'odometer') + (() if surveyed else ('fix',)), 0)
         self.spans: deque[Span] = deque()
-        most_waiting = 200_000    # odometer rows that wait for the IMU
+        max_waiting = 200_000    # odometer rows that wait for the IMU
         # stamp and travel of odometer rows
-        self._waiting: deque[tuple[int, float]] = deque(maxlen=most_waiting)
+        self._waiting: deque[tuple[int, float]] = deque(maxlen=max_waiting)
         self._gaps: deque[tuple[int, int]] = deque()         # of the IMU: both edges
         self._imu_ns = 0              # newest stamp of the IMU
         self._travel = 0.0

@@ -146,8 +146,8 @@ def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 def parts_between(leg: Leg, gaps: Ints) -> list[Leg]:
     """Return the parts of a leg between gaps, (k, 2) ns; the leg itself if none or many."""
-    most_parts = 20    # with more gaps the leg is rejected
-    if not 0 < len(gaps) < most_parts:
+    max_parts = 20    # with more gaps the leg is rejected
+    if not 0 < len(gaps) < max_parts:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
     spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
@@ -167,8 +167,8 @@ def imu_gaps(leg: Leg, limit_s: float) -> Ints:
     if len(stamps) < 2:
         return np.empty((0, 2), np.int64)
     gap_margin_ns = 1000    # below the limit: larger than the rounding of seconds
-    least_ns = round(limit_s * 1e9) - gap_margin_ns
-    k = np.flatnonzero(by_step(lambda x: np.diff(x) > least_ns, stamps))
+    min_ns = round(limit_s * 1e9) - gap_margin_ns
+    k = np.flatnonzero(by_step(lambda x: np.diff(x) > min_ns, stamps))
     begin, end = np.append(stamps[k], stamps[-1]), np.append(stamps[k + 1], leg.stop_ns)
     if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
         begin, end = (np.sort(np.append(x, leg.start_ns)) for x in (begin, end))

@@ -125,7 +125,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
         t_fix, geodetic = inputs.t_fix[between], inputs.geodetic[between]
         fields['distance'] = path_and_chord(
             t_fix, median_origin(t_fix, geodetic).to_n(np.nan_to_num(geodetic)),
-            inputs.least_motion)[0] if len(t_fix) else 0.0
+            inputs.min_motion)[0] if len(t_fix) else 0.0
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
         imu_samples=len(inputs.t_imu),

@@ -107,15 +107,15 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
     """Return the reasons why there is no usable drive, None if there is one."""
     refusal_reasons = drive.motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
-        inputs.least_motion)
+        inputs.min_motion)
     if refusal_reasons or not located.rough:
         return refusal_reasons or (Reason(
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
             'Drive farther between the marks. If the vehicle did, check the receiver (static '
             'hold off).'),)
     covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
-    fewest_rows = 4    # of the IMU between the marks, for an attitude
-    if covered.sum() < fewest_rows:
+    min_rows = 4    # of the IMU between the marks, for an attitude
+    if covered.sum() < min_rows:
         return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
     return None
 

@@ -130,7 +130,7 @@ class PreparedLeg(LocatedFixes):
         k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
         return dead_reckoning.section_ratio(
             travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
-            max(self.inputs.least_motion, 8 * self.fix_sigma))
+            max(self.inputs.min_motion, 8 * self.fix_sigma))
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """Return the antenna's position at t by fixes or surveyed mark, None without either."""

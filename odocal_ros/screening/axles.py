@@ -129,7 +129,7 @@ def _squared_distance(axle: Travel, other: Travel, imu: Imu, between: tuple[floa
         np.abs(y) > 2 * pair.quantum)
     if keep.sum() < CELL_STEPS or not design[keep, 1].any():
         return 0.0, 0.0
-    x, covariance, _ = robust_fit(design[keep], y[keep], pair.least_sigma(y[keep]))
+    x, covariance, _ = robust_fit(design[keep], y[keep], pair.min_sigma(y[keep]))
     additional, total = abs(x[1]) * np.abs(design[keep, 1]).sum(), np.abs(y[keep]).sum()
     if additional <= MIN_STEERED_SHARE * total:
         return 0.0, 0.0

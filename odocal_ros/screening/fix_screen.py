@@ -54,8 +54,8 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
     received : number of fixes.   origin : text on which ones these are.
     """
     no_fix = fix.status < gnss.min_status
-    most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
-    invalid = ~has_position(fix) | (abs(fix.height) > most_height)
+    max_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
+    invalid = ~has_position(fix) | (abs(fix.height) > max_height)
     invalid = invalid | _far_from_most(fix, ~(invalid | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
@@ -154,8 +154,8 @@ def _is_covariance(matrices: Floats) -> Bools:
     correlation[~valid] = np.eye(matrices.shape[1])
     asymmetry = 1e-3    # an asymmetric matrix is damaged: the correct half is unknown
     valid &= (np.abs(correlation - np.swapaxes(correlation, 1, 2)) < asymmetry).all(axis=(1, 2))
-    least_eigenvalue = 1e-6    # of the correlations: below it the matrix is singular
-    valid &= np.linalg.eigvalsh(correlation)[:, 0] > least_eigenvalue
+    min_eigenvalue = 1e-6    # of the correlations: below it the matrix is singular
+    valid &= np.linalg.eigvalsh(correlation)[:, 0] > min_eigenvalue
     return valid
 
 

@@ -63,8 +63,8 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
         size = np.abs(x)
         # smaller values, except 0, are damaged: judgement. Two rotations by right angles leave
         # 1e-68 of a value in axes of exact zeros
-        least_value = 1e-80
-        usable = (size <= largest) & ((size >= least_value) | (size == 0))
+        min_value = 1e-80
+        usable = (size <= largest) & ((size >= min_value) | (size == 0))
         return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
         return by_row(not_usable, column)
@@ -117,8 +117,8 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
         return is_spike
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
     end = -1
-    most_jumps = 2000    # jumps that are tested
-    for i in jumps[:most_jumps]:
+    max_jumps = 2000    # jumps that are tested
+    for i in jumps[:max_jumps]:
         if i < end:
             continue
         stop = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')

@@ -128,8 +128,8 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
     variances = np.vdot(residual, residual).real / len(design) * np.diag(inverse).real
     sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
     largest_sigma = np.deg2rad(10.0)    # of the direction
-    least_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1
-    if sigma > largest_sigma or not least_gain < abs(gain[0]) < largest_gain:
+    min_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1
+    if sigma > largest_sigma or not min_gain < abs(gain[0]) < largest_gain:
         return None
     forward = gain[0].real * binned.e1 + gain[0].imag * binned.e2
     return ImuOrientation(float(-np.arctan2(forward[1], forward[0])), float(sigma),
@@ -139,9 +139,9 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
 def corrected_forward_axis(orientation: ImuOrientation | None, f: Floats) -> Floats:
     """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
     yaw, pitch = mounting_from_forward(f)
-    least_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
+    min_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
     if orientation is None or abs(float(wrap(orientation.yaw - yaw))) < max(
-            least_difference, 3 * orientation.sigma):
+            min_difference, 3 * orientation.sigma):
         return f
     return np.linalg.norm(f) * forward_b(orientation.yaw, pitch)
 
@@ -215,12 +215,12 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
         reasons.append(Reason(Code.NO_IMU, f'angular_velocity.{AXES[upright]} is always zero: the '
                               'IMU publishes no turn rate about its upright axis', 'Publish all '
                               'three turn rates, or use an IMU that measures them.'))
-    most_tilt = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
-    if up[2] > np.cos(most_tilt):
+    max_tilt = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
+    if up[2] > np.cos(max_tilt):
         return tuple(reasons), False
     axis = int(np.argmax(np.abs(up)))
     text = f'gravity is on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
-    if up[2] < -np.cos(most_tilt) and np.allclose(C_bi, np.eye(3)):
+    if up[2] < -np.cos(max_tilt) and np.allclose(C_bi, np.eye(3)):
         reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{text}: forward-right-down is assumed'))
         return tuple(reasons), True
     reasons.append(Reason(Code.IMU_AXES, f'{text}: the body frame is not forward-left-up'))

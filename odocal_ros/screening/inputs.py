@@ -69,7 +69,7 @@ class Inputs:
         return self.usual_f_b / max(float(np.linalg.norm(self.usual_f_b)), 1e-9)
 
     @property
-    def least_motion(self) -> float:
+    def min_motion(self) -> float:
         """Return the minimum distance between positions that is certainly motion, m."""
         return LOCAL_MOVES if self.local else GNSS_MOVES
 
@@ -113,7 +113,7 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     fixes_n[lost, 2] = np.nan
     sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
     rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
-                        inputs.least_motion) or nominal
+                        inputs.min_motion) or nominal
     return LocatedFixes(origin, fixes_n, sigma, nominal, rough)
 
 

@@ -44,8 +44,8 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, reas
                 else samples.value[1:].astype(float))
         sampled = _correct_bursts(t, running_sum(step), ROUNDING_COUNTS if is_integer else 0.0)
     delay = t - sampled
-    least_delay, least_share = 0.02, 0.3    # s, of an interval: larger delays are reported
-    late = delay > max(least_delay, least_share * intervals(t)[0])
+    min_delay, min_share = 0.02, 0.3    # s, of an interval: larger delays are reported
+    late = delay > max(min_delay, min_share * intervals(t)[0])
     if late.any():
         worst, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
         reasons.append(Reason(
@@ -87,8 +87,8 @@ def intervals(t: Floats) -> list[float]:
 def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
     """Return the sampling times of rows of travel, (n,); rounding: largest error of travel."""
     interval, even, is_smoother = _smoothest_rhythm(t, travel)
-    least_delay, delay_share = 0.004, 0.1    # s, of an interval: the larger is the limit
-    late = t - even > (interval if is_smoother else max(least_delay, delay_share * interval))
+    min_delay, delay_share = 0.004, 0.1    # s, of an interval: the larger is the limit
+    late = t - even > (interval if is_smoother else max(min_delay, delay_share * interval))
     sampled = even.copy() if is_smoother else t.copy()
     for begin, end, fits in _late_runs(t, even, travel, late, rounding):
         if fits:

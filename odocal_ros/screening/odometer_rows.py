@@ -75,8 +75,8 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
     jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
-    most_jumps = 200    # with more the counter is not corrected; the check decides
-    if len(jumps) > most_jumps:
+    max_jumps = 200    # with more the counter is not corrected; the check decides
+    if len(jumps) > max_jumps:
         return false
     last_false = -1
     longest_excursion = 30.0    # s between a jump and the jump back
@@ -110,9 +110,9 @@ def held_counts(value: Values, modulus: int) -> Bools:
     update = np.flatnonzero(size) + 1
     interval_rows = np.diff(update)
     # an update of several counts after rows without one: judgement, fewer are rounding
-    fewest_counts = 3.0
+    min_counts = 3.0
     if len(update) < MIN_STEPS or np.median(interval_rows) < 2 or (
-            np.median(size[update - 1]) < fewest_counts * size[update - 1].min()):
+            np.median(size[update - 1]) < min_counts * size[update - 1].min()):
         return np.zeros(len(value), bool)
     moving = interval_rows < 2 * np.median(interval_rows)
     row = np.arange(len(value))

@@ -86,10 +86,10 @@ def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
     slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
-    least_backwards = 1.0    # m of path
-    twice = slipped / np.maximum(2 * path, least_backwards)
+    min_backwards = 1.0    # m of path
+    twice = slipped / np.maximum(2 * path, min_backwards)
     low, high = 0.8, 1.2    # of twice the path length, as slip of a reversed section
-    return spans[(path > least_backwards) & (twice > low) & (twice < high)]
+    return spans[(path > min_backwards) & (twice > low) & (twice < high)]
 
 
 def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, evidence: str,
@@ -101,12 +101,12 @@ def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | No
     path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
     each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
             for (a, b), m in zip(spans.tolist(), path.tolist(), strict=True)]
-    most_listed = 3    # sections listed in the text
-    more = f' and {len(each) - most_listed} more' if len(each) > most_listed else ''
+    max_listed = 3    # sections listed in the text
+    more = f' and {len(each) - max_listed} more' if len(each) > max_listed else ''
     times = f'{len(each)} time{"s" * (len(each) > 1)}'
     return (Reason(Code.REVERSING_UNSIGNED, f'{times} {evidence} while the odometer counts up: '
                    f'the vehicle reversed and {how}; counted as reverse: '
-                   f'{"; ".join(each[:most_listed])}{more}'),)
+                   f'{"; ".join(each[:max_listed])}{more}'),)
 
 
 def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
@@ -114,8 +114,8 @@ def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     half = ACCELERATION_TIME / 2
     speed = np.abs(travel.at(t + half) - travel.at(t - half)) / ACCELERATION_TIME
     top = np.percentile(speed, 95)
-    least_count_rate = 20.0    # counts/s at top speed: below it a counter shows no acceleration
-    if top == 0.0 or top < least_count_rate * travel.quantum:
+    min_count_rate = 20.0    # counts/s at top speed: below it a counter shows no acceleration
+    if top == 0.0 or top < min_count_rate * travel.quantum:
         return np.empty(0, int), np.empty(0, int)
     stop_share = 0.02    # of the top speed: below it is a stop
     stops = speed <= max(1.01 * travel.quantum / ACCELERATION_TIME, stop_share * top)

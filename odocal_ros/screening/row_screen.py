@@ -155,8 +155,8 @@ def _damaged(impossible: Bools, good: Bools, slot: str, reasons: list[Reason],
 
 def _zero_faded_speeds(samples: Any) -> Any:
     """Return odometer samples with zero for the tiny values of a decaying low-pass filter."""
-    least_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
-    faded = (samples.value != 0) & (np.abs(samples.value) < least_value)
+    min_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
+    faded = (samples.value != 0) & (np.abs(samples.value) < min_value)
     return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
 
 

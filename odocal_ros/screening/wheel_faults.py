@@ -50,7 +50,7 @@ class WheelPair:
         length: float = self.t[1] - self.t[0]
         return length
 
-    def least_sigma(self, steps: Floats) -> float:
+    def min_sigma(self, steps: Floats) -> float:
         """Return the least sigma of travel in cells: rounding, and a part of their median."""
         return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
@@ -130,14 +130,14 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
         return ()
     steps = np.diff([pair.left, pair.right])          # (2, n)
     rolled = np.abs(steps).sum(axis=1)
-    less = int(np.argmin(rolled))
+    slower = int(np.argmin(rolled))
     if rolled.max() <= OTHER_WHEEL_COUNTS * pair.quantum or rolled.max() == 0.0:
         return ()                                   # the vehicle does not move
-    if rolled[less] <= STALLED_SHARE * rolled.max():
-        return (Reason(Code.WHEEL_DEAD, f'the {pair.names[less]} wheel does not count: its travel '
-                       f'is {percent_text(rolled[less], rolled.max())} of that of the '
-                       f'{pair.names[1 - less]} wheel (limit {100 * STALLED_SHARE:g} %). The mean '
-                       'of both wheels is not the travel of the vehicle'),)
+    if rolled[slower] <= STALLED_SHARE * rolled.max():
+        return (Reason(Code.WHEEL_DEAD, f'the {pair.names[slower]} wheel does not count: its '
+                       f'travel is {percent_text(rolled[slower], rolled.max())} of that of the '
+                       f'{pair.names[1 - slower]} wheel (limit {100 * STALLED_SHARE:g} %). The '
+                       'mean of both wheels is not the travel of the vehicle'),)
     left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
@@ -149,7 +149,7 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
     if keep.sum() < 10:
         return _dead_reasons(pair, steps, stalled)
     design = np.stack([steps[0], turn, np.full(len(turn), FAULT_CELL)], -1)
-    x, covariance = _fit_right_wheel(design[keep], steps[1][keep], pair.least_sigma(steps))
+    x, covariance = _fit_right_wheel(design[keep], steps[1][keep], pair.min_sigma(steps))
     stalled = [_without_pivots(stalled[k], steps, design, x, k) for k in (0, 1)]
     return _dead_reasons(pair, steps, stalled) + _reversed_reasons(
         pair, steps, design @ x, x[0], covariance[0, 0], imu)
@@ -242,7 +242,7 @@ def _dead_reasons(pair: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple
 
 
 def percent_text(part: float, total: float) -> str:
-    """Return part / whole as text in per cent."""
+    """Return a part of a total as text in per cent."""
     return f'{100 * part / total:.2g} %'
 
 
@@ -281,15 +281,15 @@ def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: f
 def _wheel_against_imu(pair: WheelPair, steps: Floats, imu: Imu) -> int | None:
     """Return the wheel that accelerates opposite to the IMU's x axis, None if uncertain."""
     t_imu, _, f_b = imu
-    push = np.diff(integral_at((pair.t[:-1] + pair.t[1:]) / 2, t_imu, f_b[:, 0]))
-    push = push - np.median(push)
-    score = [_correlation(np.diff(step), push) for step in steps]
+    acceleration = np.diff(integral_at((pair.t[:-1] + pair.t[1:]) / 2, t_imu, f_b[:, 0]))
+    acceleration = acceleration - np.median(acceleration)
+    score = [_correlation(np.diff(step), acceleration) for step in steps]
     if score[0] * score[1] < 0 and min(np.abs(score)) > FAULT_SIGMAS:
         return int(np.argmin(score))
     return None
 
 
 def _correlation(a: Floats, b: Floats) -> float:
-    """Return the correlation of pair series about zero, in sigmas of uncorrelated ones."""
+    """Return the correlation of two series without mean, in sigmas of uncorrelated ones."""
     power = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / power * np.sqrt(len(a)) if power else 0.0

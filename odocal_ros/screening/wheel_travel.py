@@ -56,8 +56,8 @@ def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
     is_integer = np.issubdtype(value.dtype, np.integer)
     jump = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
-    least_jump = 8.0    # counts, smallest jump against the travel
-    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + least_jump * is_integer, 1.5 * top)
+    min_jump = 8.0    # counts, smallest jump against the travel
+    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + min_jump * is_integer, 1.5 * top)
     rows = np.flatnonzero(large & (jump * usual <= 0))      # a frozen counter catches up forwards
     if not len(rows):
         return None
@@ -83,8 +83,8 @@ def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[
     single_limit = np.inf if len(rows) > 1 else 0.01 * known
     if abs(known - size) <= min(tolerance, single_limit):
         return known, 0.0
-    fewest_jumps = 3    # for a span that is not a known one
-    if len(rows) < fewest_jumps:
+    min_jumps = 3    # for a span that is not a known one
+    if len(rows) < min_jumps:
         return np.nan, 0.0
     if not is_integer:
         return size, tolerance / np.sqrt(3 * len(rows))

@@ -232,10 +232,10 @@ def _check(options: SimOptions) -> None:
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: required: A:B, seconds with 0 <= A < B')
-    most_samples = 20_000_000    # of one topic; more would not fit in memory
-    if options.duration * options.imu_rate > most_samples:
+    max_samples = 20_000_000    # of one topic; more would not fit in memory
+    if options.duration * options.imu_rate > max_samples:
         raise BadUsage(f'--duration {options.duration:g} at --imu-rate {options.imu_rate:g}: more '
-                       f'than {most_samples:,} samples; lower one of them')
+                       f'than {max_samples:,} samples; lower one of them')
 
 
 def _check_number(name: str, value: float) -> None:

@@ -15,8 +15,8 @@ from odocal_reproductions.patent.embodiment import (
     embodiment,
     FOUND,
     imbalance,
-    least_rows,
     LEVELS,
+    min_rows,
     nearly_balanced,
     PRINTED,
     RADIUS,
@@ -96,10 +96,10 @@ def test_one_wrong_cell_makes_an_array_unbalanced():
 
 def test_no_array_smaller_than_all_441_is_orthogonal_for_the_embodiment():
     # each pair of columns needs a multiple of its 49 or 63 pairs of levels
-    assert least_rows(LEVELS) == 49 * 63 // gcd(49, 63) == 441 == len(full_factorial(LEVELS))
+    assert min_rows(LEVELS) == 49 * 63 // gcd(49, 63) == 441 == len(full_factorial(LEVELS))
     assert imbalance(full_factorial(LEVELS), LEVELS) == 0.0
-    assert least_rows((3, 3, 3)) == 9
-    assert least_rows((5,)) == 5
+    assert min_rows((3, 3, 3)) == 9
+    assert min_rows((5,)) == 5
 
 
 def test_the_printed_combinations_are_levels_but_not_balanced():

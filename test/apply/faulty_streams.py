@@ -58,11 +58,11 @@ def columns_of(drive):
                          'value': odometer.value.copy()}}
 
 
-def some_rows(rng, topic, most_s=3.0):
+def some_rows(rng, topic, max_s=3.0):
     """Return a slice of consecutive rows: one row up to some seconds."""
     n = len(topic['stamp'])
     rate = 1e9 / np.median(np.diff(topic['arrival']))
-    count = int(min(rng.choice([1, 1, 2, 3, 5, 10, rng.uniform(0, most_s) * rate]), n // 4)) or 1
+    count = int(min(rng.choice([1, 1, 2, 3, 5, 10, rng.uniform(0, max_s) * rate]), n // 4)) or 1
     begin = rng.randrange(int(3 * rate), n - count)
     return slice(begin, begin + count)
 

@@ -75,11 +75,11 @@ def rows_of(drive):
         topic.time_ns, topic.pack(slice(0, len(topic.time_ns))), strict=True)] for topic in topics}
 
 
-def some(rng, rows, kind, most_s=30.0):
+def some(rng, rows, kind, max_s=30.0):
     """Return a slice of consecutive rows of a type: one, a few, or some seconds."""
     n = len(rows[kind])
     rate = n / 240.0
-    count = max(1, int(min(rng.choice([1, 2, 5, rng.uniform(0, most_s) * rate]), n // 3)))
+    count = max(1, int(min(rng.choice([1, 2, 5, rng.uniform(0, max_s) * rate]), n // 3)))
     begin = rng.randrange(n - count)
     return slice(begin, begin + count)
 

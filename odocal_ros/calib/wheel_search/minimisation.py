@@ -161,8 +161,8 @@ class _BoxSearch:
         step_limit = 1e-6    # share of the first half range, largest last step
         small = np.abs(S @ move) <= step_limit * self.space.bounds(self.first_half)
         # share of the criterion: the box is not shrunk if its curvature contributes less
-        least_curvature = 1e-6
-        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < least_curvature * self.least)
+        min_curvature = 1e-6
+        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < min_curvature * self.least)
         narrow = 1e-3    # share of the first width, box of the last surface
         converged = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
         outside = np.abs(move) > self.w

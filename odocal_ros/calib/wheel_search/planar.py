@@ -105,9 +105,9 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
-    least_m = 10.0        # between two fixes for a course
-    least_sigmas = 20.0   # of a fix: the sigma of a course is then 4 deg
-    ends = separated_fixes(fixes_n, max(least_m, least_sigmas * float(np.median(sigma))))
+    min_m = 10.0        # between two fixes for a course
+    min_sigmas = 20.0   # of a fix: the sigma of a course is then 4 deg
+    ends = separated_fixes(fixes_n, max(min_m, min_sigmas * float(np.median(sigma))))
     return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
 
 

@@ -159,8 +159,8 @@ def _compose(transitions: Floats) -> None:
 
     A parallel scan: blocks of transitions are composed side by side, then their ends by recursion.
     """
-    most_steps = 64    # of a block
-    width = min(most_steps, max(2, int(np.sqrt(len(transitions)))))
+    max_steps = 64    # of a block
+    width = min(max_steps, max(2, int(np.sqrt(len(transitions)))))
     for k in range(1, min(width, len(transitions))):
         step = transitions[k::width]
         step[:] = _product(step, transitions[k - 1::width][:len(step)])

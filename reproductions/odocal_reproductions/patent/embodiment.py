@@ -97,7 +97,7 @@ def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
     return worst
 
 
-def least_rows(levels: tuple[int, ...]) -> int:
+def min_rows(levels: tuple[int, ...]) -> int:
     """Return the smallest number of rows of an orthogonal array; others are multiples."""
     return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \
         else int(levels[0])
@@ -154,7 +154,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
              row('response surface', refined.x), row('  wheels together', together.x),
              row('least squares', direct.x), row('  wheels together', direct_together.x)]
     rows += [] if truth is None else [row_of('truth', truth)]
-    return Embodiment(tuple(rows), imbalance(array, LEVELS), least_rows(LEVELS), *best, refined,
+    return Embodiment(tuple(rows), imbalance(array, LEVELS), min_rows(LEVELS), *best, refined,
                       direct, radius, means.reshape(LEVELS).min(axis=2))
 
 
