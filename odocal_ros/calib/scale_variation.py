@@ -71,8 +71,8 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     median is the lower limit of the error.
     """
     total = path[-1] - path[0] if len(path) else 0.0
-    fewest = 8      # fixes of a section, twice the parameters of its fit
-    count = int(min(10, len(path) // fewest, total // 10.0))      # tenths, of 10 m at least
+    min_fixes = 8      # of a section, twice the parameters of its fit
+    count = int(min(10, len(path) // min_fixes, total // 10.0))      # tenths, of 10 m at least
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
     edges = path[0] + total * np.linspace(0.0, 1.0, count + 1)
@@ -82,7 +82,7 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     fits = {}
     for i in range(count):
         rows = np.flatnonzero(part == i)
-        if len(rows) >= fewest and np.ptp(path[rows]) > 0:
+        if len(rows) >= min_fixes and np.ptp(path[rows]) > 0:
             # means of fixes: 24 of them, with little noise from fix to fix
             blocks = np.array_split(rows, min(len(rows), 24))
             source, target = (np.array([x[b].mean() for b in blocks]) for x in (reckoned, fixed))

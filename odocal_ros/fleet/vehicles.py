@@ -192,7 +192,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     since = current[0].leg.start_ns
     row |= {'current_bags': [r.bag for r in done if r.start_ns >= since or r is done[-1]],
             'report': None}
-    legs = [_leg_row(job, k, entry, starts, histories) for k, entry in enumerate(driven)]
+    legs = [_leg_row(row, k, entry, starts, histories) for k, entry in enumerate(driven)]
     inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
                    for r in done)
     return Vehicle(row, legs, calibration, config, inputs)
@@ -251,9 +251,9 @@ def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) ->
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
-def _leg_row(job: VehicleJob, k: int, entry: DrivenLeg, starts: Sequence[int],
+def _leg_row(row: dict[str, Any], k: int, entry: DrivenLeg, starts: Sequence[int],
              histories: dict[str, ValueHistory]) -> dict[str, Any]:
-    model = next((b.model for b in job.bags if b.model), '')
-    return leg_row(job.vehicle, model, k + 1, entry.odometer_km, entry.leg) | {
+    """Return the row of leg k of a vehicle; row : of the vehicle."""
+    return leg_row(row['vehicle'], row['model'], k + 1, entry.odometer_km, entry.leg) | {
         'period': sum(start <= k for start in starts),
         'odd': any(k in values.outlier_legs for values in histories.values())}

@@ -214,9 +214,7 @@ class SmootherSoFar:
         if reason:
             raise BadData(reason.text)
         _raise_if_unusable(screened.reasons)
-        located = locate_fixes(inputs, config)
-        if not located.rough:
-            raise BadData('the scale is not known yet')
+        located = _locate_or_raise(inputs, config)
         _raise_if_unusable(orientation_reasons(estimate_orientation(inputs, located.rough),
                                                config.imu.nominal_yaw))
         if vars(located.origin) != (self._origin and vars(self._origin)):

@@ -34,7 +34,7 @@ Recorded: TypeAlias = 'Bag | Recording'     # an open bag, or one that was read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 # judgement: of the distance; a first stop after this share does not start a leg
 LATEST_START_SHARE = 0.2
-CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within this time
+COVERAGE_TOLERANCE_NS = 10 * 10**9    # judgement: drivers and recorders start and stop within it
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
 
@@ -75,7 +75,7 @@ def coverage_reasons(recorder: LegRecorder) -> tuple[Reason, ...]:
             for slot, (a, b) in ends.items()
             for verb, missing_ns, relation in (('begins', a - begin, 'after the first topic'),
                                                ('ends', end - b, 'before the last topic'))
-            if missing_ns > CUT_SHORT_NS]
+            if missing_ns > COVERAGE_TOLERANCE_NS]
     return (Reason(Code.TOPIC_GAP, f'{", ".join(gaps)}: the leg is limited to the time '
                    'that all topics cover', 'Wait for messages of all topics and the first fix '
                    'before the drive, and record to its end. If a topic failed, check its driver, '

@@ -26,7 +26,7 @@ from odocal_ros.settings.config import Config
 if TYPE_CHECKING:
     from odocal_ros.library.read_bag import JournalNotes
 
-LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of this
+MAX_GPX_BYTES = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of this
 MAX_DRIVE_TIME = 36_000.0      # of a planned drive, judgement: ten hours
 
 
@@ -104,7 +104,7 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
     """Return times since the first point, s (None: none given), and (n, 3) geodetic, rad, m."""
     from xml.etree import ElementTree
     try:
-        root = ElementTree.fromstring(read_bytes(Path(path), LONGEST_TRACK))
+        root = ElementTree.fromstring(read_bytes(Path(path), MAX_GPX_BYTES))
     except OSError as error:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); give the path of a GPX '
                        'file') from None

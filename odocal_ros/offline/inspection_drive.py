@@ -41,9 +41,9 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
 
-# judgement: no vehicle drives this share of a recording backwards; with a counter that counts
-# down, the IMU would seem to be mounted backwards
-MOST_OF_TRAVEL = 0.5
+# judgement: of the path length; no vehicle drives a larger net share of a recording backwards.
+# With a counter that counts down, the IMU would seem to be mounted backwards
+MAX_BACKWARD_SHARE = 0.5
 
 
 def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, content: dict[str, Any],
@@ -143,7 +143,7 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
     is_configured = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
     options = []
-    if not is_configured and step.sum() < -MOST_OF_TRAVEL * np.abs(step).sum():
+    if not is_configured and step.sum() < -MAX_BACKWARD_SHARE * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
     axes = estimate_mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
@@ -178,7 +178,7 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
         return []
     base = (first - bag.start_ns) * 1e-9
 
-    def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
+    def entry_of(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         in_leg = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
         path_length, chord = path_and_chord(inputs.t_fix[in_leg], located.fixes_n[in_leg],
@@ -188,12 +188,12 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
 
     marks = marked_legs(bag)
     stops = standstills_of(inputs, first, config)
-    content['legs'] = [described(a, b, marked=bool(marks))
-                     for a, b in find_legs(recorder, bag, [], marks, config, stops)]
+    content['legs'] = [entry_of(a, b, marked=bool(marks))
+                       for a, b in find_legs(recorder, bag, [], marks, config, stops)]
     each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(rests) > 2 else []
-    content['each_stop'] = [described(a, b) for a, b in each]
+    content['each_stop'] = [entry_of(a, b) for a, b in each]
     content['straight'] = [
-        described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
+        entry_of(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(rests, *ends)
             for ends in survey.straight_sections(inputs, located, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
@@ -220,6 +220,18 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
 def missing_input_reasons(content: dict[str, Any], mapping: dict[str, str],
                           config: Config) -> list[Reason]:
     """Return the reasons for missing or unusable inputs, and for parts that the drive lacks."""
+    reasons, drive = _topic_reasons(content, mapping, config), content['drive']
+    if not drive:
+        return reasons
+    reasons += _standstill_reasons(content) + _leg_reasons(content['legs'], config)
+    if 0 < drive['fastest'] < config.leg.min_speed:
+        reasons.append(speed_reason(drive['fastest'], config.leg.min_speed))
+    return reasons + _heading_reasons(content, mapping, config)
+
+
+def _topic_reasons(content: dict[str, Any], mapping: dict[str, str],
+                   config: Config) -> list[Reason]:
+    """Return the reasons for inputs without a topic or without usable messages."""
     topics = {topic['name']: topic for topic in content['topics']}
     reasons = []
     for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,
@@ -233,38 +245,40 @@ def missing_input_reasons(content: dict[str, Any], mapping: dict[str, str],
                 Reason(code, f'no topic for the {word}',
                        f'Record it, or name it with --{slot}-topic.'))
         elif 'trouble' in facts and 'timing' not in facts:
-            reasons.append(Reason(code, f'{facts["name"]}: no message can be used: '
-                                  f'{facts["trouble"]}',
-                                  'Check the type and the driver of the topic, '
-                                  'or name another topic.'))
-    drive = content['drive']
-    if not drive:
-        return reasons
-    legs = content['legs']
-    if not content['standstills']:
-        slowest = (f': its lowest speed (mean over 1 s) is {drive["slowest"]:.2f} '
-                   'm/s') * (drive['slowest'] > 0)
-        reasons.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
-    elif legs and not any(abs(leg['start'] - stop) < 1.0
-                          for leg in legs for _, stop in content['standstills']):
-        reasons.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
-                              f'at {content["standstills"][0][0]:.1f} s'))
+            reasons.append(Reason(
+                code, f'{facts["name"]}: no message can be used: {facts["trouble"]}',
+                'Check the type and the driver of the topic, or name another topic.'))
+    return reasons
+
+
+def _standstill_reasons(content: dict[str, Any]) -> list[Reason]:
+    """Return NO_STANDSTILL if the vehicle does not stand before a leg."""
+    standstills, slowest = content['standstills'], content['drive']['slowest']
+    starts = [leg['start'] for leg in content['legs']]
+    if not standstills:
+        speed = f': its lowest speed (mean over 1 s) is {slowest:.2f} m/s' * (slowest > 0)
+        return [Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{speed}')]
+    if starts and not any(abs(start - stop) < 1.0 for start in starts for _, stop in standstills):
+        return [Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is at '
+                       f'{standstills[0][0]:.1f} s')]
+    return []
+
+
+def _leg_reasons(legs: list[dict[str, Any]], config: Config) -> list[Reason]:
+    """Return the reasons for legs that are too short, or that end where they start."""
     short = [leg for leg in legs if leg['distance'] < config.leg.min_distance]
     loops = [leg for leg in legs if leg not in short and is_closed(leg)]
-    limit = f'{config.leg.min_distance:g} m'
+    reasons = []
     for affected, code, template in (
-            (short, Code.LEG_TOO_SHORT,
-             'has a path length of {distance:.0f} m; ' f'the limit is {limit}'),
+            (short, Code.LEG_TOO_SHORT, 'has a path length of {distance:.0f} m; the limit is '
+             f'{config.leg.min_distance:g} m'),
             (loops, Code.CHORD_TOO_SHORT, 'is a loop: {chord:.0f} m from start to end, less than '
              'a fifth of the path length of {distance:.0f} m')):
         if affected:
-            count_text = '' if len(affected) == 1 else (
-                f'{len(affected)} of {len(legs)} legs; for example, ')
-            reasons.append(Reason(code, count_text + 'the leg {start:.1f}:{stop:.1f} s '.format(
-                **affected[0]) + template.format(**affected[0])))
-    if 0 < drive['fastest'] < config.leg.min_speed:
-        reasons.append(speed_reason(drive['fastest'], config.leg.min_speed))
-    return reasons + _heading_reasons(content, mapping, config)
+            several = f'{len(affected)} of {len(legs)} legs; for example, ' * (len(affected) > 1)
+            text = f'{several}the leg {{start:.1f}}:{{stop:.1f}} s {template}'
+            reasons.append(Reason(code, text.format(**affected[0])))
+    return reasons
 
 
 def _heading_reasons(content: dict[str, Any], mapping: dict[str, str],

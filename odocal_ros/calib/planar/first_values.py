@@ -92,8 +92,8 @@ def _windows(path: Floats) -> Ints:
     length = max(WINDOW, WINDOW_STEPS * usual)
     begins = np.arange(path[0], max(path[-1] - length / 2, path[0] + 1e-9), length / 2)
     spans = np.stack([np.searchsorted(path, begins), np.searchsorted(path, begins + length)], -1)
-    fewest = 3      # positions
-    spans = spans[spans[:, 1] - spans[:, 0] >= fewest]
+    min_positions = 3
+    spans = spans[spans[:, 1] - spans[:, 0] >= min_positions]
     return spans if len(spans) else np.array([[0, len(path)]])
 
 
