@@ -53,11 +53,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     usable = [leg for leg in usable if leg not in overlapping]
     used = usable or legs
     method_names = dict.fromkeys(name for leg in used for name in leg.methods)
-    smoother_results = [leg.methods[SMOOTHER] for leg in used if SMOOTHER in leg.methods]
-    # earlier legs with another scale unit, or not earlier, are of no use
-    if carried and (min(leg.start_ns for leg in used) <= carried.last_ns or any(
-            m.estimates['scale_factor'].unit != carried.unit for m in smoother_results)):
-        carried = None
+    carried = carried if carried and _precedes(carried, used) else None
     # the IMU constants must be by other legs than these
     earlier = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
@@ -89,6 +85,13 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
                        _information_for_later_legs(methods, usable, carried))
+
+
+def _precedes(carried: CarriedInformation, legs: Sequence[LegResult]) -> bool:
+    """Return True if information is of legs before these, in the same unit of the scale."""
+    return carried.last_ns < min(leg.start_ns for leg in legs) and all(
+        leg.methods[SMOOTHER].estimates['scale_factor'].unit == carried.unit
+        for leg in legs if SMOOTHER in leg.methods)
 
 
 def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],

@@ -31,6 +31,7 @@ AXES = 'xyz'
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
 ROUNDING = 1e-9                 # rad/s, definition: rounding of a zero rate by rotations
 MAX_RATE = 8.0                  # rad/s, physical: vehicles on wheels turn more slowly
+NO_GRAVITY = 0.01               # m/s^2, physical: far below gravity, in any unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,35 +180,9 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
     turn rate in it, rad/s.   C_bi : (3, 3) configured nominal rotation.   imu : settings, whose
     scales are already applied. With a reason of UNUSABLE no result is possible.
     """
-    bias, size = medians(w_b), float(np.linalg.norm(median_f_b))
-    top_rate = float(np.percentile(by_row(lambda w: lengths(w - bias), w_b), 99.9,
-                                   overwrite_input=True))
-    reasons = []
-    if not any(w_b[some].any() for some in chunks(len(w_b))):
-        reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
-                              'imu.gyro_scale is 0', 'Check the gyro in the IMU driver, or name '
-                              'another topic with --imu-topic.'))
-    no_gravity = 0.01    # m/s^2, far below gravity in any unit
-    if size < no_gravity:
-        reasons.append(Reason(Code.NO_IMU, 'the acceleration contains no gravity: the IMU '
-                              'publishes none or removes gravity, or imu.accel_scale is 0',
-                              'Publish accelerations that include gravity (REP-145).'))
+    reasons, size = _unit_reasons(median_f_b, w_b, imu), float(np.linalg.norm(median_f_b))
+    if size < NO_GRAVITY:
         return tuple(reasons), False
-    if not 0.85 * G < size < 1.15 * G:
-        if 0.85 < size < 1.15:
-            text = f'gravity is {size:.3f} instead of 9.8 m/s^2: the unit is probably g'
-            remedy = (f'Set imu.accel_scale to {9.80665 * imu.accel_scale:.10g}, or publish m/s^2 '
-                      '(REP-145).')
-        else:
-            text = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2'
-            remedy = ''
-        reasons.append(Reason(Code.IMU_UNITS, text, remedy))
-    if top_rate > MAX_RATE:
-        reasons.append(Reason(
-            Code.IMU_UNITS, f'the gyro measures {top_rate:.3g} rad/s; the limit for a vehicle is '
-            f'{MAX_RATE:g} rad/s: the unit is probably deg/s',
-            f'Set imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
-            '(REP-145).'))
     up = median_f_b / size
     upright = int(np.argmax(np.abs(up @ C_bi)))
     if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()
@@ -225,3 +200,36 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
         return tuple(reasons), True
     reasons.append(Reason(Code.IMU_AXES, f'{text}: the body frame is not forward-left-up'))
     return tuple(reasons), False
+
+
+def _unit_reasons(median_f_b: Floats, w_b: Floats, imu: ImuConfig) -> list[Reason]:
+    """Return reasons about missing or wrongly scaled signals; as ``unit_and_axis_reasons``."""
+    bias, size = medians(w_b), float(np.linalg.norm(median_f_b))
+    top_rate = float(np.percentile(by_row(lambda w: lengths(w - bias), w_b), 99.9,
+                                   overwrite_input=True))
+    reasons = []
+    if not any(w_b[some].any() for some in chunks(len(w_b))):
+        reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
+                              'imu.gyro_scale is 0', 'Check the gyro in the IMU driver, or name '
+                              'another topic with --imu-topic.'))
+    if size < NO_GRAVITY:
+        return [*reasons, Reason(
+            Code.NO_IMU, 'the acceleration contains no gravity: the IMU publishes none or removes '
+            'gravity, or imu.accel_scale is 0',
+            'Publish accelerations that include gravity (REP-145).')]
+    if not 0.85 * G < size < 1.15 * G:
+        if 0.85 < size < 1.15:
+            text = f'gravity is {size:.3f} instead of 9.8 m/s^2: the unit is probably g'
+            remedy = (f'Set imu.accel_scale to {9.80665 * imu.accel_scale:.10g}, or publish m/s^2 '
+                      '(REP-145).')
+        else:
+            text = f'the IMU measures a gravity of {size:.3g} m/s^2 instead of 9.8 m/s^2'
+            remedy = ''
+        reasons.append(Reason(Code.IMU_UNITS, text, remedy))
+    if top_rate > MAX_RATE:
+        reasons.append(Reason(
+            Code.IMU_UNITS, f'the gyro measures {top_rate:.3g} rad/s; the limit for a vehicle is '
+            f'{MAX_RATE:g} rad/s: the unit is probably deg/s',
+            f'Set imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
+            '(REP-145).'))
+    return reasons
