@@ -99,43 +99,57 @@ def driven_text(legs: tuple[result.LegResult, ...]) -> str:
 def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
     """Return a line for each value."""
     estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
-    scale, ratio = (texts.finite_estimate(estimates, n) for n in ('scale_factor', 'scale_ratio'))
+    wheels, rotation = _wheel_lines(estimates), rotation_text(calibration, width)
+    lines = _scale_lines(calibration)
+    for name, label in _angles_of(estimates).items():
+        angle = texts.finite_estimate(estimates, name)
+        lines.append(_line(f'{label} mounting', _angle_text(angle, width)))
+    lines += [*_largest_error_lines(calibration, width), *wheels.values(),
+              *_other_lines(estimates, wheels, width),
+              *(_lever_arm_line(estimates, name, result.name_antenna(label, local), width)
+                for name, label in ARMS.items()),
+              _gyro_scale_line(calibration), _gyro_bias_line(estimates),
+              rotation and _line('IMU on the vehicle', rotation)]
+    return [line for line in lines if line]
+
+
+def _scale_lines(calibration: result.Calibration) -> list[str]:
+    """Return the lines of the scale factor, its ratios and its inverse."""
+    scale, ratio, as_sent = (texts.finite_estimate(calibration.estimates, name) for name in (
+        'scale_factor', 'scale_ratio', result.AS_SENT))
     lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in texts.COUNTS:
         lines.append(_line('', texts.inverse_text(scale)))
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{texts.with_sigma(ratio.value, ratio.sigma)}   '
                            f'({texts.deviation_text(ratio.value, ratio.sigma)})'))
-    as_sent = texts.finite_estimate(estimates, result.AS_SENT)
     if as_sent.value is not None:
         lines.append(_line('  of the raw speed', _scale_text(as_sent)))
-    lines.append(_path_ratio_line(calibration, scale, as_sent))
-    for name, label in _angles_of(estimates).items():
-        angle = texts.finite_estimate(estimates, name)
-        lines.append(_line(f'{label} mounting', _angle_text(angle, width)))
-    lines += _largest_error_lines(calibration, width)
-    wheels = _wheel_lines(estimates)
-    lines += wheels.values()
+    return [*lines, _path_ratio_line(calibration, scale, as_sent)]
+
+
+def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str],
+                 width: int) -> list[str]:
+    """Return the lines of the values that the other functions do not show."""
+    lines, note = [], '   heading error minus yaw mounting' * (width >= texts.WIDTH)
     for name in estimates:
         estimate = texts.finite_estimate(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
                         *wheels) and name[:-2] not in ARMS and estimate.value is not None:
-            text = texts.with_unit(estimate)
-            if name == 'heading_error':
-                text = _angle_text(estimate, 0) + (
-                    '   heading error minus yaw mounting' if width >= texts.WIDTH else '')
+            text = (f'{_angle_text(estimate, 0)}{note}' if name == 'heading_error'
+                    else texts.with_unit(estimate))
             lines.append(_line(tables.source_label(name), text))
-    lines += [_lever_arm_line(estimates, name, result.name_antenna(label, local), width)
-              for name, label in ARMS.items()]
-    lines.append(_gyro_scale_line(calibration))
+    return lines
+
+
+def _gyro_bias_line(estimates: dict[str, result.Estimate]) -> str:
+    """Return the line of the gyro bias, empty if an axis is not known."""
     biases = [texts.finite_estimate(estimates, name) for name in BIASES]
-    if all(bias.value is not None for bias in biases):
-        shown = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
-                          for bias in biases)
-        lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
-    if rpy := rotation_text(calibration, width):
-        lines.append(_line('IMU on the vehicle', rpy))
-    return [line for line in lines if line]
+    if any(bias.value is None for bias in biases):
+        return ''
+    shown = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
+                      for bias in biases)
+    return _line('gyro bias x, y, z', f'{shown} deg/h')
 
 
 def rotation_text(calibration: result.Calibration, width: int = texts.WIDTH) -> str:
