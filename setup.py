@@ -60,7 +60,7 @@ setup(
         'Topic :: Scientific/Engineering',
     ],
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={f'{NAME}.{room}': ['templates/*'] for room in ('fleet', 'output')},
+    package_data={f'{NAME}.{package}': ['templates/*'] for package in ('fleet', 'output')},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),

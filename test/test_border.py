@@ -21,7 +21,7 @@ HEAVY = ('rclpy', 'rosbags', 'yaml', 'matplotlib', 'scipy', 'pyproj', 'tqdm')
 ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
        'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
 # packages in the order of the data, and those above that each uses; all: errors, reasons
-ROOMS = {
+PACKAGES = {
     'safe_io': '', 'data': '',
     'settings': 'data safe_io',
     'nav': 'data settings',
@@ -49,8 +49,8 @@ def _modules():
     return sorted(PACKAGE.rglob('*.py'))
 
 
-def _part(path):
-    """Return the folder of the package, or the module that lies directly in it."""
+def _package_of(path):
+    """Return the package of a module, or its own name if it is in none."""
     first = path.relative_to(PACKAGE).parts[0]
     return first.removesuffix('.py')
 
@@ -68,8 +68,8 @@ def _imports(path):
     return names
 
 
-def _own_parts(path):
-    """Return the parts of the package that a module imports."""
+def _imported_packages(path):
+    """Return the packages of odocal_ros that a module imports."""
     names = (name.split('.') for name in _imports(path))
     return {name[1] for name in names if name[0] == 'odocal_ros' and len(name) > 1
             and not name[1].startswith('_')}
@@ -91,9 +91,9 @@ def test_a_method_that_does_not_run_is_not_imported():
     probe = ('import odocal_ros.library.calibrate_bag, odocal_ros.pipeline.calibrate, '
              'odocal_ros.output.files, odocal_ros.output.stored, '
              'odocal_ros.library.find_legs, sys\n'
-             "rooms = ('odocal_ros.estimator', 'odocal_ros.calib.wheel_search', "
+             "packages = ('odocal_ros.estimator', 'odocal_ros.calib.wheel_search', "
              "'odocal_ros.calib.wheels.')\n"
-             'print([m for m in sys.modules if m.startswith(rooms)'
+             'print([m for m in sys.modules if m.startswith(packages)'
              " and m != 'odocal_ros.calib.slip'])")
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
@@ -110,17 +110,18 @@ def test_help_and_usage_errors_import_not_even_numpy():
 
 
 def test_ros_rosbags_and_reproductions_are_imported_only_where_allowed():
-    users = {_part(p) for p in _modules() for name in _imports(p) if name.split('.')[0] in ROS}
+    users = {_package_of(p) for p in _modules() for name in _imports(p)
+             if name.split('.')[0] in ROS}
     assert users == {'live'}
     assert not {name for path in _modules() for name in _imports(path)
                 if name.startswith('odocal_reproductions')}
-    users = {_part(p) for p in _modules() for name in _imports(p)
+    users = {_package_of(p) for p in _modules() for name in _imports(p)
              if name.split('.')[0] == 'rosbags'}
     assert users == {'bagio'}
 
 
 def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
-    users = {_part(p) for p in _modules() for name in _imports(p)
+    users = {_package_of(p) for p in _modules() for name in _imports(p)
              if name.split('.')[0] in ('dask', 'distributed', 'fsspec')}
     assert users == {'fleet'}
     probe = ('import odocal_ros.fleet.command, odocal_ros.fleet.fleet_results, '
@@ -130,34 +131,36 @@ def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 
-@pytest.mark.parametrize('room', ROOMS)
-def test_a_package_uses_only_those_in_the_table(room):
-    used = {part for p in _modules() if _part(p) == room for part in _own_parts(p)}
-    assert used - COMMON - {room} == set(ROOMS[room].split())
+@pytest.mark.parametrize('package', PACKAGES)
+def test_a_package_uses_only_those_in_the_table(package):
+    used = {other for p in _modules() if _package_of(p) == package
+            for other in _imported_packages(p)}
+    assert used - COMMON - {package} == set(PACKAGES[package].split())
 
 
 def test_live_and_forecast_use_only_public_names_of_the_estimator():
-    face = {f'odocal_ros.estimator.{name}' for name in estimator.__all__}
+    public = {f'odocal_ros.estimator.{name}' for name in estimator.__all__}
     # forecasts of planned drives
     planned = ('ideal_samples', 'planned_indoor', 'planned_methods')
-    used = {name for path in _modules() if _part(path) in ('live', 'forecast')
+    used = {name for path in _modules() if _package_of(path) in ('live', 'forecast')
              and path.stem not in planned
              for name in _imports(path) if name.startswith('odocal_ros.estimator')}
     assert used
-    assert used <= face
+    assert used <= public
 
 
 def test_the_table_has_all_packages_in_order():
-    order = list(ROOMS)
-    for room, used in ROOMS.items():      # no circular imports
-        assert all(order.index(other) < order.index(room) for other in used.split()), room
-    assert {_part(p) for p in _modules()} == set(ROOMS) | COMMON | {'__init__', '__main__'}
+    order = list(PACKAGES)
+    for package, used in PACKAGES.items():      # no circular imports
+        assert all(order.index(other) < order.index(package) for other in used.split()), package
+    found = {_package_of(p) for p in _modules()}
+    assert found == set(PACKAGES) | COMMON | {'__init__', '__main__'}
     for common in COMMON:
-        assert not _own_parts(PACKAGE / f'{common}.py')
+        assert not _imported_packages(PACKAGE / f'{common}.py')
 
 
 def test_pure_packages_use_no_clock_and_no_file():
-    pure = [p for p in _modules() if _part(p) in (
+    pure = [p for p in _modules() if _package_of(p) in (
         'nav', 'screening', 'calib', 'estimator', 'pipeline', 'forecast', 'apply')
             and p.stem != 'leg_so_far']      # it measures how long its own passes take
     assert len(pure) > 10
@@ -173,4 +176,4 @@ def test_pure_packages_use_no_clock_and_no_file():
 def test_each_package_has_a_core_test():
     marked = [path for path in Path(__file__).parent.rglob('test_*.py')
               if 'pytest.mark.core' in path.read_text(encoding='utf-8')]
-    assert set(ROOMS) - set().union(*map(_own_parts, marked)) == set()
+    assert set(PACKAGES) - set().union(*map(_imported_packages, marked)) == set()

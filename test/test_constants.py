@@ -15,7 +15,7 @@ import re
 import odocal_ros
 
 PACKAGE = Path(odocal_ros.__file__).parent
-ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'estimator', 'pipeline', 'forecast',
+PACKAGES = ('data', 'nav', 'screening', 'settings', 'calib', 'estimator', 'pipeline', 'forecast',
          'apply', 'live')
 # indices of unknowns in a vector: two vectors may contain the same quantity
 LAYOUTS = ('estimator/state.py', 'apply/errors.py')
@@ -63,8 +63,8 @@ def _unmarked(text):
 
 def test_no_two_modules_use_one_name_for_two_numbers():
     homes = defaultdict(list)
-    for room in ROOMS:
-        for path in (PACKAGE / room).rglob('*.py'):
+    for package in PACKAGES:
+        for path in (PACKAGE / package).rglob('*.py'):
             where = path.relative_to(PACKAGE).as_posix()
             if where not in LAYOUTS:
                 for name in _numbers(ast.parse(path.read_text(encoding='utf-8'))):

@@ -72,9 +72,9 @@ def test_each_source_file_has_a_copyright_and_a_licence():
     head = '\n'.join(f'# {line}' for line in text.splitlines())
     assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
     assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
-    rooms = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',
+    folders = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',
              'docs')
-    files = [path for room in rooms for path in (ROOT / room).rglob('*.py')]
+    files = [path for folder in folders for path in (ROOT / folder).rglob('*.py')]
     assert len(files) > 500
     assert [path for path in files if path.stat().st_size
             and head not in path.read_text(encoding='utf-8')[:1000]] == []

@@ -96,13 +96,13 @@ class SegmentedBag:
         if len(single) >= FILES_JOINED:
             self._join(single)
 
-    def finish(self, room: int | None = None) -> Path:
+    def finish(self, free_bytes: int | None = None) -> Path:
         """
         Join all segments into one file and write metadata.yaml; return the file.
 
-        If ``room``, bytes, or the disk is too small for the copy, the segments remain.
+        If ``free_bytes`` or the disk is too small for the copy, the segments remain.
         """
-        if room is None or self.size <= room:
+        if free_bytes is None or self.size <= free_bytes:
             try:
                 self.segments = [self._write(joined_name(self.folder), 0, self.segments[-1].last,
                                              _chunks_of(self.segments))]

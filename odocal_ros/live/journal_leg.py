@@ -205,7 +205,7 @@ class LegJournal:
     def _finish(self) -> None:
         assert self._bag is not None
         used_bytes = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
-        self._bag.finish(room=self.plan.limit - used_bytes - HEADS_BYTES)
+        self._bag.finish(free_bytes=self.plan.limit - used_bytes - HEADS_BYTES)
 
     def _give_up(self, trouble: str) -> None:
         self.trouble, self._is_closed, self._waiting = trouble, True, []

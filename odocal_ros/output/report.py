@@ -53,14 +53,14 @@ def report_html(calibration: result.Calibration, config: Config, content: dict[s
                        first=first, **_context(calibration, config, content))
 
 
-def render_page(room: str, name: str, **content: Any) -> str:
+def render_page(package: str, name: str, **content: Any) -> str:
     """Return the page of a template in ``templates`` of a package, with the style of reports."""
     from jinja2 import Environment, StrictUndefined
     home = files('odocal_ros')
     style = (home / 'output' / 'templates' / 'report.css').read_text(encoding='utf-8')
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
                            lstrip_blocks=True).from_string(
-        (home / room / 'templates' / name).read_text(encoding='utf-8'))
+        (home / package / 'templates' / name).read_text(encoding='utf-8'))
     return template.render(style=style, **content) + '\n'
 
 

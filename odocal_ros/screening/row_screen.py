@@ -59,7 +59,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     """Return the usable rows of a topic, and their times from the start mark, s: (n,)."""
     sent = leg.rows(slot)
     if slot in WHEELS:
-        sent = _zero_faded_speeds(sent)
+        sent = _with_zero_for_tiny_speeds(sent)
     good, impossible = _finite(sent, slot, leg, reasons)
     clean = sent if good.all() else take(sent, good)
     clean = _separate_equal_stamps(clean) if slot in WHEELS else clean
@@ -153,11 +153,11 @@ def _damaged(impossible: Bools, good: Bools, slot: str, reasons: list[Reason],
     return suspect
 
 
-def _zero_faded_speeds(samples: Any) -> Any:
+def _with_zero_for_tiny_speeds(samples: Any) -> Any:
     """Return odometer samples with zero for the tiny values of a decaying low-pass filter."""
     min_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
-    faded = (samples.value != 0) & (np.abs(samples.value) < min_value)
-    return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
+    tiny = (samples.value != 0) & (np.abs(samples.value) < min_value)
+    return replace(samples, value=np.where(tiny, 0, samples.value)) if tiny.any() else samples
 
 
 def _separate_equal_stamps(samples: Any) -> Any:

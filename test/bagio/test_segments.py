@@ -165,18 +165,18 @@ def test_a_kill_at_any_step_of_joining_neither_loses_nor_repeats_messages(tmp_pa
 
 def test_without_space_for_the_copy_the_segments_remain_the_bag(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 3)
-    bag.finish(room=bag.size - 1)
+    bag.finish(free_bytes=bag.size - 1)
     assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [part_name(k, k) for k in range(3)]
     assert read(bag.folder) == messages
     with rosbag2.Reader(bag.folder) as reader:
         assert reader.message_count == 120
 
 
-@pytest.mark.parametrize('room', [None, 0])
+@pytest.mark.parametrize('free_bytes', [None, 0])
 @pytest.mark.parametrize('metadata', [True, False])
-def test_a_mark_is_added_to_a_finished_bag(tmp_path, room, metadata):
+def test_a_mark_is_added_to_a_finished_bag(tmp_path, free_bytes, metadata):
     bag, messages = grown(tmp_path / 'leg', 3)
-    bag.finish(room)
+    bag.finish(free_bytes)
     late, more = second(7)
     bag.add(late)
     assert (bag.folder / joined_name(bag.folder, 1)).exists()

@@ -51,8 +51,8 @@ def test_public_names_are_documented_and_differ_from_modules():
     for name in SIGNATURES:
         assert 'Raises' in getattr(odocal_ros, name).__doc__, name
     from test_border import PACKAGE
-    rooms = {p.name for p in PACKAGE.iterdir()} | {p.stem for p in PACKAGE.glob('*.py')}
-    assert not rooms & set(odocal_ros.__all__)
+    packages = {p.name for p in PACKAGE.iterdir()} | {p.stem for p in PACKAGE.glob('*.py')}
+    assert not packages & set(odocal_ros.__all__)
     with pytest.raises(AttributeError, match='calibrate_bags'):
         _ = odocal_ros.calibrate_bags
 
