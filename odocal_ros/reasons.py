@@ -101,9 +101,9 @@ class Code(Enum):
                            'and its supply is stable; if the bias steps in each drive, replace '
                            'the IMU.')
     IMU_AXES_SKEW = CAUTION, ('Check signs and order of the gyro axes in the IMU driver. On flat '
-                              'ground a wrong gyro axis looks like this, and the pitch is then '
-                              'wrong. If the axes are right, set imu.misalignment_sigma to the '
-                              'value of this IMU.')
+                              'ground a wrong gyro axis causes this, and the pitch is then wrong. '
+                              'If the axes are right, set imu.misalignment_sigma to the '
+                              'misalignment of this IMU.')
     LEVER_ARM_OFF = CAUTION, ('Measure this lever arm and imu.lever_arm, and set them (from '
                               'base_link: x forward, y left, z up): only their difference is '
                               'estimated. A vehicle that slides in turns (skid steering, '

@@ -91,8 +91,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter counted up. Where the '
         'IMU shows the reversing, after a stop, this section was counted backwards.',
         Code.ODOMETER_REVERSED: 'The track runs opposite to the fixes: positive counts mean '
-        'backwards, or the IMU x axis points backwards. Accelerations then point backwards in '
-        'the IMU frame.',
+        'reverse motion, or the IMU x axis points backwards. Accelerations then point backwards '
+        'in the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
         '100 m or more of the drive, and 1 % of its path. If it counts again, the leg is cut '
         'there (`LEG_CUT`), also for 20 m or more in more than 20 s.',

@@ -172,11 +172,11 @@ def counter_change_reasons(parts: Sections, t_fix: Floats,
         return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
                        'per metre between fixes than before. Likely cause: the position or the '
                        'counter is frozen', 'Check the receiver (static hold) and the counter. '
-                       'Mark a leg on one side of the change with --leg.'),)
+                       'Mark a leg before or after the change with --leg.'),)
     return (Reason(Code.TRACK_MISMATCH, text + f'{factor:.2f} times as much per metre between '
                    'fixes as before. Likely cause: a change of decoding (x1, x2, x4), unit or '
-                   'gear', 'Check the odometer driver, and the fixes on both sides. Mark a leg on '
-                   'one side of the change with --leg.'),)
+                   'gear', 'Check the odometer driver, and the fixes before and after the change. '
+                   'Mark a leg before or after it with --leg.'),)
 
 
 def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:

@@ -239,8 +239,8 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
     deviation = abs(float(wrap(yaw - nominal_yaw(config))))
     if alignment.heading_separable and deviation > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs opposite to the fixes: '
-                           'positive counts mean backwards, or the IMU x axis points backwards '
-                           f'(yaw {np.rad2deg(yaw):+z.1f} deg)'),)
+                           'positive counts mean reverse motion, or the IMU x axis points '
+                           f'backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'),)
     elif alignment.heading_separable and deviation > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
                            f'course give a yaw mounting of {np.rad2deg(yaw):+z.1f} deg, '

@@ -187,4 +187,4 @@ class TwoPointRun:
                 and not chord.alignment.heading_separable):
             self.data_reasons.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
-                'mean backwards, or the vehicle reversed during the whole leg'))
+                'mean reverse motion, or the vehicle reversed during the whole leg'))

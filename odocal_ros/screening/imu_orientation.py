@@ -162,9 +162,9 @@ def orientation_reasons(orientation: ImuOrientation | None,
     observed = f'accelerations point {direction} in the IMU frame (yaw mounting {yaw_text})'
     reversed_limit = np.deg2rad(150.0)    # a reversed odometer looks the same
     if difference > reversed_limit:
-        return (Reason(Code.ODOMETER_REVERSED, f'{observed}: positive counts mean backwards, the '
-                       'IMU x axis points backwards, or the whole leg was driven in reverse with '
-                       'an unsigned counter'),)
+        return (Reason(Code.ODOMETER_REVERSED, f'{observed}: positive counts mean reverse motion, '
+                       'the IMU x axis points backwards, or the whole leg was driven in reverse '
+                       'with an unsigned counter'),)
     axes_limit = np.deg2rad(75.0)    # beyond any intended mounting
     if difference < axes_limit + 3 * orientation.sigma:
         return ()

@@ -63,7 +63,7 @@ class OdometerConfig:
     signed: bool = setting(True, read_only=True, about=(
         'False for pulses without direction: reversing is then detected from IMU and fixes, '
         'or rejects the leg.'))
-    reversed: bool = setting(False, read_only=True, about='Positive counts mean backwards.')
+    reversed: bool = setting(False, read_only=True, about='Positive counts mean reverse motion.')
     nominal_scale: float = setting(0.0, 'm/pulse, m/rad or 1', 0.0, 1e6, about='Scale factor as '
                                    'configured, K0; 0: unknown for counts, 1 for speeds.')
     max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Limit of the deviation from '

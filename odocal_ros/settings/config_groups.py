@@ -95,19 +95,29 @@ class UpdaterConfig:
 @dataclass(frozen=True, kw_only=True)
 class AcceptConfig:
     scale_factor_min: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Lower acceptance limit of the scale factor: value minus 2 sigma must not be below. NaN: '
-        'no limit.'))
+        'Lower acceptance limit of the scale factor: value minus 2 sigma '
+        'must not be below. NaN: no limit.'))
     scale_factor_max: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Upper acceptance limit: value plus 2 sigma must not be above.'))
-    scale_ratio_min: float = setting(NAN, '1', about='The same for the scale factor relative to '
-                                     'its nominal value.')
-    scale_ratio_max: float = setting(NAN, '1', about='The same.')
-    yaw_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the yaw mounting '
-                                            'angle.')
-    yaw_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
-    pitch_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the pitch mounting '
-                                              'angle.')
-    pitch_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
+        'Upper acceptance limit of the scale factor: value plus 2 sigma '
+        'must not be above. NaN: no limit.'))
+    scale_ratio_min: float = setting(NAN, '1', about=(
+        'Lower acceptance limit of scale factor over nominal scale factor: value minus 2 sigma '
+        'must not be below. NaN: no limit.'))
+    scale_ratio_max: float = setting(NAN, '1', about=(
+        'Upper acceptance limit of scale factor over nominal scale factor: value plus 2 sigma '
+        'must not be above. NaN: no limit.'))
+    yaw_mounting_angle_min: float = setting(NAN, 'rad', about=(
+        'Lower acceptance limit of the yaw mounting angle: value minus 2 sigma '
+        'must not be below. NaN: no limit.'))
+    yaw_mounting_angle_max: float = setting(NAN, 'rad', about=(
+        'Upper acceptance limit of the yaw mounting angle: value plus 2 sigma '
+        'must not be above. NaN: no limit.'))
+    pitch_mounting_angle_min: float = setting(NAN, 'rad', about=(
+        'Lower acceptance limit of the pitch mounting angle: value minus 2 sigma '
+        'must not be below. NaN: no limit.'))
+    pitch_mounting_angle_max: float = setting(NAN, 'rad', about=(
+        'Upper acceptance limit of the pitch mounting angle: value plus 2 sigma '
+        'must not be above. NaN: no limit.'))
     strict: bool = setting(False, about='A result with a caution does not pass; it is undecided.')
 
     def __post_init__(self) -> None:

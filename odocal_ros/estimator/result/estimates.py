@@ -188,8 +188,8 @@ def _angle_reasons(fitted: FittedConstants, limit: float, config: Config) -> lis
                               OTHER_WARNINGS if sigma[layout.YAW] <= limit else ''))
     elif deviation > REVERSED_YAW:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
-                              'directions: positive counts mean backwards, or the IMU x axis '
-                              f'points backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'))
+                              'directions: positive counts mean reverse motion, or the IMU x '
+                              f'axis points backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'))
     elif deviation > FAR_YAW:
         reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+z.1f} '
                               f'deg differs by {np.rad2deg(deviation):.1f} deg from its nominal '
