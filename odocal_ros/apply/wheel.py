@@ -21,7 +21,7 @@ from odocal_ros.settings.levels import FASTEST
 # judgement: averaging time of the speed, s, least and largest; number of counts in this time
 MIN_SPEED_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
 # m/s^2; physical: half of g, hard braking; largest acceleration of a wheel that locks or spins
-SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
+HARD_BRAKING, WHEEL_ACCELERATION = 5.0, 15.0
 # judgement: longest burst of stamps, s; largest deviation of a row, in mean jitters of the stamps;
 # rows of the mean jitter
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
@@ -59,8 +59,8 @@ class Wheel:
         self._value: int | float | None = None
         self._rows = self._refused = 0
         self._refused_since = 0.0
-        self._change = 0.0             # m/s, between the last two speeds
-        # m, difference of refused travel to the speed: of consecutive rows, and of all before
+        self._speed_step = 0.0         # m/s, between the last two published speeds
+        # m, refused travel minus speed times time: of the last refused rows, and of all before
         self._refused_error = self._refused_travel = 0.0
         # s, jitter of the stamps, which does not change a speed
         self._jitter = STAMP_BURST / JITTERS if form.quantity != 'rate' else 0.0
@@ -118,7 +118,7 @@ class Wheel:
         if not 0 < after < len(self.t):
             return 0.0
         # half of the deviation of a line from a parabola with this acceleration
-        sigma = SPEED_CHANGE / 2 * (t - self.t[after - 1]) * (self.t[after] - t) / 2
+        sigma = HARD_BRAKING / 2 * (t - self.t[after - 1]) * (self.t[after] - t) / 2
         return sigma**2
 
     def forget(self, t: float) -> None:
@@ -159,7 +159,8 @@ class Wheel:
             if abs(row_speed * dt) <= self._step_limit(dt):      # else it is certainly not travel
                 self._refused_error += row_speed * dt - self.speed * dt
             step = self.speed * dt
-            lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
+            # uniform error up to the travel at this speed and acceleration
+            lost = (abs(self.speed) + HARD_BRAKING * dt) * dt
             self._add_variance((lost**2 + self.quantum**2) / 3)
             value = before if self.form.quantity == 'rate' else value
         else:
@@ -195,13 +196,13 @@ class Wheel:
     def _stops_abruptly(self, dt: float, step: float) -> bool:
         """Return True if the counter stops faster than by hard braking."""
         return not step and not self._unexplained_speed and self.form.quantity != 'rate' and (
-            abs(self.speed) * dt > self._deviation_limit(dt, SPEED_CHANGE, HUNG_JITTERS))
+            abs(self.speed) * dt > self._deviation_limit(dt, HARD_BRAKING, HUNG_JITTERS))
 
-    def _deviation_limit(self, dt: float, change: float = WHEEL_CHANGE,
+    def _deviation_limit(self, dt: float, acceleration: float = WHEEL_ACCELERATION,
                          jitters: float = JITTERS) -> float:
-        """Return the limit for the deviation of a row from the previous speed, m."""
+        """Return the largest plausible deviation of a row's travel from the speed, m."""
         T = max(dt, self.mean_interval)      # a row of a burst contains the travel of an interval
-        return (change * (T + self._speed_time()) * T + 3 * self.quantum
+        return (acceleration * (T + self._speed_time()) * T + 3 * self.quantum
                 + (jitters * self._jitter + T - dt) * abs(self.speed))
 
     def _speed_time(self) -> float:
@@ -228,7 +229,7 @@ class Wheel:
                               'or the wheel locks; sigma increased')
             self._unexplained_speed, self._speed_before = abs(self.speed), self.speed
             self._unexplained_travel = self._unexplained_time = 0.0
-        elif deviation > self._deviation_limit(dt, SPEED_CHANGE):
+        elif deviation > self._deviation_limit(dt, HARD_BRAKING):
             self._add_variance(deviation**2)
         self._refused = 0
         if self.form.quantity != 'rate':
@@ -236,7 +237,7 @@ class Wheel:
                            LATENESS_RATIO * self._jitter + LATENESS_OFFSET)
             self._jitter += (lateness - self._jitter) / JITTER_ROWS
         change = (step / dt - self.speed) * min(1.0, dt / self._speed_time())
-        self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
+        self.speed += min(max(change, -WHEEL_ACCELERATION * dt), WHEEL_ACCELERATION * dt)
 
     def _add_speed_variance(self, dt: float) -> None:
         """Add the variance of travel by the unexplained speed in the last dt s."""
@@ -245,12 +246,13 @@ class Wheel:
         self._unexplained_travel = path_length
         self._unexplained_time += dt
         if self._unexplained_time > UNEXPLAINED_TIME:      # real acceleration explains more of it
-            self._unexplained_speed = max(self._unexplained_speed - SPEED_CHANGE * dt, 0.0)
+            self._unexplained_speed = max(self._unexplained_speed - HARD_BRAKING * dt, 0.0)
 
-    def _add_acceleration_variance(self, change: float, dt: float) -> None:
-        """Add the variance of travel by a changed acceleration; change : m/s in the last dt s."""
+    def _add_acceleration_variance(self, speed_step: float, dt: float) -> None:
+        """Add the variance of travel by a change of acceleration; speed_step : m/s in dt s."""
         # the acceleration changes in the middle between two speeds
-        error, self._change = abs(change - self._change) * dt / 4, change
+        error = abs(speed_step - self._speed_step) * dt / 4
+        self._speed_step = speed_step
         if error > MIN_TRAVEL_ERROR:
             self._add_variance(error**2)
 
@@ -286,10 +288,11 @@ class Wheel:
             self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
                              'distributed evenly')
             return 0.0
-        missing = dt - self.mean_interval
+        missing = dt - self.mean_interval     # s
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0
-        size = max(abs(self.speed), abs(step) / dt)
-        self._add_variance((min(missing / 50, 0.3) * size * missing) ** 2 / 3)
+        largest_speed = max(abs(self.speed), abs(step) / dt)
+        # uniform error of the mean speed: 2 % per second of the gap, at most 30 %
+        self._add_variance((min(missing / 50, 0.3) * largest_speed * missing) ** 2 / 3)
         self.notes.append(f'no odometer message for {dt:.2f} s: the travel is interpolated from '
                          'the adjacent speeds')
         return lost

@@ -4,9 +4,9 @@
 """
 Noise levels: the variances that a fit estimates, docs/method.md (S26), and their lower limits.
 
-Their uncertainty is by the average information (S27b) of Gilmour, Thompson and Cullis (1995). V_i
-is the derivative of the covariance R of all rows by the logarithm of level i, and R^-1 r are the
-weighted residuals. With q_i = V_i R^-1 r and g_i = J' R^-1 q_i,
+Their uncertainty follows from the average information (S27b) of Gilmour, Thompson and Cullis
+(1995). V_i is the derivative of the covariance R of all rows by the logarithm of level i, and
+R^-1 r are the weighted residuals. With q_i = V_i R^-1 r and g_i = J' R^-1 q_i,
 
     A_ij = (q_i' R^-1 q_j - g_i' H^-1 g_j) / 2,        dc / d(ln level_i) = (H^-1 g_i) of constants
 """
@@ -51,9 +51,9 @@ class Levels:
     """
     The noise levels by name.
 
-    Those of an interval (interval_noise.INTERVAL) and of the correlated fix error are variances
-    per second, those of a sensor with stated sigmas factors on its variances. 'size_...' are the
-    sizes of imperfections, (S28); 'correlation_time' is that of the fix error, s.
+    IMU and road noise (factors/interval_noise.py) and the time-correlated fix error: variance per
+    second. A sensor with stated sigmas: factor on its variances. 'size_...': factor on the
+    usual variance of an imperfection, (S28). 'correlation_time': of the fix error, s.
     """
 
     values: dict[str, float]
@@ -71,17 +71,21 @@ class Levels:
         return Levels(self.values | values)
 
     def sigmas(self) -> dict[str, float]:
-        """Return the roots of the levels, of correlated errors the stationary sigma; the time."""
+        """
+        Return the square roots of the levels.
+
+        Of the correlated fix error it is the stationary sigma; the correlation time stays in s.
+        """
         time = self.correlation_time
         return {k: float(np.sqrt(v * (time / 2 if k in CORRELATED_LEVELS else 1.0)))
                 for k, v in self.values.items()} | {'correlation_time': time}
 
     @classmethod
-    def from_sigmas(cls, roots: dict[str, float]) -> 'Levels':
-        """Return the levels with these standard deviations."""
-        time = roots['correlation_time']
+    def from_sigmas(cls, sigmas: dict[str, float]) -> 'Levels':
+        """Return the levels with these sigmas, as ``sigmas`` returns them."""
+        time = sigmas['correlation_time']
         return cls({k: v**2 / (time / 2 if time and k in CORRELATED_LEVELS else 1.0)
-                    for k, v in roots.items()} | {'correlation_time': time})
+                    for k, v in sigmas.items()} | {'correlation_time': time})
 
 
 class LevelRightHandSides:

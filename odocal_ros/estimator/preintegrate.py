@@ -126,7 +126,7 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
         inside = slice(np.searchsorted(interval, first), np.searchsorted(interval, last))
         chunk = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
         steps = chunk.steps_of(t_points[inside], interval[inside] - first)
-        chunk.cut(steps)
+        chunk.sum_effects(steps)
         out.append(chunk.intervals(travel, forward))
         points.append(chunk.points(t_points[inside], steps, interval[inside] - first, first))
         release_mapped_memory()
@@ -149,8 +149,8 @@ class _Chunk:
 
     Of n steps, in the axes of b at the start of their interval: R, v, p : attitude, velocity and
     position at the start of the step.   step_v, step_p : single and double integral of the force
-    over it.   mean, twice : the same of R.   since : s, time to it.   Of intervals: R_end, dv, dp.
-    by_gyro, by_accel : M_g and M_a of docs/method.md (S3).
+    over it.   R_mean, R_double : the same of R, over dt.   time_since_start : s, of the step.
+    Of intervals: R_end, dv, dp.   by_gyro, by_accel : M_g and M_a of docs/method.md (S3).
     """
 
     def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
@@ -188,24 +188,24 @@ class _Chunk:
         dv, dp = (dv - np.cross(rotation, dv - dp / dt) - rotate(self.G, accel),
                   dp - np.cross(rotation, dv * dt / 6) - rotate(self.GG, accel) * dt)
         self.step_v, self.step_p = rotate(self.R, dv), rotate(self.R, dp)
-        self.v, self.dv = self._running(self.step_v)
-        self.p, self.dp = self._running(self.v * dt + self.step_p)
-        self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        self.since = self.t[:-1] - self.t[self.key[:-1]][self.interval]
+        self.v, self.dv = self._running_sums(self.step_v)
+        self.p, self.dp = self._running_sums(self.v * dt + self.step_p)
+        self.R_mean, self.R_double = self.R @ self.G, self.R @ self.GG * dt[:, None]
+        self.time_since_start = self.t[:-1] - self.t[self.key[:-1]][self.interval]
 
-    def _gyro(self, x: Floats) -> Floats:
+    def _gyro_effects(self, x: Floats) -> Floats:
         """Return the effects of a gyro's bias and constants, (n, 3, 3 + g), from (n, 3, 3, 6)."""
         out: Floats = x[:, :, [0, 1, 2, *layout.GYRO_AXIS],
                         [0, 0, 0, *np.add(layout.GYRO_SIGNAL, 1)]]
         out[:, :, :3] = out[:, :, :3] @ (np.eye(3) - self.by_gyro[:, :3])
         return out
 
-    def _accel(self, x: Floats) -> tuple[Floats, Floats]:
+    def _accel_effects(self, x: Floats) -> tuple[Floats, Floats]:
         """Return the effects of bias and constants of the accelerometer, from (n, 3, 3, 4)."""
         return (x[:, :, :, 0] @ (np.eye(3) - self.by_accel),
                 x[:, :, layout.ACCEL_AXIS, np.add(layout.ACCEL_SIGNAL, 1)])
 
-    def _running(self, step: Floats) -> tuple[Floats, Floats]:
+    def _running_sums(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the sums since the start of the interval before each step, and over intervals."""
         total = np.cumsum(step, axis=0)
         before = total - step
@@ -217,7 +217,7 @@ class _Chunk:
         return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
                        self.key[interval + 1] - 1)
 
-    def cut(self, steps: Ints) -> None:
+    def sum_effects(self, steps: Ints) -> None:
         """
         Sum the effects of IMU errors in the steps up to each cut: interval starts and ``steps``.
 
@@ -226,17 +226,17 @@ class _Chunk:
         """
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
         dt, signals = self.dt[:, None], self.signals
-        end, v, p = self.since[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
+        end, v, p = self.time_since_start[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
         moment, growing = self.step_v - self.step_p / dt, self.R @ self.growth
         # rotation and force; velocity and position by rotations; position by forces
-        self.sums = [self._before(*one) for one in (
-            (self.mean, signals),
-            (_cross(v, self.mean) - _cross(moment, growing), signals[:, OF_GYRO]),
-            (_cross(p + self.step_p - v * end, self.mean)
+        self.effects = [self._sums_before_cuts(*one) for one in (
+            (self.R_mean, signals),
+            (_cross(v, self.R_mean) - _cross(moment, growing), signals[:, OF_GYRO]),
+            (_cross(p + self.step_p - v * end, self.R_mean)
              + _cross(moment * end - self.step_v * (dt / 6), growing), signals[:, OF_GYRO]),
-            (self.twice - self.mean * end[:, :, None], signals[:, OF_ACCEL]))]
+            (self.R_double - self.R_mean * end[:, :, None], signals[:, OF_ACCEL]))]
 
-    def _before(self, step: Floats, signals: Floats) -> Floats:
+    def _sums_before_cuts(self, step: Floats, signals: Floats) -> Floats:
         """Return the sums of (n, 3, 3) times signals (n, s) before each cut and up to the last."""
         out = np.zeros((len(self.cuts) + 1, 3, 3, signals.shape[1]))
         np.add.reduceat(_times(step, signals), self.cuts, out=out[1:])
@@ -246,30 +246,30 @@ class _Chunk:
                  tau: Floats) -> tuple[Floats, ...]:
         """Return A to FF and the derivatives by the gyro, of errors in steps between (m,) cuts."""
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
-        both, velocity, position, position_by_force = (x[last] - x[first] for x in self.sums)
-        by_turn, force = self._gyro(both[..., OF_GYRO]), both[..., OF_ACCEL]
-        velocity = self._gyro(velocity)
-        (A, F), (AA, FF) = self._accel(force), self._accel(
-            force * tau[..., None] + position_by_force)
+        both, velocity, position, position_by_force = (x[last] - x[first] for x in self.effects)
+        by_turn, force = self._gyro_effects(both[..., OF_GYRO]), both[..., OF_ACCEL]
+        velocity = self._gyro_effects(velocity)
+        A, F = self._accel_effects(force)
+        AA, FF = self._accel_effects(force * tau[..., None] + position_by_force)
         return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - velocity,
-                _cross(dp, by_turn) - velocity * tau - self._gyro(position))
+                _cross(dp, by_turn) - velocity * tau - self._gyro_effects(position))
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
         T, begin, ds = np.diff(self.t[self.key]), self.key[:-1], np.diff(travel(self.t))[:, None]
-        S = self.mean * ds[:, :, None]      # of each step
-        path_before, path = self._running(S @ forward)
+        S = self.R_mean * ds[:, :, None]      # of each step
+        path_before, path = self._running_sums(S @ forward)
         path_after = path[self.interval] - path_before - S @ forward
         turn_x, forward_x = skew(self.turn), skew(forward)
         in_step = forward_x / 2 + (turn_x @ forward_x + skew(np.cross(self.turn, forward))) / 6
         S_by_gyro = np.add.reduceat(_times(
-            _cross(path_after, self.mean) + self.R @ in_step * ds[:, :, None],
+            _cross(path_after, self.R_mean) + self.R @ in_step * ds[:, :, None],
             self.signals[:, OF_GYRO]), begin)
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
             begin, self.key[1:], self.dv, self.dp, T[:, None, None])
         rate, force = np.hsplit(np.add.reduceat(self.signals[:, 1:7], begin) / T[:, None], 2)
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
-                         dp_by_gyro, np.add.reduceat(S, begin), self._gyro(S_by_gyro),
+                         dp_by_gyro, np.add.reduceat(S, begin), self._gyro_effects(S_by_gyro),
                          rate, force, np.maximum.reduceat(self.longest, begin))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
@@ -287,13 +287,13 @@ class _Chunk:
             self.key[interval], j, dv, dp, tau[:, None, None])
         # the effects of errors in the step up to the time
         share, signals = (h / dt)[:, None], self.signals[j]
-        turn = self._gyro(_times(self.mean[j] * share, signals[:, OF_GYRO]))
+        turn = self._gyro_effects(_times(self.R_mean[j] * share, signals[:, OF_GYRO]))
         step_dv = self.step_v[j] * (h / dt)
         (A, F), (AA, FF) = (
-            (x + y for x, y in zip(before, self._accel(_times(step, signals[:, OF_ACCEL])),
-                                   strict=True))
-            for before, step in (((A, F), self.mean[j] * share),
-                                 ((AA, FF), self.twice[j] * share**2)))
+            (x + y for x, y in zip(
+                before, self._accel_effects(_times(step, signals[:, OF_ACCEL])), strict=True))
+            for before, step in (((A, F), self.R_mean[j] * share),
+                                 ((AA, FF), self.R_double[j] * share**2)))
         return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, R_by_gyro + turn,
                       dv_by_gyro + _cross(step_dv / 2, turn),
                       dp_by_gyro + _cross(step_dv * h / 6, turn), force + force_change * h,

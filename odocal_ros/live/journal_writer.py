@@ -19,7 +19,7 @@ from odocal_ros.bagio.mcap_write import pack, PackedChunk
 from odocal_ros.live.journal_leg import JournalPlan, LegJournal
 from odocal_ros.live.messages import definition_of
 
-ALWAYS_NS = 1      # definition: stamp of static messages
+ALWAYS_NS = 1      # definition: stamp of static messages, which every journal contains
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
 
 

@@ -169,10 +169,10 @@ class Input:
         # wait for a publisher: increments need its QoS, and an optional topic may never have one,
         # but its subscription would cost CPU time
         if not self.publishers and (self.slot in EXTERNAL_SLOTS
-                                    or self._counts_increments(reader)):
+                                    or self._has_increments(reader)):
             return
         offered = {p.qos_profile.reliability for p in self.publishers}
-        reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
+        reliable = self._has_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST, depth=INPUTS[self.slot].queue,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
@@ -186,7 +186,7 @@ class Input:
             f'{"reliable" if reliable else "best effort"}')
 
     @staticmethod
-    def _counts_increments(reader: Reader) -> bool:
+    def _has_increments(reader: Reader) -> bool:
         # a lost increment is lost travel, so such a topic uses reliable QoS if it is offered
         return reader.form is not None and reader.form.quantity == 'increment'
 

@@ -168,7 +168,7 @@ class SensorPlan:
         self._build = build
 
     def complete(self, view: View) -> bool:
-        """Return True: nothing is determined by the first message."""
+        """Return True: no column depends on the content of the first message."""
         return True
 
     def missing(self, view: View) -> str:
@@ -208,27 +208,27 @@ def _yaw_variance(q_ni: Floats, roll_variance: Floats, yaw_variance: Floats) -> 
     return np.where(has_orientation, yaw_variance[:, 0], np.nan)
 
 
-def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
-         status: Ints) -> samples.FixSamples:
+def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
+         covariance_type: Ints, status: Ints) -> samples.FixSamples:
     with np.errstate(invalid='ignore'):      # a signalling NaN
         latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
     return samples.of_columns(samples.FixSamples, stamps, received, latitude, longitude,
                               position[:, 2].copy(),
-                              covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
+                              covariance.reshape(-1, 3, 3), covariance_type[:, 0], status[:, 0])
 
 
-def _gps_fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
-             status: Ints) -> samples.FixSamples:
+def _gps_fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
+             covariance_type: Ints, status: Ints) -> samples.FixSamples:
     """Return fixes with the status of a NavSatFix."""
-    return _fix(stamps, received, position, covariance, known,
+    return _fix(stamps, received, position, covariance, covariance_type,
                 np.where(status == WAAS_FIX, 1, np.clip(status, -1, 2)))
 
 
 def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
               *covariance: Floats) -> samples.VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    known = (variance > 0) & (variance < 1e12)       # drivers send 0 or huge values for unknown
-    return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
+    is_known = (variance > 0) & (variance < 1e12)    # drivers send 0 or huge values for unknown
+    return samples.VelocitySamples(stamps, received, velocity_n, np.where(is_known, variance, 0.0))
 
 
 # format: of NavSatFix and GPSFix

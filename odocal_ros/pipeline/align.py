@@ -53,7 +53,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     level, reasons = _estimate_level(inputs, span, metres_per_unit, origin.latitude, grade,
                                      gyro_noise)
     reasons += _noise_reasons(noise.get('gyro', 0.0), nominal.grade_of(config.imu))
-    level = replace(level, C_np=_place_rotation(inputs, level.standstill, fixes_n, origin))
+    level = replace(level, C_np=_enu_to_n_at(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, refusals = _select_heading(inputs, level, origin.latitude, grade,
                                                            config)
     reasons += refusals
@@ -91,9 +91,9 @@ def choose_standstill(spans: Iterable[Span]) -> Span | None:
     return before[-1] if before else None
 
 
-def _place_rotation(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
-                    origin: Origin) -> Floats:
-    """Return C_np at a standstill, rotated from the origin by 0.16 mrad per kilometre."""
+def _enu_to_n_at(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
+                 origin: Origin) -> Floats:
+    """Return C_np, from east-north-up at a standstill to n: 0.16 mrad per km from the origin."""
     if span is None or not len(fixes_n):
         return np.eye(3)
     selected = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
@@ -155,7 +155,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nomina
     Return the heading by the first source that has one, and the reasons of those that do not.
 
     The heading is the ENU yaw of L's x axis and its sigma, rad, the name of its source, and True
-    if its error is the same in every leg.
+    if its error is the same in every leg (``Alignment.heading_shared``).
     """
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.local else [
