@@ -221,19 +221,19 @@ class _Chunk:
         """
         Sum the effects of IMU errors in the steps up to each cut: interval starts and ``steps``.
 
-        An error in a step acts on the rest of the interval: a rotation on the rest of dv and dp, a
-        force for the remaining time. ``_effects`` has the factors that depend on the end.
+        An error in a step rotates the rest of dv and dp, or adds a force for the remaining time.
+        ``_effects`` has the factors that depend on the end. moment : integral of f t over a step,
+        divided by dt.   R_growth : R times ``growth``, effect of a rotation within the step.
         """
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
         dt, signals = self.dt[:, None], self.signals
         end, v, p = self.time_since_start[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
-        moment, growing = self.step_v - self.step_p / dt, self.R @ self.growth
-        # rotation and force; velocity and position by rotations; position by forces
+        moment, R_growth = self.step_v - self.step_p / dt, self.R @ self.growth
         self.effects = [self._sums_before_cuts(*one) for one in (
-            (self.R_mean, signals),
-            (_cross(v, self.R_mean) - _cross(moment, growing), signals[:, OF_GYRO]),
+            (self.R_mean, signals),      # then v by rotations, p by rotations, p by forces
+            (_cross(v, self.R_mean) - _cross(moment, R_growth), signals[:, OF_GYRO]),
             (_cross(p + self.step_p - v * end, self.R_mean)
-             + _cross(moment * end - self.step_v * (dt / 6), growing), signals[:, OF_GYRO]),
+             + _cross(moment * end - self.step_v * (dt / 6), R_growth), signals[:, OF_GYRO]),
             (self.R_double - self.R_mean * end[:, :, None], signals[:, OF_ACCEL]))]
 
     def _sums_before_cuts(self, step: Floats, signals: Floats) -> Floats:
