@@ -20,7 +20,7 @@ ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
     ('straight', 'industrial', 'caution', (-0.23, 0.21, None)),
     ('out_and_back', 'tactical', 'accepted', (-0.65, 0.29, 0.25)),
     ('motorway', 'consumer', 'accepted', (0.95, -0.2, -0.6)),
-    ('yard', 'industrial', 'caution', (-1.09, -1.24, 0.13)),
+    ('yard', 'industrial', 'caution', (-0.99, -1.2, 0.1)),
     ('town', 'tactical', 'caution', (-0.08, -0.51, 1.91)),
     ('straight', 'consumer', 'accepted', (0.96, 1.09, None)),
     ('out_and_back', 'industrial', 'caution', (-1.92, 1.25, 0.92)),

@@ -42,6 +42,8 @@ from odocal_ros.settings.nominal import (
 SPACING = 1.0
 # rad, physical: roads fall by 2 to 2.5 % to the side for drainage, most of a leg to the same one
 MEAN_ROLL_SIGMA = 0.02
+# m/rad, physical: a pitch centre 1.4 m ahead of the odometer times a mean roll of 1.4 %
+LIFT_SIGMA = 0.02
 # s, physical: height errors by ionosphere and orbits change by one sigma in this time
 HEIGHT_TIME = 900.0
 
@@ -164,7 +166,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     bias_up = np.hypot(accel_bias, grade.accel_scale_error * G)
     accel_bias_sigma = np.maximum([accel_bias, accel_bias, bias_up], 1e-6)
     mean = np.zeros(layout.M)
-    sigma[layout.MEAN_ROLL] = MEAN_ROLL_SIGMA
+    sigma[layout.LIFT], sigma[layout.MEAN_ROLL] = LIFT_SIGMA, MEAN_ROLL_SIGMA
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)

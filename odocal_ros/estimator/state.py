@@ -58,7 +58,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
-             'body_centre_height', 'sway_by_force', 'mean_roll',
+             'body_centre_height', 'sway_by_force', 'lift_by_turning', 'mean_roll',
              'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
              'speed_offset', 'velocity_delay', 'velocity_lag_square', 'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
@@ -110,15 +110,19 @@ BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
 # displacements of the axle by the tilt of the body, (S12): points about which it pitches, m ahead
 # of the odometer: on hills; in addition on bumps; in turns about its own left axis, on banked
 # ground. Height above the odometer, m, of the centre about which it tilts on its springs; its sway
-# there by lateral force, m per m/s^2
-BODY_TILT = constants_from('pitch_centre', 'sway_by_force')
+# there by lateral force, m per m/s^2. Lift of the axle by turns, m/rad: the third point times the
+# mean roll of the ground, (S12)
+BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
+LIFT = constants_from('lift_by_turning')
 # rad, left side up: mean roll of the ground of a leg. The mean attitude less this one determines
 # the roll of the IMU in the vehicle
 MEAN_ROLL = constants_from('mean_roll')
+# constants of the ground of a leg
+GROUND = constants_from('lift_by_turning', 'mean_roll')
 # constants of C_bv, in the order of its derivatives
 AXES = (YAW, PITCH, MEAN_ROLL.start)
 # constants that other legs do not share: those of its ground and its fixes
-LEG_CONSTANTS = constants_from('mean_roll', 'fix_error_up')
+LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
 # deviations from ideal sensors and an ideal vehicle, (S28)
 IMPERFECTIONS = constants_from('gyro_scale_z', 'sway_by_force')
 # their kinds, with one common size each: numbers of constants
@@ -175,6 +179,11 @@ class State:
         """Return the rotation from vehicle to body axes: (3, 3)."""
         return vehicle_axes(self.forward, self.up_b, self.constants[MEAN_ROLL.start])
 
+    @cached_property
+    def C_bv_level(self) -> Floats:
+        """Return C_bv without the mean roll: (3, 3)."""
+        return vehicle_axes(self.forward, self.up_b, 0.0)
+
     def keyframe_arrays(self) -> dict[str, Floats]:
         """Return the arrays with a row for each keyframe, by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self)
@@ -189,7 +198,7 @@ class State:
         """Return the derivatives of C_bv by AXES: yaw, pitch and mean roll: three (3, 3)."""
         yaw, pitch = self.constants[[YAW, PITCH]]
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-        forward, left, _ = vehicle_axes(self.forward, self.up_b, 0.0).T
+        forward, left, _ = self.C_bv_level.T
         size = np.linalg.norm(np.cross(self.up_b, forward))
         roll = exp_so3(np.array([self.constants[MEAN_ROLL.start], 0.0, 0.0]))
 

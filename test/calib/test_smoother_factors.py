@@ -63,7 +63,8 @@ def moved():
         *3 * [layout.FIX_ERROR_BY_SIGMA.start - 3]], 1.0)
     # derivatives by biases treat these as constant over HILL_INTERVALS: no bump centre or body
     # centre of real size, because derivatives neglect how they change the effect of the others
-    c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.MEAN_ROLL] = 0.0, np.log(5.0), 0.01
+    c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
+    c[layout.MEAN_ROLL] = 0.01
     c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
                                 0.003, 0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3, 0.0, 0.0]
     c[layout.FIX_LAG2] = 2.1e-4    # not zero, where the filter changes its type

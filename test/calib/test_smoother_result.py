@@ -105,10 +105,7 @@ def test_stated_sigma_equals_the_bound_at_the_truth_and_the_sum_of_its_sources()
                       for name in CONSTANTS[IMPERFECTIONS]])
     problem = make_problem(leg, config)
     problem.priors.sigma[IMPERFECTIONS] = usual
-    state = truth(drive, config, leg)
-    for name in ('pitch_centre_in_turns', 'mean_roll'):     # their product is a displacement
-        state.constants[CONSTANTS.index(name)] = details[name]['value']
-    covariance = Equations(problem, state, fitted=True).at(
+    covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
         Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']

@@ -9,7 +9,7 @@ import pytest
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.prepare import make_problem, MEAN_ROLL_SIGMA
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.state import CONSTANTS, MEAN_ROLL, PITCH, YAW
+from odocal_ros.estimator.state import CONSTANTS, LIFT, MEAN_ROLL, PITCH, YAW
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
@@ -97,9 +97,7 @@ def test_ground_with_a_mean_roll_does_not_change_the_pitch():
     fit = best_fit(make_problem(leg, CONFIG), CONFIG)
     # without noise, except for the prior of the centre of pitch
     assert abs(fit.state.constants[PITCH] - MOUNTING) < 1.5 * np.sqrt(fit.covariance[PITCH, PITCH])
-    # turns determine the product of both
-    centre = fit.state.constants[CONSTANTS.index('pitch_centre_in_turns')]
-    assert centre * fit.state.constants[MEAN_ROLL] == pytest.approx(WHEELBASE / 2 * roll, rel=0.1)
+    assert fit.state.constants[LIFT] == pytest.approx(WHEELBASE / 2 * roll, rel=0.1)
 
 
 def test_bumps_determine_the_mean_roll_of_a_road():

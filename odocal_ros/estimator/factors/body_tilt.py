@@ -12,7 +12,7 @@ springs, about a centre above the ground. Moving means over HILL_INTERVALS separ
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.state import BODY_TILT, State
+from odocal_ros.estimator.state import State
 from odocal_ros.nav.rotations import level_left, rotate
 
 # judgement: intervals of a hill or a bank; faster tilt is of the body: bumps, squat
@@ -30,29 +30,27 @@ class BodyTilt:
     The tilt of the body in the K intervals between N keyframes.
 
     rate_n : (K, 3) rad/s, mean turn rates.   level_left : (K, 3) level axes to the left, at begin.
-    pitch_increments : (K, 3) rad, nose down: about ``level_left``; the part faster than hills; by
-        turns on banked ground.
-    by_mean_roll : (K, 3) m in n, derivative of the displacement by the mean roll of the ground.
-    displacements : (K, 3, 5) m in n, of the odometer by a unit of each of BODY_TILT.
+    pitch_increments : (K, 4) rad, nose down: about ``level_left``; the part faster than hills; by
+        turns on banked ground; and the turn about up.
+    displacements : (K, 3, 6) m in n, of the odometer by a unit of each of BODY_TILT.
     """
 
     def __init__(self, state: State, mean_rate: Floats, side_force: Floats) -> None:
         """mean_rate : (K, 3) rad/s in b.   side_force : (K,) m/s^2 to the left."""
         T, C = np.diff(state.t), state.C_nb[:-1]
-        _, left, up = state.C_bv.T
+        _, left, up = state.C_bv_level.T
         self.rate_n, self.level_left = rotate(C, mean_rate), level_left(C @ state.forward)
         about_level = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T
-        # about the left axis of the vehicle, which differs on banked ground
+        # about the left axis of the vehicle, which differs on banked ground. Without the mean
+        # roll, in which the equations are not linear: the turn about up corrects its effect
         about_left = np.einsum('ki,ki->k', self.rate_n, C @ left) * T
         self.pitch_increments = np.stack(
-            [about_level, about_level - moving_mean(about_level), about_left - about_level], -1)
+            [about_level, about_level - moving_mean(about_level), about_left - about_level,
+             mean_rate @ up * T], -1)
         # nose down about a point ahead, the odometer goes up
         lifts = (C @ up)[:, :, None] * self.pitch_increments[:, None]
-        self.displacements = np.concatenate([lifts, _horizontal(state, side_force)], axis=2)
-        centres = state.constants[BODY_TILT][:3]
-        turn = mean_rate @ up * T
-        self.by_mean_roll = (C @ up) * (centres[2] * turn)[:, None] - (C @ left) * (
-            self.pitch_increments @ centres)[:, None]
+        self.displacements = np.concatenate(
+            [lifts[:, :, :3], _horizontal(state, side_force), lifts[:, :, 3:]], axis=2)
 
 
 def _horizontal(state: State, side_force: Floats) -> Floats:
@@ -60,7 +58,7 @@ def _horizontal(state: State, side_force: Floats) -> Floats:
     forward_n = state.C_nb @ state.forward
     left_n = level_left(forward_n)
     ahead_n = np.cross(left_n, [0.0, 0.0, 1.0])
-    left_up = state.C_nb[:, 2] @ state.C_bv[:, 1]
+    left_up = state.C_nb[:, 2] @ state.C_bv_level[:, 1]
     pitch, roll = (x - moving_mean(x) for x in (forward_n[:, 2], left_up))
     padded = np.pad(side_force, 1, mode='edge')
     force = moving_mean((padded[1:] + padded[:-1]) / 2)

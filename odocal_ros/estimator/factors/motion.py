@@ -32,8 +32,8 @@ ROWS = D.stop
 # attributes of Motion with a row for each interval
 INTERVAL_ATTRIBUTES = (
     'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
-    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'tilt_by_mean_roll', 'rate_n',
-    'level_left', 'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
+    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'rate_n', 'level_left',
+    'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
     'displacement_by_state', 'residual')
 
 
@@ -159,7 +159,6 @@ class Motion:
         self.tilt = BodyTilt(state, self.sums.mean_rate, self.lean_accelerations[:, 1])
         self.rate_n, self.level_left = self.tilt.rate_n, self.tilt.level_left
         self.by_tilt = self.tilt.displacements
-        self.tilt_by_mean_roll = self.tilt.by_mean_roll
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
@@ -210,10 +209,11 @@ class Motion:
         a[:, :, BG] = gyro[:, :, :3]
         # by the pitch of BODY_TILT. A bias changes little over HILL_INTERVALS: it does not
         # affect the part of bumps
-        lift = T * (C @ self.up)[:, :, None]
-        hills, _, turns, _, _ = state.constants[layout.BODY_TILT]
+        _, left, up = state.C_bv_level.T
+        lift = T * (C @ up)[:, :, None]
+        hills, _, turns, _, _, tilted = state.constants[layout.BODY_TILT]
         a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
-                               + turns * self.left)[:, None]
+                               + turns * left + tilted * up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
@@ -258,7 +258,7 @@ class Motion:
         # lean about axes that roll
         pitch, yaw = self.lean_angles
         by_roll = state.scale * (np.outer(pitch, -self.left) - np.outer(yaw, self.up))
-        c[:, D, layout.MEAN_ROLL.start] -= rotate(C @ s.S, by_roll) + self.tilt_by_mean_roll
+        c[:, D, layout.MEAN_ROLL.start] -= rotate(C @ s.S, by_roll)
         for i, axis in enumerate((self.up, -self.left)):
             by_angle = C @ s.S @ (state.scale * axis)
             columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)

@@ -71,7 +71,7 @@ class PriorRows(factor.Factor):
     def __init__(self, problem: Problem, point: factor.LinearisationPoint) -> None:
         self.state, self.usual_priors = point.state, point.priors
         self.unshared = problem.unshared_constants | {
-            'slow_fix_errors': layout.FIX_ERRORS, 'vertical_motion': layout.MEAN_ROLL}
+            'slow_fix_errors': layout.FIX_ERRORS, 'vertical_motion': layout.GROUND}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: indices for name, indices in SHARED.items()
                        if (problem.priors.sigma[indices] > layout.NO_ERROR).any()}
