@@ -45,7 +45,7 @@ TAIL_LIMITS = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU), 20.06, TAIL
 # tuned: share of the variance of a noise that must be observable in its interval; with 0 for all,
 # one scale sigma of 60 is doubled (docs/decisions/0016). It is 0 for a bias that steps, which the
 # intervals after it observe
-LEAST_OBSERVED = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
+MIN_OBSERVED = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
 WARM_START_PASSES = 6    # judgement: of a fit that starts from a converged one
 
 
@@ -183,7 +183,7 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
     jump_ratio = new_levels['slow'] / levels['slow'] if 'slow' in weighted.factors else 1.0
     ratios = np.concatenate([ratios, np.full((len(ratios), 1), jump_ratio)], axis=1)
     z2 = noise**2 / np.maximum(observed, 1e-12) / ratios
-    z2[observed < LEAST_OBSERVED] = 0.0
+    z2[observed < MIN_OBSERVED] = 0.0
     new_factors = np.clip(variance_factors * z2 / TAIL_LIMITS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
     new_factors[:, :factor.JUMP] = np.sqrt(variance_factors * new_factors)[:, :factor.JUMP]

@@ -27,7 +27,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 # spans in a leg, minimum: statistical, with two axes, the sigma of their variance is then 35 %
-LEAST_SPANS = 8
+MIN_SPANS = 8
 # axes (east, north, up) of the levels of the correlated fix error
 SLOW_COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
 
@@ -118,7 +118,7 @@ def long_span_factors(fixes: Fixes, levels: Levels,
     stated = 1 / np.diagonal(fixes.whitening, axis1=1, axis2=2)**2
     time, out = levels.correlation_time, dict.fromkeys(SLOW_COLUMNS, 1.0)
     span = max(1.0, 2 * float(np.median(np.diff(t))))
-    while t[-1] - t[0] > LEAST_SPANS * span:
+    while t[-1] - t[0] > MIN_SPANS * span:
         end = np.searchsorted(t, t + span)
         a = np.flatnonzero(end < len(t))
         b = end[a]

@@ -19,7 +19,7 @@ from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.result.remarks import _change_reasons, LEAST_CHANGE
+from odocal_ros.estimator.result.remarks import _change_reasons, MIN_REPORTED_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, M, PITCH, YAW
 from odocal_ros.pipeline.calibrate import calibrate
@@ -167,7 +167,7 @@ def test_gradual_scale_change_is_not_reported_as_a_step():
 
 @pytest.mark.parametrize('constant', [LN_K, YAW])
 def test_change_without_effect_is_not_reported(constant):
-    for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
+    for size, count in ((0.9 * MIN_REPORTED_CHANGE, 0), (1.1 * MIN_REPORTED_CHANGE, 1)):
         fit = SimpleNamespace(constant_steps=(ConstantStep(constant, 100.0, size, size / 7),))
         assert len(_change_reasons(fit)) == count
 

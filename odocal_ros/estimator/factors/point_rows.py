@@ -33,7 +33,7 @@ from odocal_ros.settings.config import Config
 
 # sigmas above which a row or the slip of an interval has less weight. Statistical: 1 row in 370
 TAIL_SIGMAS = 3.0
-LEAST_ROWS = 5    # judgement: with fewer, outliers and levels are not estimated
+MIN_ROWS = 5    # judgement: with fewer, outliers and levels are not estimated
 # groups rows by interval: (m, d, c) to (intervals, d times their largest number, c)
 Gather = Callable[[Floats], Floats]
 
@@ -111,7 +111,7 @@ class PointRows(Factor):
     def _weights(self, white: Floats) -> Floats:
         """Return weights of whitened residuals, (m, d), equal for the components of a level."""
         weight = np.ones_like(white)
-        for columns, size in self._sizes(white) if len(white) >= LEAST_ROWS else ():
+        for columns, size in self._sizes(white) if len(white) >= MIN_ROWS else ():
             weight[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
         return weight
 
@@ -171,7 +171,7 @@ class PointRows(Factor):
             yield present[some], gather
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        if len(self.k) < LEAST_ROWS:
+        if len(self.k) < MIN_ROWS:
             return {}
         fitted = np.concatenate([self._fitted_variances(marginals, present, gather)
                                  for present, gather in self._intervals()])
@@ -182,7 +182,7 @@ class PointRows(Factor):
                 for level, columns in self.level_columns.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
-        if len(self.k) < LEAST_ROWS:
+        if len(self.k) < MIN_ROWS:
             return
         columns = out.columns(self.level_columns)
         q = np.zeros((*self.r.shape, len(columns)))

@@ -34,7 +34,7 @@ WORSE_THAN_GRADE = 3.0      # judgement: limit of noise or bias over that of its
 # limits of accelerometer outliers: size, m/s per second, share and number of seconds. Judgement:
 # aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
 # drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
-OUTLIER_SIZE, OUTLIER_TIME, FEWEST_OUTLIERS = 0.01, 0.01, 3
+OUTLIER_SIZE, OUTLIER_TIME, MIN_ACCEL_OUTLIERS = 0.01, 0.01, 3
 FINEST = 1e-5           # rad/s and m/s^2, physical: finer steps have no effect
 SAMPLES = 20_000        # judgement: number of samples in which a quantisation step is sought
 SAMPLES_PER_VALUE = 20  # judgement: a signal with more samples for each value is quantised
@@ -42,8 +42,8 @@ EXPLAINED = 0.4         # judgement: share of the noise variance that quantisati
 # judgement: limit of the noise of single samples in motion over that at rest. Real drives:
 # vibrating accelerometers 26 and 3.6, gyros 1.3 and 2.0
 VIBRATION = 3.0
-MOST_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
-FEWEST_SAMPLES = 100    # judgement: their median has a sigma of 15 %
+MAX_NOISE_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
+MIN_NOISE_SAMPLES = 100    # judgement: their median has a sigma of 15 %
 # judgement: share of outliers among the fixes, and of intervals with slip
 OUTLIER_SHARE_LIMIT = 0.15
 SIDESLIP_LIMIT = 0.2    # m/sqrt(s), judgement
@@ -169,7 +169,7 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
     size = np.sqrt(factor * fit.levels['accel'])
     outlier = (factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)
     share = float(outlier.mean())
-    if share < OUTLIER_TIME or outlier.sum() < FEWEST_OUTLIERS:
+    if share < OUTLIER_TIME or outlier.sum() < MIN_ACCEL_OUTLIERS:
         return []
     return [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'the accelerometer has outliers in {100 * share:.0f} % of the '
@@ -260,9 +260,9 @@ def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str
         return np.where(inside, rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
     parts = by_row(part, leg.t_imu)
-    in_motion, at_rest = (np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1))
-    return (sample_noise(leg, in_motion) if len(in_motion) >= FEWEST_SAMPLES else {},
-            sample_noise(leg, at_rest) if len(at_rest) >= FEWEST_SAMPLES else {})
+    in_motion, at_rest = (np.flatnonzero(parts == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
+    return (sample_noise(leg, in_motion) if len(in_motion) >= MIN_NOISE_SAMPLES else {},
+            sample_noise(leg, at_rest) if len(at_rest) >= MIN_NOISE_SAMPLES else {})
 
 
 def _setting(name: str, level: dict[str, float]) -> str:

@@ -42,9 +42,9 @@ SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or 
 # judgement: variance factor of a bias walk above which it has a step. Steps have 480 and more, 60
 # drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
-LEAST_CHANGE = 3e-4     # relative, rad; judgement: smaller ones of scale or angle are not reported
+MIN_REPORTED_CHANGE = 3e-4     # relative, rad; judgement, of scale and angles
 # judgement: share and number of outliers among the fixes above which they are reported
-OUTLIER_SHARE, LEAST_OUTLIERS = 0.02, 3
+OUTLIER_SHARE, MIN_REPORTED_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 POSE_COVARIANCE_REMEDY = (
     'Uncertainties were increased to match the residuals. Check the map, and the '
@@ -156,7 +156,7 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
     count, total = int(outlier.sum()), len(outlier)
-    if count < max(LEAST_OUTLIERS, OUTLIER_SHARE * total):
+    if count < max(MIN_REPORTED_OUTLIERS, OUTLIER_SHARE * total):
         return []
     largest = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {total} fixes ({100 * count / total:.0f} %) '
@@ -171,7 +171,7 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     for i, signal, what in ((layout.SCALE_BY_SPEED, 0, 'from low to high speed'),
                             (layout.SCALE_BY_TIME, 1, 'from start to end')):
         change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(motion.tyre_signals[:, signal])
-        if abs(change) > max(REMARK_SIGMAS * change_sigma, LEAST_CHANGE):
+        if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {what}')
     if not texts:
         return []
@@ -200,7 +200,7 @@ def _change_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for a scale or mounting that changes in the leg."""
     texts = []
     for step in fit.constant_steps:
-        if step.is_certain and abs(step.size) > LEAST_CHANGE:
+        if step.is_certain and abs(step.size) > MIN_REPORTED_CHANGE:
             what = layout.CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \
                 f'{np.rad2deg(step.size):+z.2f} deg'
@@ -213,8 +213,8 @@ def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
     """Return the indices of lever arm axes whose estimates deviate from their settings."""
     axes = (*range(layout.ODO_ARM.start, layout.ODO_ARM.stop - 1),      # not z of the odometer
             *range(layout.GNSS_ARM.start, layout.GNSS_ARM.stop))
-    least_size = 0.3     # m
-    return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], least_size)}
+    min_size = 0.3     # m
+    return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], min_size)}
 
 
 def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
@@ -254,8 +254,8 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     """Return FIXES_SMOOTHED if the filter constant of the receiver, s^2, is significant."""
-    least_size = 0.1     # s: the age of a fix at 10 Hz is up to this
-    if abs(square) <= max(REMARK_SIGMAS * sigma, least_size**2):
+    min_size = 0.1     # s: the age of a fix at 10 Hz is up to this
+    if abs(square) <= max(REMARK_SIGMAS * sigma, min_size**2):
         return ()
     what, time = ('fixes are averaged', np.sqrt(square)) if square > 0 else (
         'positions and velocities of the fixes are filtered', np.sqrt(-square / 2))
@@ -265,8 +265,8 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def contains_odometer(share: float, sigma: float) -> bool:
     """Return True if the positions contain an odometer, with this scale error and its sigma."""
-    least_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
-    return bool(abs(share) > max(FAULT_SIGMAS * sigma, least_size))
+    min_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
+    return bool(abs(share) > max(FAULT_SIGMAS * sigma, min_size))
 
 
 def odometer_reasons(share: float, sigma: float, log_time: float,
@@ -283,8 +283,8 @@ def odometer_reasons(share: float, sigma: float, log_time: float,
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     """Return SPEED_FILTERED if the filter constant of the odometer, s^2, is significant."""
-    least_size = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
-    if square <= max(REMARK_SIGMAS * sigma, least_size**2):
+    min_size = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
+    if square <= max(REMARK_SIGMAS * sigma, min_size**2):
         return ()
     return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
                    f'constant of about {np.sqrt(square):.2f} s; accounted for'),)
@@ -292,8 +292,8 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
     """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
-    least_size = 0.01        # s: the samples of most odometers are farther apart
-    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= least_size:
+    min_size = 0.01        # s: the samples of most odometers are farther apart
+    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= min_size:
         return ()
     return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '
                    f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '

@@ -32,7 +32,7 @@ OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
 # variance factor of an interval above which it is a slip. Statistical: 3.7 sigmas, by chance once
 # in 4200
 SLIP_VARIANCE = 1.5
-LEAST_SLIP = 0.05    # m, judgement: a shorter slip is not reported
+MIN_REPORTED_SLIP = 0.05    # m, judgement: a shorter slip is not reported
 # redundancy above which a level is reported. Statistical: its root, with a sigma of root / sqrt(2
 # redundancy), is then REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
@@ -137,7 +137,7 @@ def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
 def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
     """Return the slips, largest first; slip_path : (K,) m.   count_m : size of a count, m."""
     t = fit.state.t
-    limit = max(LEAST_SLIP, count_m)
+    limit = max(MIN_REPORTED_SLIP, count_m)
     slipping = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE)
                               | (np.abs(slip_path) > max(4 * np.sqrt(fit.levels['along']), limit)))
     if not len(slipping):

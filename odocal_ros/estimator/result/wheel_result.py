@@ -17,7 +17,7 @@ from odocal_ros.settings.config import Config, SIDES
 from odocal_ros.settings.levels import TRACK_WIDTH
 
 Found = tuple[dict[str, Estimate], list[Reason]]
-FEWEST_COMPARED = 3     # wheels, definition: with fewer, it is unknown which one differs
+MIN_COMPARED_WHEELS = 3     # wheels, definition: with fewer, it is unknown which one differs
 # relative, judgement: difference of new tyres of one size; a third less pressure makes half of it
 DEPARTS = 0.01
 
@@ -102,7 +102,7 @@ def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
 
 def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
     """Return the reason that reports a wheel whose factor differs from all others."""
-    if len(wheels) < FEWEST_COMPARED:
+    if len(wheels) < MIN_COMPARED_WHEELS:
         return []
     differing = {}
     for name, wheel in wheels.items():

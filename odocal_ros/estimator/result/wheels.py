@@ -42,7 +42,7 @@ WHEEL_DELAY_SIGMA = 0.02    # s, judgement: of the stamps of a wheel relative to
 FIRST_WALK = 2e-3**2    # m^2/s, definition: initial levels of the random walk
 UNUSABLE_SHARE = 1e10   # s, definition: ``Increments.share`` without information
 LONGEST_STEP = 0.3      # s, judgement: interpolation errors are then 1 to 2 cm
-FEWEST_INCREMENTS = 20  # judgement: with fewer, the sigma of a level is 30 % or more
+MIN_WHEEL_INCREMENTS = 20  # judgement: with fewer, the sigma of a level is 30 % or more
 NUISANCE = range(2, 5)  # definition: indices of the delays and the drift among the unknowns
 # physical, relative error of x_i by sideslip and body motion: 20 mm of 2.7 m (docs/decisions/0022)
 POSITION_ERROR = 8e-3
@@ -52,7 +52,7 @@ WHEELBASE = 5.0         # m, physical: 1 sigma of x_i of a steered wheel, of a l
 WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
 # of those logarithms, definition: wheels of a forecast have no noise, and their levels would
 # decrease until the equations are singular
-LEAST_LOG_LEVEL = -20.0
+MIN_LOG_LEVEL = -20.0
 # judgement: iterations of the search for outliers, until variances change by less than a tenth;
 # each removes nine tenths of their effect on a level
 TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
@@ -96,11 +96,11 @@ def fit_wheels(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     t = stamp_of(state.t, state.constants)
     inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
                             & (t <= min(w.t[-1] for w in wheels)))
-    if len(inside) < FEWEST_INCREMENTS:
+    if len(inside) < MIN_WHEEL_INCREMENTS:
         return {}
     s = np.stack([as_rolled(w, state.constants)(state.t[inside]) for w in wheels]) * state.scale
     at = _nodes(s, state.scale * max(w.quantum for w in wheels))
-    if len(at) < FEWEST_INCREMENTS:
+    if len(at) < MIN_WHEEL_INCREMENTS:
         return {}
     signals = _Signals(problem, fit, inside[at], s[:, at])
     clock = np.array([layout.ODO_DELAY, layout.ODO_CLOCK])
@@ -240,7 +240,7 @@ def fit_line(data: Increments) -> Line:
         minimum = minimize(_minus_log_likelihood, log_levels, args=(data, factor),
                            method='Nelder-Mead', options={
                                'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
-        log_levels = np.maximum(minimum.x, LEAST_LOG_LEVEL)
+        log_levels = np.maximum(minimum.x, MIN_LOG_LEVEL)
         x, covariance, _, banded, root = _solve(log_levels, data, factor)
         z = _leave_one_out(banded, root, data.y - data.X @ x)
         before, factor = factor, np.maximum(factor * (z / TAIL_SIGMAS)**2, 1.0)
@@ -253,7 +253,7 @@ def fit_line(data: Increments) -> Line:
 def _solve(log_levels: Floats, data: Increments,
            factor: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
     """Return x, its covariance, -2 ln likelihood, and the banded covariance of y and its root."""
-    levels = np.exp(np.maximum(log_levels, LEAST_LOG_LEVEL))
+    levels = np.exp(np.maximum(log_levels, MIN_LOG_LEVEL))
     reading = data.reading * levels[-1]
     walk = (data.walk * levels[:-1])[data.kind] * data.share * factor
     banded = np.empty((2, len(data.y)))
