@@ -7,6 +7,7 @@ Write .ci/constraints.txt: the installed versions of all dependencies of odocal_
 Run ``python -m tools.pin_versions`` in the environment of the tests.
 """
 
+import argparse
 from importlib.metadata import distribution, PackageNotFoundError
 from pathlib import Path
 import platform
@@ -35,6 +36,7 @@ def needed(name: str, extras: tuple[str, ...], found: dict[str, str]) -> None:
 
 def main() -> None:
     """Write the file."""
+    argparse.ArgumentParser(description=__doc__).parse_args()   # --help writes nothing
     found: dict[str, str] = {}
     needed('odocal_ros', EXTRAS, found)
     head = (f'# made by tools/pin_versions.py on Python {platform.python_version()}: all that is '
