@@ -102,7 +102,7 @@ def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text,
 def test_two_counters_on_one_topic_are_reported_as_the_cause(made, leg):
     half_ns = int(np.diff(leg.odometer.stamp_ns).min()) // 2
     two = with_columns(leg, 'odometer', value=lambda a: a + 10**6, stamp_ns=lambda a: a + half_ns,
-                 received_ns=lambda a: a + half_ns)
+                       received_ns=lambda a: a + half_ns)
     both = join([leg.odometer, two.odometer])
     order = np.argsort(both.stamp_ns, kind='stable')
     result, said = run(replace(leg, odometer=take(both, order)), made)
@@ -150,8 +150,7 @@ def test_missing_odometer_rows_do_not_reject_the_leg(made, leg, gone, text):
 
 @pytest.mark.parametrize('kind', ['increment', 'rate'])
 def test_a_gap_of_increments_or_speeds_increases_the_sigma(made, leg, kind):
-    if kind == 'rate':
-        made = drives.drive(**drives.STRAIGHT, odometer='speed')
+    made = drives.drive(**drives.STRAIGHT, odometer='speed') if kind == 'rate' else made
     leg = made.leg() if kind == 'rate' else drives.with_increments(leg)
     whole, _ = run(leg, made)
     result, said = run(without(leg, 'odometer', 20, 30), made)  # at the end of the acceleration
@@ -175,8 +174,7 @@ def test_a_counter_that_counts_down_is_reported(made, leg, heading_sigma):
 @pytest.mark.parametrize(('drive', 'spoil', 'setting', 'value'), [
     ('made', partial(with_columns, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale',
      9.80665),
-    ('town', partial(with_columns, slot='imu', w_i=np.degrees), 'imu.gyro_scale',
-     0.017453292519943295)])
+    ('town', partial(with_columns, slot='imu', w_i=np.degrees), 'imu.gyro_scale', np.pi / 180)])
 def test_units_other_than_si_are_reported_with_a_setting(request, drive, spoil, setting, value):
     made = request.getfixturevalue(drive)
     leg = spoil(made.leg())

@@ -16,7 +16,7 @@ import odocal_ros
 
 PACKAGE = Path(odocal_ros.__file__).parent
 PACKAGES = ('data', 'nav', 'screening', 'settings', 'calib', 'estimator', 'pipeline', 'forecast',
-         'apply', 'live')
+            'apply', 'live')
 # indices of unknowns in a vector: two vectors may contain the same quantity
 LAYOUTS = ('estimator/state.py', 'apply/errors.py')
 

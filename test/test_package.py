@@ -73,7 +73,7 @@ def test_each_source_file_has_a_copyright_and_a_licence():
     assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
     assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
     folders = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',
-             'docs')
+               'docs')
     files = [path for folder in folders for path in (ROOT / folder).rglob('*.py')]
     assert len(files) > 500
     assert [path for path in files if path.stat().st_size

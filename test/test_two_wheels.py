@@ -156,7 +156,7 @@ def test_wheels_with_other_rates_and_ends_are_used_where_both_have_rows(made, cl
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
     # a row stamped early by 7 ms: as a wheel read 7 ms late
     leg = with_columns(kept(made.leg(), 'odometer_right', slice(101, 5001, 2)), 'odometer_right',
-                 stamp_ns=lambda a: a - 7_000_000)
+                       stamp_ns=lambda a: a - 7_000_000)
     inputs, _ = screened(leg, made)
     t, sent = inputs.travel.t, seconds(leg, leg.odometer_right)
     assert sent[0] <= t[0]

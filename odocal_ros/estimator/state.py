@@ -116,11 +116,11 @@ BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
 # rad, left side up: mean roll of the ground of a leg. The mean attitude less this one determines
 # the roll of the IMU in the vehicle
-MEAN_ROLL = constants_from('mean_roll')
+MEAN_ROLL = CONSTANTS.index('mean_roll')
 # constants of the ground of a leg
 GROUND = constants_from('lift_by_turning', 'mean_roll')
 # constants of C_bv, in the order of its derivatives
-AXES = (YAW, PITCH, MEAN_ROLL.start)
+AXES = (YAW, PITCH, MEAN_ROLL)
 # constants that other legs do not share: those of its ground and its fixes
 LEG_CONSTANTS = constants_from('lift_by_turning', 'fix_error_up')
 # deviations from ideal sensors and an ideal vehicle, (S28)
@@ -177,7 +177,7 @@ class State:
     @cached_property
     def C_bv(self) -> Floats:
         """Return the rotation from vehicle to body axes: (3, 3)."""
-        return vehicle_axes(self.forward, self.up_b, self.constants[MEAN_ROLL.start])
+        return vehicle_axes(self.forward, self.up_b, self.constants[MEAN_ROLL])
 
     @cached_property
     def C_bv_level(self) -> Floats:
@@ -200,7 +200,7 @@ class State:
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
         forward, left, _ = self.C_bv_level.T
         size = np.linalg.norm(np.cross(self.up_b, forward))
-        roll = exp_so3(np.array([self.constants[MEAN_ROLL.start], 0.0, 0.0]))
+        roll = exp_so3(np.array([self.constants[MEAN_ROLL], 0.0, 0.0]))
 
         def gradient(by_forward: Floats) -> Floats:
             by_left = np.cross(self.up_b, by_forward) / size

@@ -104,8 +104,7 @@ def test_bumps_determine_the_mean_roll_of_a_road():
     """The body pitches about its own left axis: else ``gyro_axis_zy`` was 0.020, 35 sigma."""
     fit = best_fit(make_problem(bumpy_road(0.02), CONFIG), CONFIG)
     c, sigma = fit.state.constants, np.sqrt(np.diag(fit.covariance))
-    roll = MEAN_ROLL.start
-    assert sigma[roll] < MEAN_ROLL_SIGMA / 5     # from the drive, not the prior
-    for i, true in ((roll, np.arctan(0.02)), (YAW, 0.0), (PITCH, MOUNTING),
+    assert sigma[MEAN_ROLL] < MEAN_ROLL_SIGMA / 5     # from the drive, not the prior
+    for i, true in ((MEAN_ROLL, np.arctan(0.02)), (YAW, 0.0), (PITCH, MOUNTING),
                     (CONSTANTS.index('gyro_axis_zy'), 0.0)):
         assert abs(c[i] - true) < 3 * sigma[i]

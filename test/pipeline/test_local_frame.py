@@ -159,7 +159,7 @@ def test_a_local_frame_has_no_gyrocompass():
     assert Code.YAW_NOT_SEPARABLE in reason_texts(result)
     heading_config = settings(made, heading_sigma=None, alignment__heading_source='gyrocompass')
     assert 'y axis does not point to north' in reason_texts(calibrate(posed(made),
-                                                                         heading_config))[
+                                                                      heading_config))[
         Code.GYROCOMPASS_REFUSED]
 
 

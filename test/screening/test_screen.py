@@ -60,7 +60,7 @@ def test_a_force_that_is_scaled_to_zero_has_no_direction(leg):
 def test_fixes_with_the_status_no_fix_are_excluded(leg):
     def lost(rows):
         return with_columns(leg, 'fix', status=(rows, -1), latitude=(rows, np.nan),
-                      longitude=(rows, np.nan))
+                            longitude=(rows, np.nan))
     n = len(leg.fix.stamp_ns)
     inputs, codes = screen_with(lost(slice(0, 9)))
     assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} {FIXES} are not used: 9 with status '

@@ -258,7 +258,7 @@ class Motion:
         # lean about axes that roll
         pitch, yaw = self.lean_angles
         by_roll = state.scale * (np.outer(pitch, -self.left) - np.outer(yaw, self.up))
-        c[:, D, layout.MEAN_ROLL.start] -= rotate(C @ s.S, by_roll)
+        c[:, D, layout.MEAN_ROLL] -= rotate(C @ s.S, by_roll)
         for i, axis in enumerate((self.up, -self.left)):
             by_angle = C @ s.S @ (state.scale * axis)
             columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)

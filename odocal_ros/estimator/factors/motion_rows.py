@@ -95,7 +95,7 @@ class MotionRows(Factor):
         if self.motion.fitted:
             estimates = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
             self.signals.fit_forces(rows, constants, gyro, estimates)
-            constants[:, D, MEAN_ROLL.start] += self.derivative_by_roll(rows, units)
+            constants[:, D, MEAN_ROLL] += self.derivative_by_roll(rows, units)
         return begin, end, constants
 
     def derivative_by_roll(self, rows: slice, units: Floats) -> Floats:
