@@ -21,11 +21,11 @@ PHI_U = np.deg2rad(0.06)            # 3.6'
 
 def straight_leg(phi_U0, eps_z, T, velocity_E, velocity_N, latitude):
     """Return phi_U, dL, dlam, dalpha, rad, and dK / K at the end of a leg: (29)-(33)."""
-    turned = phi_U0 * T - eps_z * T**2 / 2
+    phi_integral = phi_U0 * T - eps_z * T**2 / 2
     return SimpleNamespace(
-        phi_U=phi_U0 - eps_z * T, dL=-velocity_E / PAPER_RADIUS * turned,
-        dlam=velocity_N / np.cos(latitude) / PAPER_RADIUS * turned,
-        dalpha=-turned / T, dK=eps_z**2 * T**2 / 24)      # in place of (32)
+        phi_U=phi_U0 - eps_z * T, dL=-velocity_E / PAPER_RADIUS * phi_integral,
+        dlam=velocity_N / np.cos(latitude) / PAPER_RADIUS * phi_integral,
+        dalpha=-phi_integral / T, dK=eps_z**2 * T**2 / 24)      # in place of (32)
 
 
 def papers_profile(n=4001):
@@ -37,10 +37,10 @@ def papers_profile(n=4001):
 
 
 @pytest.mark.parametrize('latitude_deg', [20.0, 35.0, 50.0])
-@pytest.mark.parametrize('off_deg', [-3.0, -1.5, 0.5, 3.0])
-def test_plane_error_is_the_derivative_of_the_projection(latitude_deg, off_deg):
+@pytest.mark.parametrize('from_meridian_deg', [-3.0, -1.5, 0.5, 3.0])
+def test_plane_error_is_the_derivative_of_the_projection(latitude_deg, from_meridian_deg):
     meridian = 117.0
-    latitude, longitude = np.deg2rad([latitude_deg, meridian + off_deg])
+    latitude, longitude = np.deg2rad([latitude_deg, meridian + from_meridian_deg])
     plane, h = Plane(meridian, ellipsoid='Krassovsky'), 1e-6
     by_L, by_lam = (np.subtract(plane.forward(latitude + a, longitude + b),
                                 plane.forward(latitude - a, longitude - b)) / (2 * h)
@@ -65,9 +65,9 @@ def test_chord_error_is_the_derivative_of_scale_and_bearing(bearing_deg):
     h = 0.1      # m: third order leaves (h / S2)^2 = 1e-10
     for dx, dy in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
         change = calibrate(x + h * dx, y + h * dy) - calibrate(x - h * dx, y - h * dy)
-        seen = wrap(change) / (2 * h)
+        derivative = wrap(change) / (2 * h)
         # round-off: 1e-16 of K0, 4e-16 of a bearing of 3, over 0.2 m
-        assert_allclose(chord_error(x, y, dx, dy, S1, K0), seen, rtol=1e-9, atol=3e-15)
+        assert_allclose(chord_error(x, y, dx, dy, S1, K0), derivative, rtol=1e-9, atol=3e-15)
 
 
 def test_straight_leg_is_the_model_without_earth_rate_and_tilt():

@@ -87,17 +87,17 @@ def difference(town, column, k):
     step[column] = STEP[column]
     plus, minus = ([level_state(*run, i) for i in k] for run in (
         reckon(town, step[:6], step[6:]), reckon(town, -step[:6], -step[6:])))
-    out = []
-    for (p, C), (q, D) in zip(plus, minus, strict=True):
+    changes = []
+    for (p, C), (q, D) in zip(plus, minus, strict=True):     # positions, attitudes
         turn = C @ D.T                       # = I - [2 phi x]
         phi = np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2],
                         turn[0, 1] - turn[1, 0]]) / 2
-        out.append(np.concatenate([phi, p - q]) / (2 * STEP[column]))
-    return np.array(out)
+        changes.append(np.concatenate([phi, p - q]) / (2 * STEP[column]))
+    return np.array(changes)
 
 
-def size(path, k):
-    """Return one unit of each state in metres or rad x 1 m, for equal weights of all six."""
+def state_units(path, k):
+    """Return the length, m, of one unit of each state at epochs k; of an angle phi, 1 m."""
     meridian, normal = radii(path.latitude[k])
     return np.stack([np.ones_like(meridian)] * 3
                     + [meridian, normal * np.cos(path.latitude[k]), np.ones_like(meridian)], -1)
@@ -114,9 +114,9 @@ def test_the_model_is_the_derivative_of_the_real_dead_reckoning(town, column):
     real = difference(town, column, k) - start
     # both sum by trapezoids: second order in the turn per sample, 0.4 rad/s / 100 Hz, so
     # (4e-3)^2 / 12 = 1.3e-6; round-off 1e-15 rad and 2e-9 m
-    for rows, grain in ((slice(0, 3), 1e-15), (slice(3, 6), 2e-9)):
-        a, b = (model * size(path, k))[:, rows], (real * size(path, k))[:, rows]
-        assert_allclose(a, b, rtol=0, atol=3e-6 * np.abs(b).max() + grain / STEP[column])
+    for rows, round_off in ((slice(0, 3), 1e-15), (slice(3, 6), 2e-9)):
+        a, b = (model * state_units(path, k))[:, rows], (real * state_units(path, k))[:, rows]
+        assert_allclose(a, b, rtol=0, atol=3e-6 * np.abs(b).max() + round_off / STEP[column])
 
 
 def test_fixed_axes_show_the_error_of_strapdown_and_dead_reckoning(town):
@@ -127,10 +127,10 @@ def test_fixed_axes_show_the_error_of_strapdown_and_dead_reckoning(town):
     psi, dr = in_fixed_axes(path, propagate(path, x_0, eps_b), origin)
     (plus, _), (minus, _) = reckon(town, x_0, eps_b), reckon(town, -x_0, -eps_b)
     turn = matrix_from_quat(plus.q_nb) @ transpose(matrix_from_quat(minus.q_nb))
-    seen = np.stack([turn[:, 1, 2] - turn[:, 2, 1], turn[:, 2, 0] - turn[:, 0, 2],
-                     turn[:, 0, 1] - turn[:, 1, 0]], -1) / 4
+    measured_psi = np.stack([turn[:, 1, 2] - turn[:, 2, 1], turn[:, 2, 0] - turn[:, 0, 2],
+                             turn[:, 0, 1] - turn[:, 1, 0]], -1) / 4
     # trapezoids as above, and phi^2 = 1e-7 of the terms of third order
-    assert_allclose(psi, seen, rtol=0, atol=4e-6 * np.abs(seen).max())
+    assert_allclose(psi, measured_psi, rtol=0, atol=4e-6 * np.abs(measured_psi).max())
     assert_allclose(dr, (plus.P - minus.P) @ FORWARD / 2, rtol=0, atol=4e-6 * np.abs(dr).max())
 
 
@@ -139,24 +139,24 @@ def test_without_drift_the_error_in_fixed_axes_rotates_by_the_earth_only(town):
     path = path_of(track, origin)
     psi_0 = np.array([1e-4, 2e-4, -3e-4])
     psi, _ = in_fixed_axes(path, propagate(path, [*psi_0, 0, 0, 0], np.zeros(3)), origin)
-    turned = exp_so3(-earth_rate_n(origin.latitude) * (path.t - path.t[0])[:, None]) @ psi_0
+    rotated_psi = exp_so3(-earth_rate_n(origin.latitude) * (path.t - path.t[0])[:, None]) @ psi_0
     # the path's velocities are means over an interval, turned by the mean attitude of the level:
     # second order in the turn of the level per step, 1e-8; transport itself is 1e-3 of psi
-    assert_allclose(psi, turned, rtol=0, atol=1e-7 * np.abs(psi_0).max())
+    assert_allclose(psi, rotated_psi, rtol=0, atol=1e-7 * np.abs(psi_0).max())
 
 
 def test_the_sphere_gives_the_coefficients_of_the_paper():
     F = coefficients(np.deg2rad(40.0), 0.0, [14.0, 14.0, 0.0], PAPER_RADIUS)
     # by (15)-(23), corrected, computed independently: value, unit of the last digit
-    figures = {('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
+    entries = {('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
                ('dlam', 'dL'): (2.404e-6, 1e-9), ('phi_E', 'phi_N'): (4.871e-5, 1e-8),
                ('phi_E', 'phi_U'): (-5.586e-5, 1e-8), ('phi_N', 'dL'): (-4.687e-5, 1e-8),
                ('phi_N', 'phi_E'): (-4.871e-5, 1e-8), ('phi_U', 'dL'): (5.960e-5, 1e-8),
                ('phi_U', 'phi_E'): (5.805e-5, 1e-8), ('phi_U', 'phi_N'): (2.195e-6, 1e-9),
                ('phi_U', 'phi_U'): (1.842e-6, 1e-9)}
     expected, unit = np.zeros((5, 5)), np.zeros((5, 5))
-    for (row, column), figure in figures.items():
-        expected[_state(row), _state(column)], unit[_state(row), _state(column)] = figure
+    for (row, column), entry in entries.items():
+        expected[_state(row), _state(column)], unit[_state(row), _state(column)] = entry
     assert (np.abs(F[:5, :5] - expected) <= unit).all()
     # dh: the third row of (21), without feedback
     assert_allclose(F[5], [-14.0, 14.0, 0, 0, 0, 0])
@@ -207,10 +207,10 @@ def test_the_series_is_of_second_order():
         return propagate(level, x_0, eps_b)[-1]
 
     best = end(6400)
-    miss = [np.abs((end(n) - best) / best)[:3].max() for n in (10, 20, 40)]
+    errors = [np.abs((end(n) - best) / best)[:3].max() for n in (10, 20, 40)]
     # second order over a fixed time: error per step of third order, so 4 in all
-    assert miss[0] / miss[1] == pytest.approx(4, rel=0.15)
-    assert miss[1] / miss[2] == pytest.approx(4, rel=0.1)
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)
 
 
 def test_a_planned_drive_equals_the_simulated_one():

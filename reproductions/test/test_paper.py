@@ -22,7 +22,7 @@ from odocal_ros.settings.config import with_settings
 pytestmark = pytest.mark.slow
 
 # table 1 by the corrected equations (15)-(23): value, unit of the last digit
-FIGURES_1 = {
+EXPECTED_TABLE_1 = {
     ('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),
     ('dlam', 'dL'): (2.404e-6, 1e-9), ('phi_E', 'phi_N'): (4.871e-5, 1e-8),
     ('phi_E', 'phi_U'): (-5.586e-5, 1e-8), ('phi_N', 'dL'): (-4.687e-5, 1e-8),
@@ -32,10 +32,10 @@ FIGURES_1 = {
     ('phi_N', 'eps_N'): (-1.0, 0), ('phi_U', 'eps_U'): (-1.0, 0)}
 # yaw error of table 3 in the plane whose meridian goes through the start: deg, unit of the last
 # digit. Row none is the error of the plane itself
-RECOMPUTED = {'none': (0.70e-5, 0.01e-5), 'eps_x': (1.34e-5, 0.01e-5), 'eps_y': (1.38e-5, 0.01e-5),
-              'eps_z': (8.40e-4, 0.01e-4), 'phi_E0': (-1.379e-4, 0.001e-4),
-              'phi_N0': (0.06e-5, 0.01e-5), 'phi_U0': (-0.05998, 0.00001),
-              'all': (-0.05929, 0.00001)}
+EXPECTED_YAW_DEG = {
+    'none': (0.70e-5, 0.01e-5), 'eps_x': (1.34e-5, 0.01e-5), 'eps_y': (1.38e-5, 0.01e-5),
+    'eps_z': (8.40e-4, 0.01e-4), 'phi_E0': (-1.379e-4, 0.001e-4), 'phi_N0': (0.06e-5, 0.01e-5),
+    'phi_U0': (-0.05998, 0.00001), 'all': (-0.05929, 0.00001)}
 TILTED = ('phi_E0', 'phi_N0', 'all')
 
 
@@ -50,16 +50,16 @@ def cells(table):
 
 def test_table_1_agrees_with_an_independent_computation(tables):
     computed = cells(tables.table_1)
-    assert computed.keys() == FIGURES_1.keys()
-    for place, (figure, unit) in FIGURES_1.items():
+    assert computed.keys() == EXPECTED_TABLE_1.keys()
+    for place, (expected, unit) in EXPECTED_TABLE_1.items():
         value = computed[place].sign * computed[place].value
-        assert value == pytest.approx(figure, rel=1e-12, abs=unit)
+        assert value == pytest.approx(expected, rel=1e-12, abs=unit)
 
 
 def test_table_1_is_as_printed_except_for_two_entries(tables):
     # two digits, rounded or truncated: within a unit of the second
     different = {place for place, cell in cells(tables.table_1).items()
-           if abs(cell.value - cell.printed) > 10**(np.floor(np.log10(cell.printed)) - 1)}
+                 if abs(cell.value - cell.printed) > 10**(np.floor(np.log10(cell.printed)) - 1)}
     assert different == {('phi_E', 'phi_N'), ('phi_U', 'phi_U')}
     for place in different:
         assert 'tan L' in cells(tables.table_1)[place].remark
@@ -78,32 +78,33 @@ def test_table_2_is_table_1_times_the_errors(tables):
     assert second['phi_N', 'dL'].value == pytest.approx(7.35e-11, abs=0.005e-11)
 
 
-def test_table_2_as_printed_follows_from_rounded_inputs_and_one_wrong_decade(tables):
+def test_table_2_as_printed_follows_from_rounded_inputs_and_one_wrong_power_of_ten(tables):
     # 1.57e-6, 1.454e-4, 1.047e-3, 4.848e-8, as the printed products show them
     rounded = {'dL': 1.6e-6, 'phi_E': 1.5e-4, 'phi_N': 1.5e-4, 'phi_U': 1.1e-3, 'eps_E': 4.8e-8,
                'eps_N': 4.8e-8, 'eps_U': 4.8e-8}
-    # in these entries phi_N, phi_E is that of the entry above it, and phi_U is rounded down
-    other = {('phi_N', 'phi_E'): 5.0e-5 * 1.5e-4, ('phi_U', 'phi_U'): 2.2e-6 * 1.0e-3}
+    # (phi_N, phi_E) was computed with the coefficient of the entry above it, and (phi_U, phi_U)
+    # with phi_U rounded down
+    exceptions = {('phi_N', 'phi_E'): 5.0e-5 * 1.5e-4, ('phi_U', 'phi_U'): 2.2e-6 * 1.0e-3}
     first = cells(tables.table_1)
     for (row, column), cell in cells(tables.table_2).items():
-        expected = other.get((row, column)) or first[row, column].printed * rounded[column]
-        decade = 10 if (row, column) == ('phi_N', 'dL') else 1
+        expected = exceptions.get((row, column)) or first[row, column].printed * rounded[column]
+        power = 10 if (row, column) == ('phi_N', 'dL') else 1
         half_unit = 10**(np.floor(np.log10(expected)) - 1) * 0.51     # of the second digit
-        assert cell.printed / decade == pytest.approx(expected, rel=0, abs=half_unit)
+        assert cell.printed / power == pytest.approx(expected, rel=0, abs=half_unit)
         # printed values differ by 1 to 6 %, and by 14 % where table 1 lacks tan L
-        difference = abs(cell.printed / decade / cell.value - 1)
+        difference = abs(cell.printed / power / cell.value - 1)
         assert difference < (0.145 if (row, column) == ('phi_U', 'phi_U') else 0.062)
-        if difference > 0.02 or decade > 1:
+        if difference > 0.02 or power > 1:
             assert cell.remark
 
 
 @pytest.mark.parametrize('source', SOURCES)
-def test_table_3_is_the_recomputed_column_minus_its_row_none(tables, source):
-    figure, unit = RECOMPUTED[source]
+def test_table_3_is_the_expected_column_minus_its_row_none(tables, source):
+    yaw_deg, unit = EXPECTED_YAW_DEG[source]
     # half a unit of the last digits. The column was solved in the plane, the pipeline solves in
     # space: tilts along and across the track differ between the two by their product, phi^2 / 2
     second_order = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2) if source in TILTED else 0
-    expected = figure - RECOMPUTED['none'][0]
+    expected = yaw_deg - EXPECTED_YAW_DEG['none'][0]
     if source == 'none':
         # by the resolution of the pulses: 1e-6 m over 11 200 m
         expected, unit, second_order = 0.0, 0.0, np.rad2deg(1e-6 / 11_200)
@@ -137,7 +138,7 @@ def test_scale_errors_are_of_second_order(tables, source):
 @pytest.mark.parametrize('source', SOURCES)
 def test_the_error_model_predicts_the_result_of_the_pipeline(tables, source):
     row = tables.table_3[source]
-    # eq. (14) has C in place of N: up to 0.3 %; second order as above
+    # eq. (14) has C in place of the radius N: up to 0.3 %; second order as in table 3
     assert row.model_deg == pytest.approx(
         row.yaw_deg.value, rel=3e-3,
         abs=1e-9 + (6.1e-7 if source in TILTED else 0))
@@ -171,13 +172,13 @@ def drive_in_a_plane():
 
 
 @pytest.mark.parametrize('source', SOURCES)
-def test_the_plane_of_the_paper_gives_the_recomputed_column(drive_in_a_plane, source):
+def test_the_plane_of_the_paper_gives_the_expected_column(drive_in_a_plane, source):
     drive = drive_in_a_plane
     check = drive.outcome(source).result.methods['two_point'].details['cross_check']['plane']
-    figure, unit = RECOMPUTED[source]
+    yaw_deg, unit = EXPECTED_YAW_DEG[source]
     second_order = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2) if source in TILTED else 0
     assert np.rad2deg(check['alpha_psi'] - drive.drive.truth.yaw) == pytest.approx(
-        figure, abs=unit / 2 + second_order)
+        yaw_deg, abs=unit / 2 + second_order)
 
 
 def test_errors_of_the_alignment_have_the_stated_signs():
@@ -192,7 +193,7 @@ def test_errors_of_the_alignment_have_the_stated_signs():
         assert_allclose(alignment.gyro_bias, -eps_b)
         assert alignment.t == 0.0
     rate = np.deg2rad(0.01) / 3600
-    # right is minus left, forward is forward
+    # x of the paper is right, minus left; y is forward
     assert_allclose(errors_of('eps_x')[1], [0, -rate, 0])
     assert_allclose(errors_of('eps_y')[1], [rate, 0, 0])
     assert_allclose(errors_of('all')[1], [rate, -rate, rate])
@@ -205,13 +206,13 @@ def test_stdout_contains_only_json_and_a_picture_is_written(capsys, tables, tmp_
     out = json.loads(capsys.readouterr().out)
     assert 'estimate - truth' in out['error_convention']
     assert 'truth - estimate' in out['error_convention']
-    third = out['tables']['3']
-    assert set(third) == {'none', 'eps_x', 'eps_y', 'eps_z', 'phi_E0', 'phi_N0', 'phi_U0', 'all'}
-    assert third['phi_U0']['yaw_deg']['printed'] == 0.0596
-    assert third['phi_U0']['scale']['printed'] == 4.016e-8
-    assert third['none']['yaw_deg']['printed'] is None
-    assert third['eps_z']['yaw_deg']['printed'] == -7.968e-4
-    assert third == json.loads(json.dumps(tables.as_dict()['tables']['3']))    # repeatable
+    table_3 = out['tables']['3']
+    assert set(table_3) == {'none', 'eps_x', 'eps_y', 'eps_z', 'phi_E0', 'phi_N0', 'phi_U0', 'all'}
+    assert table_3['phi_U0']['yaw_deg']['printed'] == 0.0596
+    assert table_3['phi_U0']['scale']['printed'] == 4.016e-8
+    assert table_3['none']['yaw_deg']['printed'] is None
+    assert table_3['eps_z']['yaw_deg']['printed'] == -7.968e-4
+    assert table_3 == json.loads(json.dumps(tables.as_dict()['tables']['3']))    # repeatable
     assert out['tables']['4']['phi_U0']['formula']['scale']['printed'] == 3.416e-6
     assert out['tables']['1']['dL']['phi_U'] == pytest.approx(
         {'printed': 2.2e-6, 'value': 2.195e-6, 'ratio': 0.9977, 'sign': -1}, rel=1e-4)

@@ -13,13 +13,13 @@ import pytest
 from odocal_reproductions.patent import command as patent
 from odocal_reproductions.patent.embodiment import (
     embodiment,
-    FOUND,
     imbalance,
     LEVELS,
     min_rows,
     nearly_balanced,
+    NOMINAL_RADIUS,
     PRINTED,
-    RADIUS,
+    PRINTED_BEST,
 )
 from odocal_ros.calib.wheel_search.parameter_sets import bose, full_factorial
 from odocal_ros.offline.cli import main
@@ -41,9 +41,9 @@ def test_json_and_page_have_the_same_lines_and_the_truth_is_found(same_drive, ca
     assert main(['patent', '--json']) == 0
     out = json.loads(capsys.readouterr().out)
     rows = {row['name']: row for row in out['rows']}
-    whole = rows['best of all 441']
+    best = rows['best of all 441']
     # the true combination is the best of all, and is not one of those printed
-    assert (whole['left'], whole['right'], whole['heading_deg']) == pytest.approx(FOUND)
+    assert (best['left'], best['right'], best['heading_deg']) == pytest.approx(PRINTED_BEST)
     assert out['orthogonal_rows'] == 441
     assert main(['patent', '--fix-noise', 'rtk']) == 0
     page = capsys.readouterr().out
@@ -54,7 +54,7 @@ def test_json_and_page_have_the_same_lines_and_the_truth_is_found(same_drive, ca
 
 
 @pytest.mark.parametrize(('name', 'begin'), [('a.png', b'\x89PNG'), ('b.PDF', b'%PDF')])
-def test_plot_writes_a_picture_whole(same_drive, capsys, tmp_path, name, begin):
+def test_plot_writes_a_picture(same_drive, capsys, tmp_path, name, begin):
     assert main(['patent', '--plot', str(tmp_path / name)]) == 0
     assert name in capsys.readouterr().out
     assert (tmp_path / name).read_bytes().startswith(begin)
@@ -69,22 +69,24 @@ def test_an_invalid_picture_file_is_refused_before_any_computation(capsys, tmp_p
 def test_the_embodiment_gives_the_printed_values():
     leg = patent.planar_leg('white', 0, duration=300.0, imu_grade='perfect', fix_sigma=0.0,
                         odometer_rate=50.0)
-    table = embodiment(leg, truth=FOUND)
+    table = embodiment(leg, truth=PRINTED_BEST)
     rows = {row.name: row for row in table.rows}
     assert [(round(r.left, 9), round(r.right, 9), round(r.heading_deg, 9)) for r in (
         rows[f'printed {k}'] for k in range(1, 8))] == list(PRINTED)
-    assert table.least == 441
+    assert table.orthogonal_rows == 441
     assert table.imbalance == pytest.approx(4 - 81 / 49)
     # fixes without noise: among all 441 the true one is best, and the optimum is the truth
-    assert (table.whole.left, table.whole.right, table.whole.heading_deg) == pytest.approx(FOUND)
+    best = table.best_of_all
+    assert (best.left, best.right, best.heading_deg) == pytest.approx(PRINTED_BEST)
     for name in ('response surface', 'least squares'):
-        found = rows[name]
-        # tracks within 0.1 mm (the line truth) over 0.4 m for a difference of one
-        assert (found.left, found.right) == pytest.approx(FOUND[:2], abs=RADIUS * 1e-4 / 0.4)
-        assert found.heading_deg == pytest.approx(FOUND[2], abs=0.002)
-        assert found.criteria['mean'] <= rows['truth'].criteria['mean'] + 1e-6
-    others = [rows[f'printed {k}'] for k in range(1, 8)] + [table.small]
-    assert table.whole.criteria['mean'] < min(row.criteria['mean'] for row in others)
+        row = rows[name]
+        # tracks within 0.1 mm (the line truth); a relative difference of radii of 1 gives 0.4 m
+        assert (row.left, row.right) == pytest.approx(PRINTED_BEST[:2],
+                                                      abs=NOMINAL_RADIUS * 1e-4 / 0.4)
+        assert row.heading_deg == pytest.approx(PRINTED_BEST[2], abs=0.002)
+        assert row.criteria['mean'] <= rows['truth'].criteria['mean'] + 1e-6
+    others = [rows[f'printed {k}'] for k in range(1, 8)] + [table.best_of_array]
+    assert table.best_of_all.criteria['mean'] < min(row.criteria['mean'] for row in others)
 
 
 def test_one_wrong_cell_makes_an_array_unbalanced():
@@ -109,17 +111,17 @@ def test_the_printed_combinations_are_levels_but_not_balanced():
     assert (rows >= 0).all()
     assert (rows < LEVELS).all()
     assert imbalance(rows, LEVELS) > 0.8
-    assert FOUND not in PRINTED
+    assert PRINTED_BEST not in PRINTED
 
 
 def test_the_small_array_is_nearly_balanced_by_the_stated_amount():
     array = nearly_balanced(LEVELS)
     assert array.shape == (81, 3)
     assert (array.max(axis=0) == [6, 6, 8]).all()
-    # two of seven levels stand for two of nine: their pair is met 4 times, even were 81 / 49
+    # two of seven levels replace four of nine: a pair of them occurs 4 times; even: 81 / 49
     assert imbalance(array, LEVELS) == pytest.approx(4 - 81 / 49)
     for a, b in combinations(range(3), 2):
-        met = {tuple(pair) for pair in array[:, [a, b]].tolist()}
-        assert len(met) == LEVELS[a] * LEVELS[b]
-    # dummies are symmetric about the middle: the mean of each column is the middle level
+        pairs = {tuple(pair) for pair in array[:, [a, b]].tolist()}
+        assert len(pairs) == LEVELS[a] * LEVELS[b]
+    # dummy levels are symmetric about the middle: the mean of each column is the middle level
     assert array.mean(axis=0) == pytest.approx([3, 3, 4])

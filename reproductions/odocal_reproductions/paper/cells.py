@@ -52,15 +52,15 @@ class Cell:
     """A printed and a computed value."""
 
     printed: float | None
-    value: float              # computed
-    sense: int = 1            # -1 if the printed value is truth - estimate
-    sign: int | None = None   # of the computed value, if it is a magnitude
-    remark: str = ''          # usually a misprint
+    value: float                # computed; its magnitude if ``sign`` is set
+    sign: int | None = None     # 1 or -1, of the computed value
+    printed_sign: int = 1       # -1 if the printed value is truth - estimate
+    remark: str = ''            # usually a misprint
 
     @property
     def ratio(self) -> float | None:
         """Return the computed over the printed value, both estimate - truth."""
-        return self.value / (self.sense * self.printed) if self.printed else None
+        return self.value / (self.printed_sign * self.printed) if self.printed else None
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the entry of --json."""

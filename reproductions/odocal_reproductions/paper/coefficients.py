@@ -12,24 +12,24 @@ from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, S
 GYRO_DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
 # definition: rad, of phi_E and phi_N, 0.5', and of phi_U, 3.6'
 TILT_ERROR, HEADING_ERROR = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)
-# factors of table 2, the sizes of the errors: rad, rad/s
-SIZES = {'dL': 10.0 / PAPER_RADIUS,
-         'phi_E': TILT_ERROR, 'phi_N': TILT_ERROR, 'phi_U': HEADING_ERROR,
-         'eps_E': GYRO_DRIFT, 'eps_N': GYRO_DRIFT, 'eps_U': GYRO_DRIFT}
-DRIFT_OF = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
+# factors of table 2: rad, rad/s
+ERROR_SIZES = {'dL': 10.0 / PAPER_RADIUS,
+               'phi_E': TILT_ERROR, 'phi_N': TILT_ERROR, 'phi_U': HEADING_ERROR,
+               'eps_E': GYRO_DRIFT, 'eps_N': GYRO_DRIFT, 'eps_U': GYRO_DRIFT}
+DRIFT_BY_STATE = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
 # remarks on printed values that differ from the computed ones
 REMARKS_1 = {
     ('phi_E', 'phi_N'): 'misprint: (15) has vE/R instead of vE tan L/R',
     ('phi_U', 'phi_U'): 'misprint: tan L of (17) is missing',
     ('dlam', 'dL'): 'misprint: (19), (23) lack vE, the value has it',
 }
-MISSING = 'as in table 1: tan L is missing'
+TAN_L_MISSING = 'as in table 1: tan L is missing'
 REMARKS_2 = {
     ('phi_N', 'dL'): 'misprint: wrong by a factor of 10, 7.5e-11',
-    ('phi_U', 'phi_U'): MISSING,
-    ('phi_E', 'phi_N'): MISSING,
+    ('phi_U', 'phi_U'): TAN_L_MISSING,
+    ('phi_E', 'phi_N'): TAN_L_MISSING,
 }
-ROUNDED = 'inputs rounded to two digits first'
+INPUTS_ROUNDED = 'inputs rounded to two digits first'
 TRUNCATED = 'truncated, not rounded'
 
 
@@ -40,7 +40,7 @@ def table_1() -> dict[str, dict[str, Cell]]:
     F = coefficients(latitude, 0.0, velocity_n, PAPER_RADIUS)
 
     def cell(row: str, column: str, printed: float) -> Cell:
-        value = -1.0 if DRIFT_OF.get(row) == column else float(
+        value = -1.0 if DRIFT_BY_STATE.get(row) == column else float(
             F[STATES.index(row), STATES.index(column)])
         remark = '' if float(f'{abs(value):.1e}') == printed else TRUNCATED
         return _cell(printed, value, REMARKS_1.get((row, column), remark))
@@ -51,14 +51,14 @@ def table_1() -> dict[str, dict[str, Cell]]:
 
 def table_2() -> dict[str, dict[str, Cell]]:
     """Return table 1 times the sizes of the errors, 1/s and rad/s."""
-    first = table_1()
+    coefficients_1 = table_1()
 
     def cell(row: str, column: str, printed: float) -> Cell:
-        coefficient = first[row][column]
-        value = coefficient.value * SIZES[column] * coefficient.sign
+        coefficient = coefficients_1[row][column]
+        value = coefficient.value * ERROR_SIZES[column] * coefficient.sign
         remark = REMARKS_2.get((row, column), '')
         if not remark and abs(printed / abs(value) - 1) > 0.02:
-            remark = ROUNDED
+            remark = INPUTS_ROUNDED
         return _cell(printed, value, remark)
 
     return {row: {column: cell(row, column, printed) for column, printed in cells.items()}

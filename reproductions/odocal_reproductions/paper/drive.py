@@ -68,7 +68,7 @@ class Growth:
 
     t: NDArray[np.float64]         # (m,) s
     yaw: NDArray[np.float64]       # (m,) rad, error if the leg ended at t; NaN before motion
-    across: NDArray[np.float64]    # (m,) m to the right of the true position
+    across: NDArray[np.float64]    # (m,) m, position error to the right of the chord
     heading: NDArray[np.float64]   # (m,) rad, phi_U
 
 
@@ -76,7 +76,7 @@ class PaperDrive:
     """The simulated drive of section 3, to be calibrated with any source of error."""
 
     def __init__(self) -> None:
-        pulse = 1e-6    # m: quantisation is 1e-10 of the distance, less than the errors
+        pulse = 1e-6    # m: quantisation is 1e-10 of the distance, below the errors of table 3
         self.drive: Drive = simulate(SimOptions(
             scenario='paper', imu_grade='perfect', fix_sigma=0.0, scale=pulse))
         truth, options = self.drive.truth, self.drive.options

@@ -28,7 +28,6 @@ dtheta is the rotation from the local level at the true to that at the computed 
 psi' = psi x omega_ie - C_nb eps_b and dr' = v x psi: psi changes by the Earth rate and drift only.
 """
 
-
 import numpy as np
 
 from odocal_reproductions.paper.path import Path
@@ -71,7 +70,7 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     F[..., E, N], F[..., E, U] = wU, -wN
     F[..., N, E], F[..., N, U] = -wU, wE
     F[..., U, E], F[..., U, N] = wN, -wE
-    _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec)
+    F[..., :3] += _velocity_error_effects((vE, vN, vU), RM, RN, tan, sec)
     # a position error changes the computed Earth rate and radii
     north_L, north_h = -vN / RM**2 * dRM, -vN / RM**2 * by_height
     east_L, east_h = -vE / RN**2 * dRN, -vE / RN**2 * by_height
@@ -85,21 +84,21 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     return F
 
 
-def _add_turned_velocity(F: Floats, vE: Floats | float, vN: Floats | float, vU: Floats,
-                         RM: Floats | float, RN: Floats | float, tan: Floats | float,
-                         sec: Floats | float) -> None:
-    """Add the effects of the velocity error v x phi, eq. (21), on position and omega_in."""
-    dv = np.zeros((*F.shape[:-2], 3, 3))                # rows dvE, dvN, dvU by phi
-    dv[..., 0, 1], dv[..., 0, 2] = -vU, vN
-    dv[..., 1, 0], dv[..., 1, 2] = vU, -vE
-    dv[..., 2, 0], dv[..., 2, 1] = -vN, vE
-    by_north, by_east = dv[..., 1, :] / _column(RM), dv[..., 0, :] / _column(RN)
-    F[..., E, :3] -= by_north
-    F[..., N, :3] += by_east
-    F[..., U, :3] += by_east * _column(tan)
-    F[..., LAT, :3] = by_north                          # (18), (22)
-    F[..., LON, :3] = by_east * _column(sec)            # (19), (23)
-    F[..., H, :3] = dv[..., 2, :]
+def _velocity_error_effects(velocity_n: tuple[Floats, Floats, Floats], RM: Floats | float,
+                            RN: Floats | float, tan: Floats, sec: Floats) -> Floats:
+    """
+    Return the rates of the states by phi through the velocity error v x phi of (21): (..., 6, 3).
+
+    velocity_n : east, north, up, m/s, (...) each.   RM, RN : radii of curvature, m.   tan, sec :
+    of the latitude.
+    """
+    vE, vN, vU = np.broadcast_arrays(*velocity_n, tan)[:3]
+    zero = np.zeros_like(vE)
+    dv_E, dv_N, dv_U = (np.stack(row, -1) for row in (
+        (zero, -vU, vN), (vU, zero, -vE), (-vN, vE, zero)))
+    by_north, by_east = dv_N / _column(RM), dv_E / _column(RN)
+    return np.stack([-by_north, by_east, by_east * _column(tan),      # in omega_in
+                     by_north, by_east * _column(sec), dv_U], -2)     # (18), (22); (19), (23)
 
 
 def _column(x: Floats | float) -> Floats:
@@ -114,8 +113,8 @@ def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float]
     x_0 : (6,) states at the first epoch.   eps_b : (3,) or (m - 1, 3) gyro drift in b, rad/s,
     constant or mean of each interval.   radius : see the module.
     """
-    transitions = _transitions(path, radius, np.asarray(eps_b, dtype=float)[..., None])
-    _compose(transitions)
+    transitions = _from_first_epoch(
+        _transitions(path, radius, np.asarray(eps_b, dtype=float)[..., None]))
     x: Floats = transitions[..., :6] @ np.asarray(x_0, dtype=float) + transitions[..., 6]
     return x
 
@@ -126,50 +125,51 @@ def _transitions(path: Path, radius: float | None, drift_b: Floats) -> Floats:
 
     drift_b : (..., 3, 1) drift in b, rad/s.
     """
-    transitions = np.zeros((len(path.t), 6, 7))
-    transitions[:1, range(6), range(6)] = 1.0
-    drift_b = np.broadcast_to(drift_b, (len(transitions) - 1, 3, 1))
+    n = len(path.t) - 1
+    drift_b = np.broadcast_to(drift_b, (n, 3, 1))
     chunk = 4096    # intervals at a time: in the cache it is three times as fast
-    for first in range(0, len(transitions) - 1, chunk):
-        rows = slice(first, first + chunk)
-        _fill(transitions[1:][rows], path, slice(first, first + chunk + 1), rows, radius,
-              drift_b[rows])
-    return transitions
+    return np.concatenate([np.eye(6, 7)[None], *(
+        _interval_transitions(path, slice(first, first + chunk), radius,
+                              drift_b[first:first + chunk]) for first in range(0, n, chunk))])
 
 
-def _fill(transitions: Floats, path: Path, epochs: slice, intervals: slice, radius: float | None,
-          drift_b: Floats) -> None:
-    """Write [A | B] of intervals into transitions; epochs: those at their edges."""
+def _interval_transitions(path: Path, intervals: slice, radius: float | None,
+                          drift_b: Floats) -> Floats:
+    """Return [A | B] of m consecutive intervals, (m, 6, 7), with their drift_b, (m, 3, 1)."""
+    epochs = slice(intervals.start, intervals.stop + 1)
     dt = np.diff(path.t[epochs])[:, None, None]
     latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude[epochs], path.height[epochs]))
     Fdt = coefficients(latitude, height, path.velocity_n[intervals], radius) * dt
-    # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
-    transitions[..., :6] = Fdt + Fdt @ Fdt / 2
-    transitions[:, range(6), range(6)] += 1.0
     C_nb = path.C_nb[epochs]
-    rotation = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
+    drift_angle = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
+    # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
+    A = Fdt + Fdt @ Fdt / 2
+    A[:, range(6), range(6)] += 1.0
     # the drift of an interval acts for half of it on average
-    transitions[..., 6:] = Fdt[..., :3] @ rotation / -2
-    transitions[:, :3, 6:] -= rotation
+    B = Fdt[..., :3] @ drift_angle / -2
+    B[:, :3] -= drift_angle
+    return np.concatenate([A, B], axis=-1)
 
 
-def _compose(transitions: Floats) -> None:
+def _from_first_epoch(transitions: Floats) -> Floats:
     """
-    Replace transitions from epoch to epoch by those from the first epoch, in place: (n, 6, 7).
+    Return the transitions from the first epoch, from those between adjacent epochs: (n, 6, 7).
 
     A parallel scan: blocks of transitions are composed side by side, then their ends by recursion.
     """
+    composed = transitions.copy()
     max_steps = 64    # of a block
-    width = min(max_steps, max(2, int(np.sqrt(len(transitions)))))
-    for k in range(1, min(width, len(transitions))):
-        step = transitions[k::width]
-        step[:] = _product(step, transitions[k - 1::width][:len(step)])
-    ends = transitions[width - 1::width].copy()
+    width = min(max_steps, max(2, int(np.sqrt(len(composed)))))
+    for k in range(1, min(width, len(composed))):
+        step = composed[k::width]
+        step[:] = _product(step, composed[k - 1::width][:len(step)])
+    ends = composed[width - 1::width].copy()
     if len(ends) > 1:
-        _compose(ends)
+        ends = _from_first_epoch(ends)
     for k in range(width):
-        step = transitions[width + k::width]
+        step = composed[width + k::width]
         step[:] = _product(step, ends[:len(step)])
+    return composed
 
 
 def _product(second: Floats, first: Floats) -> Floats:

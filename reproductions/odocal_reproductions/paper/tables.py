@@ -46,7 +46,7 @@ class PaperTables:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the output of --json."""
-        third = {source: {
+        table_3 = {source: {
             'yaw_deg': row.yaw_deg.as_dict() | {'model': row.model_deg,
                                                 'noise_sigmas': row.noise_sigmas},
             'scale': row.scale.as_dict()} for source, row in self.table_3.items()}
@@ -54,7 +54,7 @@ class PaperTables:
             'error_convention': CONVENTION,
             'gyro_noise_yaw_sigma_deg': self.noise_deg,
             'stated_yaw_sigma_deg': self.sigma_deg,
-            'tables': {'1': _plain(self.table_1), '2': _plain(self.table_2), '3': third,
+            'tables': {'1': _plain(self.table_1), '2': _plain(self.table_2), '3': table_3,
                        '4': _plain(self.table_4)}}
 
 
@@ -70,10 +70,10 @@ def compute() -> PaperTables:
     growths = {source: drive.growth(source) for source in SOURCES}
     profile = drive.profile()
     noise_deg = float(np.rad2deg(profile.noise_sigma(GYRO_NOISE)))
-    third = {source: _row(source, outcomes[source], growths[source], noise_deg)
-             for source in SOURCES}
-    return PaperTables(table_1(), table_2(), third, _table_4(third, profile), outcomes, growths,
-                       noise_deg, float(np.rad2deg(outcomes['all'].yaw_sigma)))
+    table_3 = {source: _row(source, outcomes[source], growths[source], noise_deg)
+               for source in SOURCES}
+    return PaperTables(table_1(), table_2(), table_3, _table_4(table_3, profile), outcomes,
+                       growths, noise_deg, float(np.rad2deg(outcomes['all'].yaw_sigma)))
 
 
 def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row:
@@ -84,27 +84,28 @@ def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row
         sigmas = (printed_yaw + yaw) / noise_deg
         if abs(yaw) < noise_deg:
             remark = 'below the gyro noise of the paper: not significant'
-    return Row(Cell(printed_yaw, yaw, sense=-1, remark=remark),
+    return Row(Cell(printed_yaw, yaw, printed_sign=-1, remark=remark),
                Cell(printed_scale, outcome.scale, remark=SCALE_REMARK if printed_scale else ''),
                float(np.rad2deg(growth.yaw[-1])), sigmas)
 
 
-def _table_4(third: dict[str, Row],
+def _table_4(table_3: dict[str, Row],
              profile: SpeedProfile) -> dict[str, dict[str, dict[str, Cell]]]:
-    formula = {'eps_z': profile.heading_and_drift(0.0, GYRO_DRIFT),
-               'phi_U0': profile.heading_and_drift(HEADING_ERROR, 0.0)}
+    closed_form = {'eps_z': profile.heading_and_drift(0.0, GYRO_DRIFT),
+                   'phi_U0': profile.heading_and_drift(HEADING_ERROR, 0.0)}
 
     def line(source: str, name: str) -> dict[str, Cell]:
         if name == 'simulated':
-            yaw_deg, scale = third[source].yaw_deg.value, third[source].scale.value
-            remarks = '', SCALE_REMARK
+            yaw_deg, scale = table_3[source].yaw_deg.value, table_3[source].scale.value
+            yaw_remark, scale_remark = '', SCALE_REMARK
         else:
-            dalpha, scale = formula[source]
+            dalpha, scale = closed_form[source]
             scale = round(scale, 20)      # smaller digits are rounding errors of a zero variance
-            yaw_deg, remarks = float(np.rad2deg(dalpha)), (SIGN_REMARK, FORMULA_REMARK)
+            yaw_deg = float(np.rad2deg(dalpha))
+            yaw_remark, scale_remark = SIGN_REMARK, FORMULA_REMARK
         printed_scale, printed_yaw = TABLE_4[source][name]
-        return {'yaw_deg': Cell(printed_yaw, yaw_deg, sense=-1, remark=remarks[0]),
-                'scale': Cell(printed_scale, scale, remark=remarks[1])}
+        return {'yaw_deg': Cell(printed_yaw, yaw_deg, printed_sign=-1, remark=yaw_remark),
+                'scale': Cell(printed_scale, scale, remark=scale_remark)}
 
     return {source: {name: line(source, name) for name in lines}
             for source, lines in TABLE_4.items()}

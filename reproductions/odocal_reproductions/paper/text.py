@@ -29,11 +29,11 @@ profile of the drive."""
 def text_of(tables: PaperTables) -> str:
     """Return the page that odocal paper prints."""
     return '\n\n'.join([
-        HEAD, _rates(TITLE_1, tables.table_1), _rates(TITLE_2, tables.table_2),
-        _third(tables), _fourth(tables)]) + '\n'
+        HEAD, _coefficient_text(TITLE_1, tables.table_1),
+        _coefficient_text(TITLE_2, tables.table_2), _text_3(tables), _text_4(tables)]) + '\n'
 
 
-def _rates(title: str, table: dict[str, dict[str, Cell]]) -> str:
+def _coefficient_text(title: str, table: dict[str, dict[str, Cell]]) -> str:
     lines = [title, '  rate of  by       printed        ours   ratio  remark']
     for row, cells in table.items():
         for column, cell in cells.items():
@@ -43,7 +43,7 @@ def _rates(title: str, table: dict[str, dict[str, Cell]]) -> str:
     return '\n'.join(lines)
 
 
-def _third(tables: PaperTables) -> str:
+def _text_3(tables: PaperTables) -> str:
     lines = [TITLE_3, '           yaw error, deg                                   '
              'scale error, K',
              '  source      printed        ours   ratio       model   printed       ours']
@@ -53,12 +53,13 @@ def _third(tables: PaperTables) -> str:
         lines.append(f'  {source:7s} {_figure(yaw.printed, ".3e"):>11s} {yaw.value:+11.3e} '
                      f'{_figure(yaw.ratio, ".3f"):>7s} {row.model_deg:+11.3e} '
                      f'{_figure(scale.printed, ".3e"):>9s} {scale.value:+10.2e}{mark}')
-    worst = max((abs(r.noise_sigmas), s) for s, r in tables.table_3.items()
-                if r.noise_sigmas is not None)
-    below = next(r.yaw_deg.remark for r in tables.table_3.values() if r.yaw_deg.remark)
+    max_sigmas, max_source = max((abs(row.noise_sigmas), source)
+                                 for source, row in tables.table_3.items()
+                                 if row.noise_sigmas is not None)
+    remark = next(row.yaw_deg.remark for row in tables.table_3.values() if row.yaw_deg.remark)
     notes = [
-        f'* {below} (0.001 deg/sqrt(h) alone: {tables.noise_deg:.1e} deg, 1 sigma; printed and '
-        f'ours differ by at most {worst[0]:.1f} sigma, in row {worst[1]}).',
+        f'* {remark} (0.001 deg/sqrt(h) alone: {tables.noise_deg:.1e} deg, 1 sigma; printed and '
+        f'ours differ by at most {max_sigmas:.1f} sigma, in row {max_source}).',
         'Row none is not in the paper: it is the residual error of the method.',
         f'Printed scale errors: {tables.table_3["all"].scale.remark}.',
         f'The yaw uncertainty stated by the pipeline is {tables.sigma_deg:.4f} deg: that of the '
@@ -66,7 +67,7 @@ def _third(tables: PaperTables) -> str:
     return '\n'.join(lines + [_note(note) for note in notes])
 
 
-def _fourth(tables: PaperTables) -> str:
+def _text_4(tables: PaperTables) -> str:
     lines = [TITLE_4, '                     yaw error, deg                     scale error, K0',
              '  source             printed        ours   ratio     printed       ours']
     remarks: dict[str, str] = {}

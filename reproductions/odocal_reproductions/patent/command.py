@@ -27,10 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate, compute, print, draw; return 0."""
     picture = picture_of(args)
-    from odocal_reproductions.patent.embodiment import embodiment, FOUND, RADIUS
+    from odocal_reproductions.patent.embodiment import embodiment, PRINTED_BEST
     from odocal_reproductions.patent.text import text_of
-    leg = planar_leg(args.fix_noise, args.seed)
-    table = embodiment(leg, RADIUS, FOUND)
+    table = embodiment(planar_leg(args.fix_noise, args.seed), truth=PRINTED_BEST)
     if picture is not None:
         from odocal_reproductions.patent.plot import draw
         draw(table, picture)
@@ -39,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         print_text(json.dumps({'fix_noise': args.fix_noise, 'seed': args.seed} | table.as_dict(),
                               indent=2, allow_nan=False))
     else:
-        print_text(text_of(table, args.fix_noise, FOUND), end='')
+        print_text(text_of(table, args.fix_noise, PRINTED_BEST), end='')
         if picture is not None:
             print_text(f'\n{picture}: the distances of all combinations and of each line')
     return 0
@@ -47,23 +46,24 @@ def run(args: argparse.Namespace) -> int:
 
 def planar_leg(fix_noise: str, seed: int, **others: Any) -> 'PlanarLeg':
     """Return the embodiment's drive, ten minutes of town; others: options that replace these."""
-    from odocal_reproductions.patent.embodiment import FOUND, RADIUS
+    from odocal_reproductions.patent.embodiment import NOMINAL_RADIUS, PRINTED_BEST
     from odocal_ros.pipeline.prepare import prepare
     from odocal_ros.pipeline.smoother_run import planar_input
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    left, right = RADIUS + FOUND[0], RADIUS + FOUND[1]
+    left, right = NOMINAL_RADIUS + PRINTED_BEST[0], NOMINAL_RADIUS + PRINTED_BEST[1]
     options: dict[str, Any] = {
         'scenario': 'town', 'seed': seed, 'imu_grade': 'tactical', 'odometer': 'angle',
         'two_wheels': True, 'scale': 2 / (1 / left + 1 / right),
-        'wheel_difference': right / left - 1, 'yaw': 0.0, 'pitch': 0.0, 'nominal_scale': RADIUS,
-        'fix_noise': fix_noise}
+        'wheel_difference': right / left - 1, 'yaw': 0.0, 'pitch': 0.0,
+        'nominal_scale': NOMINAL_RADIUS, 'fix_noise': fix_noise}
     drive = simulate(SimOptions(**options | others))
-    # the correction is counter-clockwise: the heading, clockwise, is too large
+    # the heading error of the patent rotates the track counter-clockwise, a heading is clockwise
     config = with_settings(Config(), {
-        'imu.grade': 'tactical', 'wheels.radius': RADIUS, 'alignment.heading_source': 'fixed',
-        'alignment.heading': drive.truth.heading + math.radians(FOUND[2])})
+        'imu.grade': 'tactical', 'wheels.radius': NOMINAL_RADIUS,
+        'alignment.heading_source': 'fixed',
+        'alignment.heading': drive.truth.heading + math.radians(PRINTED_BEST[2])})
     leg = drive.leg()
     inputs, _ = screen(leg, config)
     prepared, _ = prepare(leg, inputs, config)

@@ -35,8 +35,10 @@ RADIUS_STEP = 0.01      # m, definition: of the patent's embodiment
 # definition: left radius, right radius, m; heading, deg: as printed
 PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
            (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
-FOUND = (-0.01, 0.01, 0.25)     # printed as best, with 21.76 m at most and 13.24 m in the mean
-RADIUS = 0.3                    # m, judgement: the patent states none
+# definition: the combination printed as best, with distances of 21.76 m at most and 13.24 m in the
+# mean
+PRINTED_BEST = (-0.01, 0.01, 0.25)
+NOMINAL_RADIUS = 0.3            # m, judgement: the patent states none
 
 
 @dataclass(frozen=True)
@@ -55,31 +57,31 @@ class Embodiment:
     """The table, and the results from which it is computed."""
 
     rows: tuple[Row, ...]
-    imbalance: float          # of the array of 81, see ``imbalance``
-    least: int                # fewest rows of an orthogonal array
-    small: Row                # best of the array
-    whole: Row                # best of all 441
-    refined: Refined          # by response surfaces, within the range
-    direct: LeastSquares      # without limits
-    radius: float             # m, nominal, of both wheels
-    grid: NDArray[np.float64]    # (7, 7) m, least mean distance by left and right radius
+    imbalance: float             # of the array of 81, see ``imbalance``
+    orthogonal_rows: int         # fewest rows of an orthogonal array
+    best_of_array: Row
+    best_of_all: Row             # of the 441 combinations
+    response_surface: Refined    # refined optimum, within the range
+    least_squares: LeastSquares  # optimum without a range
+    radius: float                # m, nominal, of both wheels
+    mean_distance: NDArray[np.float64]    # (7, 7) m by left and right radius, of the best heading
 
     @property
     def sigma_radius(self) -> float:
         """Return the formal sigma of right minus left radius by positions, m."""
-        return self.direct.sigma_difference * self.radius
+        return self.least_squares.sigma_difference * self.radius
 
     def as_dict(self) -> dict[str, Any]:
         """Return the output of ``odocal patent --json``."""
+        surface, squares = self.response_surface, self.least_squares
         return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
-                'imbalance': self.imbalance, 'orthogonal_rows': self.least,
-                'response_surface': {'iterations': self.refined.iterations,
-                                     'settled': self.refined.converged,
-                                     'on_edge': self.refined.on_edge},
-                'least_squares': {'condition_number': float(self.direct.condition),
-                                  'correlation': float(self.direct.correlation[0, 1]),
+                'imbalance': self.imbalance, 'orthogonal_rows': self.orthogonal_rows,
+                'response_surface': {'iterations': surface.iterations,
+                                     'settled': surface.converged, 'on_edge': surface.on_edge},
+                'least_squares': {'condition_number': float(squares.condition),
+                                  'correlation': float(squares.correlation[0, 1]),
                                   'sigma_right_less_left_m': float(self.sigma_radius)},
-                'told_apart': self.separable}
+                'separable': self.separable}
 
     @property
     def separable(self) -> bool:
@@ -89,12 +91,12 @@ class Embodiment:
 
 def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
     """Return the largest deviation from equal counts over all pairs of levels."""
-    worst = 0.0
-    for a, b in combinations(range(len(levels)), 2):
-        cells = levels[a] * levels[b]
-        counts = np.bincount(rows[:, a] * levels[b] + rows[:, b], minlength=cells)
-        worst = max(worst, float(np.abs(counts - len(rows) / cells).max()))
-    return worst
+    largest = 0.0
+    for a, b in combinations(range(len(levels)), 2):      # columns
+        pairs = levels[a] * levels[b]
+        counts = np.bincount(rows[:, a] * levels[b] + rows[:, b], minlength=pairs)
+        largest = max(largest, float(np.abs(counts - len(rows) / pairs).max()))
+    return largest
 
 
 def min_rows(levels: tuple[int, ...]) -> int:
@@ -118,7 +120,7 @@ def nearly_balanced(levels: tuple[int, ...]) -> Ints:
     return rows
 
 
-def embodiment(leg: PlanarLeg, radius: float = RADIUS,
+def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
                truth: tuple[float, float, float] | None = None) -> Embodiment:
     """
     Run the embodiment on a leg.
@@ -127,16 +129,17 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     both wheels, m.   truth : (left, right, heading) true errors, m and deg, for one more line.
     """
     heading_step = np.deg2rad(0.25)
-    half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
+    # x: errors of left and right radius, relative to the nominal one, and of the heading, rad
+    half_range = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
     array = nearly_balanced(LEVELS)     # 81 rows
-    small, full = (_levels(rows, half) for rows in (array, full_factorial(LEVELS)))
-    (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, full))
-    step = 2 * half / (np.array(LEVELS) - 1)
+    array_x, all_x = (_errors_of(rows, half_range) for rows in (array, full_factorial(LEVELS)))
+    (best_x, _), (best_of_all_x, mean_distances) = (_best(leg, x) for x in (array_x, all_x))
+    step = 2 * half_range / (np.array(LEVELS) - 1)
     spaces = Space(fixed_difference=False), Space(fixed_difference=True)
-    refined, together = (
-        refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, x_small, step, half,
+    surface, surface_together = (
+        refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, best_x, step, half_range,
                space, widen=False) for space in spaces)
-    direct, direct_together = (least_squares(leg, x_small, space) for space in spaces)
+    squares, squares_together = (least_squares(leg, best_x, space) for space in spaces)
 
     def row(name: str, x: Floats) -> Row:
         criteria = score(leg, sets_of(leg, x)).row(0)
@@ -147,20 +150,21 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
         left, right, heading_deg = errors
         return row(name, np.array([left / radius, right / radius, np.deg2rad(heading_deg)]))
 
-    best = row(f'best of {len(small)}', x_small), row(f'best of all {len(full)}', x_whole)
+    best = (row(f'best of {len(array)}', best_x),
+            row(f'best of all {len(all_x)}', best_of_all_x))
     rows = [row_of('start values', (0.0, 0.0, 0.0))]
     rows += [row_of(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
-    rows += [row_of('printed as best', FOUND), *best,
-             row('response surface', refined.x), row('  wheels together', together.x),
-             row('least squares', direct.x), row('  wheels together', direct_together.x)]
+    rows += [row_of('printed as best', PRINTED_BEST), *best,
+             row('response surface', surface.x), row('  wheels together', surface_together.x),
+             row('least squares', squares.x), row('  wheels together', squares_together.x)]
     rows += [] if truth is None else [row_of('truth', truth)]
-    return Embodiment(tuple(rows), imbalance(array, LEVELS), min_rows(LEVELS), *best, refined,
-                      direct, radius, means.reshape(LEVELS).min(axis=2))
+    return Embodiment(tuple(rows), imbalance(array, LEVELS), min_rows(LEVELS), *best, surface,
+                      squares, radius, mean_distances.reshape(LEVELS).min(axis=2))
 
 
-def _levels(rows: Ints, half: Floats) -> Floats:
-    """Return the errors of rows of level numbers, evenly from -half to half."""
-    x: Floats = (2 * rows / (np.array(LEVELS) - 1) - 1) * half
+def _errors_of(level_numbers: Ints, half_range: Floats) -> Floats:
+    """Return the errors x of level numbers, (n, 3) each; levels are even over the range."""
+    x: Floats = (2 * level_numbers / (np.array(LEVELS) - 1) - 1) * half_range
     return x
 
 

@@ -30,14 +30,14 @@ def _draw_grid(figure: Any, axes: Any, table: Embodiment) -> None:
     """Draw the mean distance over the errors of both radii, each with its best heading."""
     mm = 1000.0
     levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * mm
-    mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
-                           norm='log')
+    mesh = axes.pcolormesh(levels, levels, table.mean_distance.T, shading='nearest',
+                           cmap='viridis', norm='log')
     figure.colorbar(mesh, ax=axes, label='mean distance between track and fixes, m')
     edge, outside = 1.2 * levels[-1], []
     for name, (marker, colour) in MARKS.items():
-        rows = [r for r in table.rows if r.name.startswith(name) and (
-            name != 'printed' or 'best' not in r.name)]
-        x, y = (mm * np.array([getattr(r, side) for r in rows]) for side in ('left', 'right'))
+        rows = [row for row in table.rows if row.name.startswith(name) and (
+            name != 'printed' or 'best' not in row.name)]
+        x, y = (mm * np.array([getattr(row, side) for row in rows]) for side in ('left', 'right'))
         if (np.abs([x, y]) > edge).any():
             outside.append(name)
         hollow = colour == 'none'
@@ -56,13 +56,13 @@ def _draw_lines(axes: Any, table: Embodiment) -> None:
     """Draw mean and largest distance of each line of the table."""
     names = [f'{table.rows[k - 1].name}, {row.name.strip()}' if row.name.startswith(' ')
              else row.name for k, row in enumerate(table.rows)]
-    at = np.arange(len(names))
-    for what, colour in (('max', '#56B4E9'), ('mean', '#0072B2')):
-        axes.barh(at, [row.criteria[what] for row in table.rows], color=colour,
-                  height=0.8 if what == 'max' else 0.45, label=what)
+    positions = np.arange(len(names))
+    for criterion, colour in (('max', '#56B4E9'), ('mean', '#0072B2')):
+        axes.barh(positions, [row.criteria[criterion] for row in table.rows], color=colour,
+                  height=0.8 if criterion == 'max' else 0.45, label=criterion)
     axes.set(xscale='log', xlabel='distance between track and fixes, m',
              title='Each line of the table')
-    axes.set_yticks(at, names, fontsize=9)
+    axes.set_yticks(positions, names, fontsize=9)
     axes.invert_yaxis()
     axes.grid(axis='x', color='0.88', linewidth=0.6)
     axes.legend(frameon=False, fontsize=9)
