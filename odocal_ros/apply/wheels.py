@@ -75,7 +75,7 @@ class Wheels:
     def _set_scales(self, form: OdometerForm) -> None:
         """Set the scales of left and right wheel, if there are two and they are calibrated."""
         scales = self._vehicle.wheel_scales
-        if len(self._wheels) == 2 and scales is not None and form.sides:
+        if len(self._wheels) == 2 and scales is not None and form.sides_known:
             for slot, scale in zip(SIDES, scales, strict=True):
                 self._wheels[slot].rescale(scale)
 

@@ -237,7 +237,7 @@ def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path
                 piece = frame.decompress(data, 2**20)
             except zstd.ZstdError:     # damaged: the output is used like a truncated file
                 return target
-            allowance.take(len(piece))
+            allowance.add(len(piece))
             out.write(piece)
             data = frame.unused_data if frame.eof else b''
     return target

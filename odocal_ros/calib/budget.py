@@ -21,7 +21,7 @@ import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Estimate, Source
-from odocal_ros.data.arrays import by_row, by_step, Floats
+from odocal_ros.data.arrays import Floats, map_rows, map_windows
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import SEMI_MAJOR_AXIS
@@ -54,10 +54,10 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     r = D[-1] - D
     dt = np.diff(t)
     # e = integral of (C_nb db) x r
-    effect = by_step(_gyro_error_effect, r, q_nb)
+    effect = map_windows(_gyro_error_effect, r, q_nb)
     bias = np.einsum('nij,n->ij', effect, dt) * alignment.gyro_bias_sigma
     # a misaligned axis j measures a share of the turn about each axis k
-    axes = np.einsum('nij,nk->ijk', effect, by_step(_step_rotations, q_nb)).reshape(3, 9)
+    axes = np.einsum('nij,nk->ijk', effect, map_windows(_step_rotations, q_nb)).reshape(3, 9)
     scale, off_diagonal = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
     # R(u): integral of r from u to the end; a bias step at u acts on all of it
     integrals = (r[:-1] + r[1:]) / 2 * dt[:, None]
@@ -112,7 +112,7 @@ def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start:
         C_nb = matrix_from_quat(q_nb)
         return np.stack([(C_nb[:-1] + C_nb[1:]) @ f / 2, np.diff(C_nb, axis=0) @ f], axis=1)
 
-    middle, change = map(np.ascontiguousarray, by_step(middle_and_change, q_nb).swapaxes(0, 1))
+    middle, change = map(np.ascontiguousarray, map_windows(middle_and_change, q_nb).swapaxes(0, 1))
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
     effect: Floats = (change * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
@@ -205,7 +205,7 @@ def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats
     f : (3,) m per unit of travel, in b.
     """
     start = track.at(t_start)
-    return by_row(lambda P: (P - start) @ f, track.P[rows])
+    return map_rows(lambda P: (P - start) @ f, track.P[rows])
 
 
 def total_covariance(sources: Iterable[Source]) -> Floats:

@@ -13,7 +13,7 @@ from odocal_ros.calib import scale_variation
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.scale_variation import Sections, SpeedScale
-from odocal_ros.data.arrays import Bools, by_row, chunks, Complexes, Floats, Ints, running_sum
+from odocal_ros.data.arrays import Bools, chunks, Complexes, Floats, Ints, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import yaw_from_quat
@@ -77,7 +77,7 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
     before, after = (_pin_path(path, pin) for path in paths)
     after_n, fixed_n = after(t), after(t_fix)
-    yaw = np.unwrap(by_row(yaw_from_quat, track.q_nb[inside]))
+    yaw = np.unwrap(map_rows(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = running_sum(np.hypot(*np.diff(after_n[:, :2], axis=0).T))[:len(t)]
     forward = _forward_directions(t_fix, t, after_n, sign)

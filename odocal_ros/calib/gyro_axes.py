@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.track_check import ONE_MOTION_RATIO
-from odocal_ros.data.arrays import by_row, Floats
+from odocal_ros.data.arrays import Floats, map_rows
 from odocal_ros.nav.geodesy import GNSS_MOVES
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.time_series import gaps_longer, integral_at, twice_integral_at
@@ -68,7 +68,7 @@ def level_axes(up: Floats) -> tuple[Floats, list[str]]:
 def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
                 gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
     """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
-    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
+    ratio = turn_ratio(inputs.t_imu, map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.min_motion)
     reasons = gyro_reasons(ratio, gyro_scale)
     if not any(one.code is Code.GYRO_SIGN for one in reasons):
@@ -91,7 +91,7 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     located : the fixes in metres and approximate scale.   orientation : fit of the accelerations.
     A flat road does not show roll and pitch, a straight one no yaw.
     """
-    w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
+    w_i, f_i = (map_rows(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
     axes, names = level_axes(up / np.linalg.norm(up))
     wrong_axes = by_course(inputs, located, w_i, axes, names)
@@ -139,7 +139,7 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
               names: list[str]) -> list[WrongAxis]:
     """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
-        return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
+        return turn_ratio(inputs.t_imu, map_rows(lambda w: w @ axis, w_i), inputs.t_fix,
                           located.fixes_n, located.fix_sigma, inputs.min_motion)
 
     def one_motion(ratio: float | None) -> bool:

@@ -24,7 +24,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Bools, by_row, Floats, Ints, running_sum
+from odocal_ros.data.arrays import Bools, Floats, Ints, map_rows, running_sum
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel
@@ -128,7 +128,7 @@ class _Windows:
 def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
                  latitude: float) -> Floats:
     """Return the mean acceleration along the forward axis from each grid time to the next."""
-    along = by_row(lambda f_b: f_b @ forward, f_b)
+    along = map_rows(lambda f_b: f_b @ forward, f_b)
     force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
     out: Floats = force - gravity(latitude, 0.0) * rise

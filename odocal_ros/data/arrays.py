@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Array types, arrays in unnamed files, and long columns processed in pieces.
+Array types, arrays in unnamed files, and functions for long arrays, which work in chunks of rows.
 
-Shapes and units are documented at each array. The IMU rows of a long leg are most of the memory of
-a computation, and each further column of this length needs as much: work arrays are in files, and
-columns are processed in pieces, bitwise equal to processing at once. For readers an array in a
-file is a normal one; ``release_mapped_memory`` releases its memory, and released data is read
-again on access. If the disk is full, arrays are in memory.
+The IMU rows of a long leg need most of the memory of a computation, and each further column of
+this length as much again. Large work arrays are therefore in memory-mapped files, and long arrays
+are processed in chunks; the results are bitwise equal to processing all rows at once.
+``release_mapped_memory`` frees the memory of mapped arrays, whose data is read from the file again
+on access. If the disk is full, arrays are in memory.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,13 +33,13 @@ Bools = NDArray[np.bool_]
 Values = NDArray[np.int64] | NDArray[np.float64]     # raw values of an odometer
 FloatOrFloats = TypeVar('FloatOrFloats', float, Floats)
 WORK_ARRAY_BYTES = 2**24      # judgement: least bytes of a work array in a file
-# judgement: bytes of all arrays in files that stay in memory, since reading pages again takes time
-HELD_BYTES = 2**27
+# judgement: bytes of mapped arrays that stay in memory, since reading pages again takes time
+MAX_RESIDENT_BYTES = 2**27
 RELEASE_ROWS = 512      # judgement: rows between releases of mapped memory
-_maps: WeakSet[mmap.mmap] = WeakSet()
-_lock = Lock()
+CHUNK_ROWS = 2**16      # judgement: rows that are processed at a time
 Array = NDArray[Any]
-PIECE_ROWS = 2**16    # judgement: rows
+_maps: WeakSet[mmap.mmap] = WeakSet()      # of all threads
+_lock = Lock()                             # of ``_maps``
 
 
 def unnamed_file() -> BinaryIO:
@@ -48,7 +48,7 @@ def unnamed_file() -> BinaryIO:
 
 
 def map_file(file: BinaryIO, size: int, access: int = mmap.ACCESS_WRITE) -> mmap.mmap:
-    """Return a file's bytes as memory that can be released; size 0: all bytes."""
+    """Map a file into memory that ``release_mapped_memory`` frees; size : bytes, 0: all."""
     pages = mmap.mmap(file.fileno(), size, access=access)
     with _lock:
         _maps.add(pages)
@@ -60,29 +60,29 @@ def work_array(*shape: int, dtype: DTypeLike = float) -> NDArray[Any]:
     size = np.dtype(dtype).itemsize * math.prod(shape)
     if size >= WORK_ARRAY_BYTES:
         with contextlib.suppress(OSError), unnamed_file() as file:
-            os.posix_fallocate(file.fileno(), 0, size)      # without space, a write would kill
+            os.posix_fallocate(file.fileno(), 0, size)    # else writing to a full disk kills
             return np.frombuffer(map_file(file, size), dtype).reshape(shape)
     return np.zeros(shape, dtype)
 
 
 def release_mapped_memory() -> None:
-    """Release the memory of arrays in files if it is large; they stay usable."""
+    """Free the memory of mapped arrays if it is large; the arrays stay usable."""
     with _lock:
         maps = list(_maps)
-    if sum(map(len, maps)) > HELD_BYTES:
+    if sum(map(len, maps)) > MAX_RESIDENT_BYTES:
         for pages in maps:
             pages.madvise(mmap.MADV_DONTNEED)
 
 
 def blocks(n: int) -> Iterator[slice]:
     """
-    Yield slices of n rows of nearly equal length.
+    Yield slices of n rows, of at most 64 rows and nearly equal length, for stacks of matrices.
 
-    A slice has more than one row if n has: numpy multiplies a single matrix differently from a
-    stack, and results must not depend on the chunks. Mapped memory is released periodically.
+    No slice has a single row if n > 1: numpy multiplies a single matrix differently from a stack,
+    and results must not depend on the slices. Mapped memory is released periodically.
     """
-    at_a_time = 64      # their matrices stay in the cache
-    edges = np.linspace(0, n, max(1, -(-n // at_a_time)) + 1).astype(int)
+    max_rows = 64      # their matrices stay in the cache
+    edges = np.linspace(0, n, max(1, math.ceil(n / max_rows)) + 1).astype(int)
     for first, last in pairwise(edges.tolist()):
         yield slice(first, last)
         if last // RELEASE_ROWS > first // RELEASE_ROWS or last == n:
@@ -98,39 +98,39 @@ def iterate_releasing(numbers: range) -> Iterator[int]:
 
 
 def chunks(n: int) -> Iterator[slice]:
-    """Yield slices of n rows; memory of arrays in files is released after each."""
-    for first in range(0, n, PIECE_ROWS):
-        yield slice(first, min(first + PIECE_ROWS, n))
+    """Yield slices of n rows, each of CHUNK_ROWS; mapped memory is released after each."""
+    for first in range(0, n, CHUNK_ROWS):
+        yield slice(first, min(first + CHUNK_ROWS, n))
         release_mapped_memory()
 
 
-def by_row(function: Callable[..., Array], *columns: Array) -> Array:
-    """Return the result of a function for each row of arrays, in pieces: (n, ...) to (n,)."""
-    return by_step(function, *columns, steps=0)
+def map_rows(function: Callable[..., Array], *arrays: Array) -> Array:
+    """Return ``function(*arrays)``, computed in chunks: a result, (n, ...), for each of n rows."""
+    return map_windows(function, *arrays, following=0)
 
 
-def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
+def map_windows(function: Callable[..., Array], *arrays: Array, following: int = 1) -> Array:
     """
-    Return the results of a function of adjacent rows, in pieces: (m, ...) to (m - steps,).
+    Return ``function(*arrays)``, in chunks; each result depends on a row and the next ones.
 
-    steps : rows that the function needs after a row, 1: each result is of a row and the next.
+    following : number of the next rows; (n, ...) arrays give (n - following, ...) results.
     """
-    n = len(columns[0]) - steps
-    if n <= PIECE_ROWS:
-        return function(*columns)
+    n = len(arrays[0]) - following
+    if n <= CHUNK_ROWS:
+        return function(*arrays)
     for rows in chunks(n):
-        part = function(*(x[rows.start:rows.stop + steps] for x in columns))
+        part = function(*(x[rows.start:rows.stop + following] for x in arrays))
         if not rows.start:
-            out = work_array(n, *part.shape[1:], dtype=part.dtype)
-        out[rows] = part
-    return out
+            result = work_array(n, *part.shape[1:], dtype=part.dtype)
+        result[rows] = part
+    return result
 
 
-def thinned(x: Array, rows: int) -> Array:
-    """Return at least ``rows`` evenly spaced rows, or all if there are fewer: (n, ...)."""
-    step = max(1, len(x) // rows)
-    return np.concatenate([x[some][-some.start % step::step].copy() for some in chunks(len(x))]
-                          or [x])
+def thinned(x: Array, min_rows: int) -> Array:
+    """Return evenly spaced rows of x, at least ``min_rows``, or all if there are fewer."""
+    step = max(1, len(x) // min_rows)
+    parts = [x[rows][-rows.start % step::step].copy() for rows in chunks(len(x))]
+    return np.concatenate(parts or [x])
 
 
 def running_sum(steps: Array) -> Array:
@@ -140,7 +140,7 @@ def running_sum(steps: Array) -> Array:
 
 
 def reduce_columns(ufunc: np.ufunc, x: Array) -> Array:
-    """Return ``ufunc.reduce(x, axis=1)``, (n, k) to (n,); numpy's own takes ten times as long."""
+    """Return ``ufunc.reduce(x, axis=1)``, (n, k) to (n,), which takes numpy ten times as long."""
     return reduce(ufunc, x.T)
 
 
@@ -158,19 +158,20 @@ def median(x: Floats) -> float:
     """
     Return the median of x, (n,), like numpy but four times as fast for many rows.
 
-    Only the values near the median of a subset are sorted.
+    Only the values near the median of a sample of x are sorted.
     """
-    if len(x) < PIECE_ROWS:
+    if len(x) < CHUNK_ROWS:
         return float(np.median(x))
-    few = np.sort(x[::64])
-    low, high = few[[int(0.45 * len(few)), int(0.55 * len(few))]]
+    sample = np.sort(x[::64])
+    low, high = sample[[int(0.45 * len(sample)), int(0.55 * len(sample))]]
     below, above = np.count_nonzero(x < low), np.count_nonzero(x > high)
     middle = x[(x >= low) & (x <= high)]
-    at = len(x) // 2 - below        # of the upper of the two in the middle
-    if not 0 < at < len(middle) or below + len(middle) + above < len(x):     # NaN is neither
+    has_nan = below + len(middle) + above < len(x)
+    upper = len(x) // 2 - below      # rank in ``middle``: of the median, or the value above it
+    if has_nan or not 0 < upper < len(middle):
         return float(np.median(x))
-    middle.partition(at)
-    return float(middle[at] if len(x) % 2 else (middle[:at].max() + middle[at]) / 2)
+    middle.partition(upper)
+    return float(middle[upper] if len(x) % 2 else (middle[:upper].max() + middle[upper]) / 2)
 
 
 def columns(x: Floats) -> Iterator[Floats]:
@@ -198,12 +199,13 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
     count = np.diff(first)
     means = [np.empty((len(count), vector.shape[1])) for vector in vectors]
     bins_at_a_time = 64    # limits the memory
-    for bins in (slice(k, k + bins_at_a_time) for k in range(0, len(count), bins_at_a_time)):
-        rows = slice(first[bins.start], first[bins.start + len(count[bins])])
-        cell = np.repeat(np.arange(len(count[bins])), count[bins])
+    for k in range(0, len(count), bins_at_a_time):
+        bins = slice(k, min(k + bins_at_a_time, len(count)))
+        rows = slice(first[bins.start], first[bins.stop])
+        bin_of_row = np.repeat(np.arange(bins.stop - k), count[bins])
         for mean, vector in zip(means, vectors, strict=True):
-            for k, column in enumerate(vector[rows].T):
-                mean[bins, k] = np.bincount(cell, column, len(count[bins]))
+            for axis, values in enumerate(vector[rows].T):
+                mean[bins, axis] = np.bincount(bin_of_row, values, bins.stop - k)
         release_mapped_memory()
     divisor = np.maximum(count, 1)[:, None]
     return count, [mean / divisor for mean in means]
@@ -211,9 +213,9 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
 
 def enclosing_slices(times: Array, t: Array) -> Iterator[tuple[slice, slice]]:
     """
-    Yield pairs of slices: of rising times, and of the rows of t between which they are.
+    Yield pairs of slices: of rising times, and of the rows of t that enclose these times.
 
-    All of both are included; a piece of t shares its last row with the next one.
+    The slices of the times cover all of them. A slice of t shares its last row with the next one.
     """
     begin = 0
     for rows in chunks(len(t) - 1):

@@ -1,11 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table of inputs: names, topics, queues, clocks and required columns, each defined once."""
+"""Table of the inputs: names, topics, queues, clocks and required columns."""
 
 from typing import NamedTuple
 
-# slots of the wheels, in the order of odometer.wheels. Judgement: 8, as of an 8x8 truck
+# slots of the wheels, in the order of odometer.wheels. Judgement: at most 8, as of an 8x8 truck
 WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
 
 
@@ -13,19 +13,20 @@ class Input(NamedTuple):
     """
     One input; its slot is its name in code, bags, journals and options.
 
-    label : name in texts.   kind : class of its samples (``data/samples.py``).   needed : columns
-    that a usable row must have.   clock : group of settings with its ``time_offset``, or empty.
-    topic : default topic of the node; empty for further wheels of one message.   queue : depth of
-    the subscription, messages.   possible : limits of the value of a scalar sensor, None: none.
+    label : name in texts.   sample_class : name of its class in ``data/samples.py``.
+    required_columns : columns without NaN and impossible values in a usable row.   clock : group
+    of settings with its ``time_offset``, or empty.   topic : default topic of the node; empty for
+    further wheels of one message.   queue : depth of the subscription, messages.   value_limits :
+    of a scalar sensor, None: no limits.
     """
 
     label: str
-    kind: str
-    needed: tuple[str, ...]
+    sample_class: str      # not the class itself: settings use this module without numpy
+    required_columns: tuple[str, ...]
     clock: str = ''
     topic: str = ''
     queue: int = 0
-    possible: tuple[float, float] | None = None
+    value_limits: tuple[float, float] | None = None
 
 
 # queues, physical: messages of five seconds at the highest expected rates, 4 kHz, 1 kHz and 100 Hz
@@ -46,7 +47,7 @@ INPUTS = {
 }
 # sensors other than IMU, odometer and fixes
 EXTERNAL_SLOTS = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))
-TOPICS = {slot: one.topic for slot, one in INPUTS.items() if one.topic}
+TOPICS = {slot: source.topic for slot, source in INPUTS.items() if source.topic}
 
 
 def topic_option(slot: str) -> str:

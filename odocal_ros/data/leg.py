@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from odocal_ros.data import samples
-from odocal_ros.data.arrays import by_row, Ints, runs
+from odocal_ros.data.arrays import Ints, map_rows, runs
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, WHEELS
 from odocal_ros.data.samples import (
     FixSamples,
@@ -26,11 +26,11 @@ from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
 MAX_DAYS = 7          # judgement: of a leg
-# slot -> function that returns no rows
-NO_ROWS: dict[str, Callable[[], Samples]] = {
-    'imu_other': OtherImuSamples.none,
-    **{slot: getattr(samples, source.kind).none for slot, source in INPUTS.items()}}
-SLOTS = tuple(NO_ROWS)
+# slot -> function that returns samples without rows
+MAKE_EMPTY: dict[str, Callable[[], Samples]] = {
+    'imu_other': OtherImuSamples.empty,
+    **{slot: getattr(samples, source.sample_class).empty for slot, source in INPUTS.items()}}
+SLOTS = tuple(MAKE_EMPTY)
 OTHER_SLOTS = (*WHEELS[2:], *EXTERNAL_SLOTS)      # definition: slots without a field in ``Leg``
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
@@ -42,16 +42,17 @@ class Leg:
 
     Each topic has the rows from ``start_ns`` minus the pre-roll to the first row after
     ``stop_ns``, unchanged, in order of arrival. ``odometer`` is the only wheel or the first of
-    several; ``form_right`` is the form of ``odometer_right``, None: that of the first.
+    several; ``form`` is the meaning of its values, ``form_right`` that of the values of
+    ``odometer_right`` (None: as ``form``).
     """
 
     start_ns: int
     stop_ns: int
-    imu: ImuSamples = field(default_factory=ImuSamples.none)
-    imu_other: OtherImuSamples = field(default_factory=OtherImuSamples.none)
-    odometer: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_right: OdometerSamples = field(default_factory=OdometerSamples.none)
-    fix: FixSamples = field(default_factory=FixSamples.none)
+    imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    imu_other: OtherImuSamples = field(default_factory=OtherImuSamples.empty)
+    odometer: OdometerSamples = field(default_factory=OdometerSamples.empty)
+    odometer_right: OdometerSamples = field(default_factory=OdometerSamples.empty)
+    fix: FixSamples = field(default_factory=FixSamples.empty)
     others: Mapping[str, Samples] = field(default_factory=dict)      # of OTHER_SLOTS, by slot
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
@@ -64,7 +65,7 @@ class Leg:
     def rows(self, slot: str) -> Any:
         """Return the samples of a slot."""
         rows = self.others.get(slot) if slot in OTHER_SLOTS else getattr(self, slot)
-        return NO_ROWS[slot]() if rows is None else rows
+        return MAKE_EMPTY[slot]() if rows is None else rows
 
     def with_rows(self, **rows: Samples) -> 'Leg':
         """Return the leg with other samples in some slots."""
@@ -79,10 +80,10 @@ class Leg:
 
 @final
 class LegRecorder:
-    """Collects blocks until a leg is closed; the result does not depend on their sizes."""
+    """Collects blocks of rows until a leg ends; the leg does not depend on the sizes of blocks."""
 
     def __init__(self) -> None:
-        self._rows = {slot: Rows(no_rows) for slot, no_rows in NO_ROWS.items()}
+        self._rows = {slot: Rows(make_empty) for slot, make_empty in MAKE_EMPTY.items()}
         self.form = COUNTER
         self.form_right: OdometerForm | None = None
 
@@ -92,7 +93,7 @@ class LegRecorder:
             self._rows[slot].feed(block)
 
     def adopt(self, slot: str, other: 'LegRecorder', other_slot: str) -> None:
-        """Use the rows of a slot of another recorder, if it has any."""
+        """Use the rows of a slot of another recorder for a slot of this one, if there are any."""
         if len(other.rows(other_slot).stamp_ns):
             self._rows[slot] = other._rows[other_slot].snapshot()
 
@@ -115,18 +116,18 @@ class LegRecorder:
         """Drop blocks that are completely before a stamp, to limit memory."""
         for slot in slots:
             self._rows[slot].forget(
-                lambda block: _order_ns(block.stamp_ns, block.received_ns) < stamp_ns)
+                lambda block: _stamp_or_arrival(block.stamp_ns, block.received_ns) < stamp_ns)
 
     def clear(self) -> None:
-        """Drop everything, as after a jump of time."""
+        """Drop all rows, as after a jump of time."""
         self.__init__()
 
     def close(self, start_ns: int, stop_ns: int, preroll: float = 600.0) -> Leg:
         """
         Return the leg between two marks, with ``preroll`` seconds before the first.
 
-        Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
-        interpolated at the mark; later ones are not, independent of the time of closing.
+        Each topic has its rows up to the first one after ``stop_ns``, so that values can be
+        interpolated at the mark.
 
         Raises BadData: the marks are more than MAX_DAYS apart, too long for a computation.
         """
@@ -142,29 +143,29 @@ class LegRecorder:
 
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
-    """Return the part of a leg between two stamps; ``first_ns``: no IMU row before it."""
+    """Return the part of a leg between two stamps, without IMU rows before ``first_ns``."""
+    first_ns = first_ns or 0
     # odometer and fixes begin earlier, to be interpolated at the first row of the IMU
     lead_ns = 10**9
-    rows = {slot: _cut(leg.rows(slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
+    rows = {slot: _cut(leg.rows(slot), first_ns - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
-    rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
+    rows['imu'] = take(imu, (imu.stamp_ns >= first_ns) & (imu.stamp_ns <= stop_ns))
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns).with_rows(**rows)
 
 
-def _order_ns(stamp_ns: Ints, received_ns: Ints) -> Ints:
+def _stamp_or_arrival(stamp_ns: Ints, received_ns: Ints) -> Ints:
     """Return the stamps, and the arrival of rows without one: (n,) ns."""
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
 def _cut(rows: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     """Return the rows between two stamps, and up to the first one after them."""
-    time_ns = by_row(_order_ns, rows.stamp_ns, rows.received_ns)
-    latest_ns = stop_ns + 600 * 10**9    # later rows have no information on the mark
-    after = time_ns[(time_ns > stop_ns) & (time_ns <= latest_ns)]
-    last_ns = after.min() if len(after) else stop_ns
+    time_ns = map_rows(_stamp_or_arrival, rows.stamp_ns, rows.received_ns)
+    max_ns = stop_ns + 600 * 10**9    # later rows have no information on the mark
+    next_ns = time_ns[(time_ns > stop_ns) & (time_ns <= max_ns)]
+    last_ns = next_ns.min() if len(next_ns) else stop_ns
     keep = (time_ns >= first_ns) & (time_ns <= last_ns)
     if keep.all():
         return rows
-    spans = runs(keep)
-    # rows in order of time, the usual case, are a view and no copy
+    spans = runs(keep)      # one if rows are in order of time: a slice is then a view, not a copy
     return take(rows, slice(*spans[0]) if len(spans) == 1 else keep)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples of the sensors as read-only arrays, of one row or a million.
+Samples of the sensors: blocks of rows as read-only arrays, one array for each column.
 
 Rows are in order of arrival and unchanged, including NaN and stale stamps; ``screening/screen.py``
 selects the usable ones. ``stamp_ns`` is the header stamp (arrival if a message has none),
-``received_ns`` the arrival (bag time, or the middleware's source stamp): it is used to compare
+``received_ns`` the arrival (bag time, or the middleware's source stamp), which is used to compare
 clocks and never in a result.
 """
 
@@ -21,17 +21,16 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
-Stamps = Ints
-# a row in plain numbers: stamp and arrival, ns, then the values in the order of the columns
+# a row as Python numbers: stamp and arrival, ns, then the values in the order of the columns
 Reading = tuple[Any, ...]
 NO_FORCE = (math.nan, math.nan, math.nan)      # definition: m/s^2, no force published
-FRAME_BYTES = 48     # judgement: of a frame_id in texts
-# format: status of a position in a local frame; that of a NavSatFix is an int8
-LOCAL = 1000
+FRAME_BYTES = 48     # judgement: length of a stored frame_id
+# format: status of a position in a local frame; outside of int8, the type in a NavSatFix
+LOCAL_STATUS = 1000
 
 
 def column(*shape: int, dtype: Any = np.float64) -> Any:
-    """Declare a column of samples: the shape of each row, and the type of its values."""
+    """Declare a column of samples: shape of one row, () for a number, and type of its values."""
     return field(metadata={'shape': shape, 'dtype': np.dtype(dtype)})
 
 
@@ -39,28 +38,29 @@ def column(*shape: int, dtype: Any = np.float64) -> Any:
 class Samples:
     """Rows of one topic; all columns are read-only arrays of the same length n."""
 
-    stamp_ns: Stamps = column(dtype=np.int64)       # (n,)
-    received_ns: Stamps = column(dtype=np.int64)    # (n,)
+    stamp_ns: Ints = column(dtype=np.int64)       # (n,)
+    received_ns: Ints = column(dtype=np.int64)    # (n,)
 
     def __post_init__(self) -> None:
         """Copy each column to a read-only array; raise BadData for a wrong shape."""
         n = len(self.stamp_ns)
-        for one in fields(self):
-            shape = n, *one.metadata['shape']
-            array = np.array(getattr(self, one.name), dtype=self._dtype(one), order='C')
+        for declared in fields(self):
+            name, shape = declared.name, (n, *declared.metadata['shape'])
+            array = np.array(getattr(self, name), dtype=self._dtype(declared), order='C')
             if array.shape != shape:
-                raise BadData(f'{type(self).__name__}.{one.name}: required shape {shape}, found '
+                raise BadData(f'{type(self).__name__}.{name}: required shape {shape}, found '
                               f'{array.shape}')
             array.setflags(write=False)
-            object.__setattr__(self, one.name, array)
+            object.__setattr__(self, name, array)
 
-    def _dtype(self, one: Field[Any]) -> Any:
-        return one.metadata['dtype']
+    def _dtype(self, declared: Field[Any]) -> Any:
+        return declared.metadata['dtype']
 
     @classmethod
-    def none(cls) -> Self:
-        return cls(*(np.empty((0, *one.metadata['shape']), one.metadata['dtype'])
-                     for one in fields(cls)))
+    def empty(cls) -> Self:
+        """Return samples without rows."""
+        return cls(*(np.empty((0, *declared.metadata['shape']), declared.metadata['dtype'])
+                     for declared in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +75,10 @@ class ImuSamples(Samples):
 
 @dataclass(frozen=True, eq=False)
 class OtherImuSamples(Samples):
-    """Messages on the IMU topic with another frame_id than that of the IMU in use."""
+    """Messages on the IMU topic whose frame_id is not that of the IMU in use."""
 
-    frame: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')    # its first bytes
-    used: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')     # of the IMU in use
+    frame: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')    # frame_id, its first bytes
+    used: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')     # frame_id of the IMU in use
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +87,10 @@ class OdometerSamples(Samples):
 
     value: Values = column()       # int64 for counters (uint64 as its int64 bits), else float64
 
-    def _dtype(self, one: Field[Any]) -> Any:
-        is_integer = one.name == 'value' and np.issubdtype(
+    def _dtype(self, declared: Field[Any]) -> Any:
+        is_integer = declared.name == 'value' and np.issubdtype(
             np.asarray(self.value).dtype, np.integer)
-        return np.int64 if is_integer else super()._dtype(one)
+        return np.int64 if is_integer else super()._dtype(declared)
 
 
 @dataclass(frozen=True)
@@ -101,21 +101,21 @@ class OdometerForm:
     ``quantity`` is ``cumulative`` (a counter or angle), ``increment`` (since the row before) or
     ``rate`` (m/s, or rad/s of a joint). ``modulus`` is the counter's span in counts, 0 for values
     that do not roll over. ``scale_unit`` is the unit of the scale factor: ``m/pulse``, ``m/rad``
-    or ``1``. ``sides`` is false for two values with unknown sides (left or right wheel):
-    only their mean has a meaning. ``chosen`` explains the automatic selection of wheels.
+    or ``1``. ``sides_known`` is false if it is not known which of two values is the left wheel's:
+    only their mean has a meaning. ``selection_text`` explains an automatic selection of wheels.
     """
 
     quantity: str
     modulus: int
     scale_unit: str
-    sides: bool = True
-    chosen: str = ''
+    sides_known: bool = True
+    selection_text: str = ''
 
 
 @dataclass(frozen=True, eq=False)
 class FixSamples(Samples):
     """
-    GNSS fixes, or positions in a local frame with the status LOCAL.
+    GNSS fixes, or positions in a local frame with the status LOCAL_STATUS.
 
     A local frame has a fictitious place on the Earth (``nav/geodesy.py``); y is not north.
     """
@@ -125,7 +125,7 @@ class FixSamples(Samples):
     height: Floats = column()                       # m, ellipsoidal
     covariance_n: Floats = column(3, 3)             # m^2, ENU
     covariance_type: Ints = column(dtype=np.int64)  # 0 unknown .. 3 known
-    status: Ints = column(dtype=np.int64)           # NavSatStatus: -1 no fix .. 2; or LOCAL
+    status: Ints = column(dtype=np.int64)           # NavSatStatus: -1 no fix .. 2; or LOCAL_STATUS
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,12 +153,11 @@ class HeadingSamples(Samples):
 
 
 SomeSamples = TypeVar('SomeSamples', bound=Samples)
-Index = slice | Ints | Bools      # of rows
 
 
-def take(samples: SomeSamples, index: Index) -> SomeSamples:
+def take(samples: SomeSamples, index: slice | Ints | Bools) -> SomeSamples:
     """Return the rows selected by a numpy index, as the same type."""
-    return of_columns(type(samples), *(column[index] for column in columns_of(samples)))
+    return from_columns(type(samples), *(column[index] for column in columns_of(samples)))
 
 
 def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
@@ -166,8 +165,8 @@ def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
     blocks = list(blocks)
     if len(blocks) == 1:
         return blocks[0]
-    return of_columns(type(blocks[0]), *map(np.concatenate, zip(*map(columns_of, blocks),
-                                                                strict=True)))
+    columns = zip(*map(columns_of, blocks), strict=True)
+    return from_columns(type(blocks[0]), *map(np.concatenate, columns))
 
 
 def columns_of(samples: Samples) -> list[NDArray[Any]]:
@@ -176,12 +175,16 @@ def columns_of(samples: Samples) -> list[NDArray[Any]]:
 
 
 def readings_of(samples: Samples) -> list[Reading]:
-    """Return the rows in plain numbers, each vector as a list."""
+    """Return the rows as Python numbers, each vector as a list."""
     return list(zip(*(column.tolist() for column in columns_of(samples)), strict=True))
 
 
-def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
-    """Return samples from checked arrays without other references, without a copy."""
+def from_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
+    """
+    Return samples of valid columns, which become read-only, without checks and copies.
+
+    No other code may write to the arrays.
+    """
     samples = object.__new__(kind)
     for array in columns:
         array.setflags(write=False)

@@ -16,10 +16,10 @@ import numpy as np
 
 from odocal_ros.data.arrays import (
     Bools,
-    by_row,
-    by_step,
     Floats,
     Ints,
+    map_rows,
+    map_windows,
     median,
     release_mapped_memory,
 )
@@ -207,8 +207,8 @@ def sample_noise(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out
 
-    T = median(by_step(np.diff, leg.t_imu[rows]))
-    return {name: float(np.sqrt(median(by_step(squared_differences, x[rows]))
+    T = median(map_windows(np.diff, leg.t_imu[rows]))
+    return {name: float(np.sqrt(median(map_windows(squared_differences, x[rows]))
                                 / CHI2_3_MEDIAN / 2 * T))
             for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}
 
@@ -220,7 +220,7 @@ def is_standing(leg: SmootherLeg, t: Floats) -> Bools:
         for begin, end in leg.standstills:
             inside |= (t >= begin + 0.5) & (t <= end - 0.5)
         return inside
-    return by_row(within, t)
+    return map_rows(within, t)
 
 
 def gyro_bias_at_rest(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:

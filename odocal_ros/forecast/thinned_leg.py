@@ -82,7 +82,7 @@ class ThinnedLeg:
             is_integer = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in cells else True
             form = replace(COUNTER if is_integer else UNROLLED, scale_unit=form.scale_unit,
-                           sides=form.sides)
+                           sides_known=form.sides_known)
         leading = cells.get('imu', cells.get('odometer'))
         stop_ns = start_ns if leading is None else int(leading.stamp_ns[-1])
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form).with_rows(**cells)

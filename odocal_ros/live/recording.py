@@ -18,7 +18,7 @@ from rclpy.node import Node
 
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.samples import FixSamples, LOCAL, OdometerForm, Samples, take
+from odocal_ros.data.samples import FixSamples, LOCAL_STATUS, OdometerForm, Samples, take
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.progress import Progress
 from odocal_ros.forecast.quantities import Received
@@ -198,7 +198,7 @@ class Recording:
     def is_local(self) -> bool:
         """Return True if positions are in a local frame, or from marks only."""
         fix = self.inputs.by_slot.get('fix')
-        return fix is None or fix.health.fix_status == LOCAL
+        return fix is None or fix.health.fix_status == LOCAL_STATUS
 
     def drop_old_samples(self, preroll_s: float, start_ns: int) -> None:
         """Drop samples before the pre-roll of a leg that starts at ``start_ns``; 0: now."""
@@ -252,7 +252,7 @@ class Recording:
         """Return True if there are two wheels, known as left and right."""
         form = self.inputs.form
         sent = [self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3]]
-        return sent == [True, True, False] and (form is None or form.sides)
+        return sent == [True, True, False] and (form is None or form.sides_known)
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""

@@ -192,7 +192,7 @@ def _imu(stamps: Ints, received: Ints, q_ni: Floats, roll_variance: Floats, yaw_
     has_no_force = force_variance.view(np.int64)[:, 0] == NOT_SENT_BITS
     if has_no_force.any():
         f_i[has_no_force] = np.nan
-    return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
+    return samples.from_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
                               _yaw_variance(q_ni, roll_variance, yaw_variance))
 
 
@@ -212,7 +212,7 @@ def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
          covariance_type: Ints, status: Ints) -> samples.FixSamples:
     with np.errstate(invalid='ignore'):      # a signalling NaN
         latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
-    return samples.of_columns(samples.FixSamples, stamps, received, latitude, longitude,
+    return samples.from_columns(samples.FixSamples, stamps, received, latitude, longitude,
                               position[:, 2].copy(),
                               covariance.reshape(-1, 3, 3), covariance_type[:, 0], status[:, 0])
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.inputs import WHEELS
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Reading, Samples
+from odocal_ros.data.samples import from_columns, OdometerForm, OdometerSamples, Reading, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.message_fields import Column, MessageView, parts, STAMP, stamp_ns, View
@@ -140,7 +140,7 @@ class OdometerPlan:
         else:
             self.keys = choice.keys
         self._set_columns(field)
-        self.form = replace(self.form, sides=choice.sides, chosen=choice.explanation)
+        self.form = replace(self.form, sides_known=choice.sides, selection_text=choice.explanation)
 
     def _complete_unknown_type(self, view: MessageView) -> None:
         """Determine columns and meaning of an unknown type from its first message."""
@@ -230,7 +230,7 @@ class OdometerPlan:
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
         values = columns[2:] if self.stamped else columns
-        return [(slot, of_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
+        return [(slot, from_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
                 for slot, value in zip(self._slots, values, strict=True)]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import FloatOrFloats, Floats, Ints
-from odocal_ros.data.samples import FixSamples, LOCAL, of_columns
+from odocal_ros.data.samples import FixSamples, from_columns, LOCAL_STATUS
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.settings.config import ProjectionConfig
 
@@ -152,8 +152,8 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
         n = len(stamps)
         kind = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
         covariance_n = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
-        return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
-                          covariance_n, kind, np.full(n, LOCAL))
+        return from_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
+                          covariance_n, kind, np.full(n, LOCAL_STATUS))
     return build
 
 

@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, by_step, Floats, reduce_columns, running_sum, runs
+from odocal_ros.data.arrays import Bools, Floats, map_windows, reduce_columns, running_sum, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import integral_at
 
@@ -80,7 +80,7 @@ def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bo
     mean = reduce(np.add, shifted) / len(shifted)
     scatter = np.sqrt(reduce(np.add, [(x - mean)**2 for x in shifted]) / len(shifted))
     has_data = np.ones(len(rate), bool)
-    if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
+    if map_windows(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
         dt = np.diff(t_imu)
         time_in_gaps = running_sum(np.where(dt > REST_WINDOW, dt, 0.0))
         has_data = np.diff(np.interp(edges, t_imu, time_in_gaps)) == 0

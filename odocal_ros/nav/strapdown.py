@@ -11,7 +11,7 @@ of blocks in parallel, then of the ends of blocks, without a loop over samples.
 
 import numpy as np
 
-from odocal_ros.data.arrays import by_row, Complexes, Floats, release_mapped_memory
+from odocal_ros.data.arrays import Complexes, Floats, map_rows, release_mapped_memory
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 # judgement: quaternions that a scan multiplies in sequence; 40 to 800 are equally fast
@@ -172,7 +172,7 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     if not len(t):
         return t, np.empty((0, 4))
     kept = np.append(np.arange(0, len(t) - 1, every), len(t) - 1)
-    t_out = by_row(lambda k: t[k], kept)
+    t_out = map_rows(lambda k: t[k], kept)
     a0, b0 = _pairs(q_nb0)
     a, b = _products(t, w_b, every, bias)
     a, b = _scan(np.append(a0, a), np.append(b0, b))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import by_step, enclosing_slices, Floats
+from odocal_ros.data.arrays import enclosing_slices, Floats, map_windows
 
 # statistical: medians of |x|, x normal with sigma 1, and of the length of two such, sqrt(2 ln 2)
 NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
@@ -92,7 +92,7 @@ def robust_sigma(residual: NDArray[np.float64]) -> float:
 
 def gaps_longer(t: Floats, limit: float) -> Floats:
     """Return begin and end of the steps in times, (n,) s, longer than ``limit`` s: (k, 2)."""
-    k = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
+    k = np.flatnonzero(map_windows(lambda t: np.diff(t) > limit, t))
     return np.stack([t[k], t[k + 1]], -1)
 
 

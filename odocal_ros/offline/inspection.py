@@ -245,10 +245,10 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
             facts['motions'] = wheel_survey.motion_texts(values)
         form = topic_samples.reader.form
         assert form is not None      # a topic of lists is an odometer's
-        if form.chosen:
-            facts['chosen'] = form.chosen
+        if form.selection_text:
+            facts['chosen'] = form.selection_text
         if facts['name'] == mapping.get('odometer') and is_unconfigured:
-            named = topic_samples.reader.wheels if form.sides else ()
+            named = topic_samples.reader.wheels if form.sides_known else ()
             rolling = {one['key'] for one in values if one['rolls']}
             if len(named) > 1 and rolling.issuperset(named):
                 options += [f'odometer.{side}={key}' for side, key in zip(

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable, Iterator
 import math
 from typing import Any
 
-from odocal_ros.data.samples import LOCAL
+from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.output.value_text import counted, wrapped
 from odocal_ros.safe_io.text_formats import for_shell, one_line
 
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
-          str(LOCAL): 'positions in a local frame'}
+          str(LOCAL_STATUS): 'positions in a local frame'}
 
 
 def text(content: dict[str, Any]) -> str:
@@ -47,7 +47,7 @@ def _topics(content: dict[str, Any], roles: dict[str, str]) -> list[str]:
         rate = '' if topic['count'] < 2 else (
             f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] else f'{"unknown":>8} Hz')
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
-        if str(LOCAL) in topic.get('fix', {}).get('status', ()):
+        if str(LOCAL_STATUS) in topic.get('fix', {}).get('status', ()):
             role += ' (position reference)' if role else 'position reference, if GNSS is not used'
         lines.append(f'  {name:{wide}}  {kind:{kinds}} '
                      f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())

@@ -186,7 +186,7 @@ class Results:
         try:
             yield
         except KeyboardInterrupt:
-            if not self.folder.written:
+            if not self.folder.is_unchanged:
                 raise
             missing = '' if (self.directory / REPORT).exists() else f', {REPORT} is not'
             raise KeyboardInterrupt(f'the results are in {self.directory}/{missing}') from None

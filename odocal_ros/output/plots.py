@@ -11,7 +11,7 @@ import numpy as np
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import LOCAL
+from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.scale_plots import by_speed, by_window
 
@@ -75,7 +75,7 @@ def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
                     ha='right' if right < 0 else 'left', va='top' if up < 0 else 'bottom')
     _draw_marks(ax, evidence,
                 lambda t: np.stack([np.interp(t, evidence.t, x) for x in after.T]), slips)
-    is_local = (evidence.fix_status == LOCAL).any()
+    is_local = (evidence.fix_status == LOCAL_STATUS).any()
     axes = ('x from', 'y from') if is_local else ('east of', 'north of')
     ax.set(xlabel=f'{axes[0]} the start, {unit}', ylabel=f'{axes[1]} the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')

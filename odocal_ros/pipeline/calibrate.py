@@ -18,7 +18,7 @@ import numpy as np
 from odocal_ros.calib.drive import ferry_intervals
 from odocal_ros.calib.mounting import with_mounting_remedy
 from odocal_ros.calib.result import LegResult
-from odocal_ros.data.arrays import by_step, Floats, Ints, release_mapped_memory
+from odocal_ros.data.arrays import Floats, Ints, map_windows, release_mapped_memory
 from odocal_ros.data.leg import Leg, part_of
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -160,7 +160,7 @@ def imu_gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
     near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
     stamps, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
-    if by_step(lambda x: np.diff(x) > 0, stamps).all():      # a view of them
+    if map_windows(lambda x: np.diff(x) > 0, stamps).all():      # a view of them
         stamps = stamps[slice(*np.searchsorted(stamps, [first_ns, leg.stop_ns + 1]))]
     else:
         stamps = np.unique(stamps[(stamps >= first_ns) & (stamps <= leg.stop_ns)])
@@ -168,7 +168,7 @@ def imu_gaps(leg: Leg, limit_s: float) -> Ints:
         return np.empty((0, 2), np.int64)
     gap_margin_ns = 1000    # below the limit: larger than the rounding of seconds
     min_ns = round(limit_s * 1e9) - gap_margin_ns
-    k = np.flatnonzero(by_step(lambda x: np.diff(x) > min_ns, stamps))
+    k = np.flatnonzero(map_windows(lambda x: np.diff(x) > min_ns, stamps))
     begin, end = np.append(stamps[k], stamps[-1]), np.append(stamps[k + 1], leg.stop_ns)
     if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
         begin, end = (np.sort(np.append(x, leg.start_ns)) for x in (begin, end))

@@ -23,7 +23,7 @@ from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.scale_variation import counter_change_reasons
 from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW, WheelSlips
-from odocal_ros.data.arrays import Bools, by_row, Floats, running_sum
+from odocal_ros.data.arrays import Bools, Floats, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav import dead_reckoning
 from odocal_ros.nav.alignment import Alignment
@@ -112,7 +112,7 @@ class PreparedLeg(LocatedFixes):
     def level_path(self, t: Floats) -> Floats:
         """Return travel along the gyro's heading on level ground, up to a rotation: (n, 2)."""
         inputs, epochs = self.inputs, self.track.t
-        turn = integral_at(epochs, inputs.t_imu, by_row(
+        turn = integral_at(epochs, inputs.t_imu, map_rows(
             lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
         path = dead_reckoning.level_track(self.track.s, turn)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)

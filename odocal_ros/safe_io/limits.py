@@ -17,7 +17,8 @@ DEFINITION_CHARACTERS = 2**16     # judgement: of a message definition
 MESSAGE_BYTES = 2**26             # judgement: of one requested message
 MESSAGE_VALUES = 100_000          # judgement: in the fixed arrays of one message
 PARSE_SECONDS = 20                # judgement: to parse a message definition
-# judgement: bytes first given to a decompressor, which copies the rest after each (short) frame
+# judgement: bytes first given to a decompressor: it copies the rest of its input after each
+# frame, and frames may be short
 FIRST_PIECE = 2**10
 LATEST_NS = 2**62            # judgement: the year 2116: a later time is invalid
 
@@ -39,7 +40,7 @@ def limit_factor() -> float:
 
 
 def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
-    """Raise LimitReached if an amount exceeds a limit; ``what`` begins the text with the file."""
+    """Raise LimitReached if an amount exceeds a limit; what : file and quantity, for the text."""
     limit *= limit_factor()
     if amount > limit:
         raise LimitReached(f'{what} exceeds the limit of {limit:.0f} {unit}; if the file is '
@@ -49,70 +50,74 @@ def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
 
 class Allowance:
     """
-    Number of bytes that a file of a bag may decompress to in one pass.
+    Limit of the bytes that a file of a bag may decompress to in one pass, and count of them.
 
-    path : of the file as recorded.   total : bytes of all files of its bag.
+    path : of the compressed file.   total : bytes of all files of its bag.
     """
 
     def __init__(self, path: Path, total: int) -> None:
         packed = path.stat().st_size
         self._what = f'{path}: unpacked, it'
-        unpacked = 2**26    # bytes that a bag may always decompress to
-        ratio = 40    # more for each byte of the file; sensor messages compress to a tenth
-        self.most = int(unpacked * packed / max(total, packed, 1) + ratio * packed)
+        always_allowed = 2**26    # bytes of a bag, distributed over its files
+        # further bytes for each byte of the file; sensor messages compress to a tenth
+        ratio = 40
+        self.limit = int(always_allowed * packed / max(total, packed, 1) + ratio * packed)
         self._used = 0
 
     def restart(self) -> None:
         """Restart the count for another pass."""
         self._used = 0
 
-    def take(self, count: int) -> None:
+    def add(self, count: int) -> None:
         """Count decompressed bytes; raise LimitReached above the limit."""
         self._used += count
-        check(self._used, self.most, self._what)
+        check(self._used, self.limit, self._what)
 
     def check_frames(self, frames: int, packed: int) -> None:
         """Raise LimitReached for implausibly many frames in ``packed`` bytes."""
-        few, bytes_a_frame = 1000, 1024
-        check(frames, few + packed / bytes_a_frame, self._what, 'frames')
+        always_allowed, bytes_a_frame = 1000, 1024
+        check(frames, always_allowed + packed / bytes_a_frame, self._what, 'frames')
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Return the number of bytes that are still allowed."""
-        return int(self.most * limit_factor()) - self._used
+        return int(self.limit * limit_factor()) - self._used
 
     def unpack(self, packing: str, data: bytes | bytearray | memoryview, size: int | None = None
                ) -> bytes | bytearray | memoryview:
         """
-        Return decompressed data, up to the end of a truncated stream.
+        Return decompressed data; of a truncated stream, the part that exists.
 
-        packing : '', 'zstd', 'lz4' or 'bz2'.   size : stated number of bytes, if any.
-        Raises LimitReached, or an error of the decompressor for damaged data.
+        packing : '', 'zstd', 'lz4' or 'bz2'.   size : stated number of bytes, if any. Raises
+        LimitReached; Damaged: another packing, or more than ``size`` bytes; or an error of the
+        decompressor.
         """
-        most = self.left if size is None else min(size, self.left)
+        max_size = self.remaining if size is None else min(size, self.remaining)
         if not packing:
-            self.take(len(data))
+            self.add(len(data))
             return data
-        parts, have, at, frames = [], 0, 0, 0
+        parts, unpacked, offset, frames = [], 0, 0, 0
         packed = memoryview(data)
-        while at < len(packed) and have <= most:
+        while offset < len(packed) and unpacked <= max_size:
             frames += 1
-            self.check_frames(frames, at)
-            stream, piece = opener(packing)(), FIRST_PIECE
-            while at < len(packed) and have <= most and not stream.eof:
-                parts.append(stream.decompress(packed[at:at + piece], most + 1 - have))
-                have += len(parts[-1])
-                at += min(piece, len(packed) - at)
+            self.check_frames(frames, offset)
+            stream, piece = _decompressor_class(packing)(), FIRST_PIECE
+            while offset < len(packed) and unpacked <= max_size and not stream.eof:
+                parts.append(stream.decompress(packed[offset:offset + piece],
+                                               max_size + 1 - unpacked))
+                unpacked += len(parts[-1])
+                offset += min(piece, len(packed) - offset)
                 piece *= 2
-            at -= len(stream.unused_data or b'') if stream.eof else 0
-        self.take(have)
-        if size is not None and have > size:
+            if stream.eof:
+                offset -= len(stream.unused_data or b'')      # the next frame
+        self.add(unpacked)
+        if size is not None and unpacked > size:
             raise Damaged('a chunk is larger than its header states')
         return b''.join(parts)
 
 
-def opener(packing: str) -> Any:
-    """Return the class of a decompressor with ``decompress(data, max_length)``; or Damaged."""
+def _decompressor_class(packing: str) -> Any:
+    """Return a class with a method ``decompress(data, max_length)``; raises Damaged if unknown."""
     if packing == 'zstd':
         return zstd_module().ZstdDecompressor
     if packing == 'lz4':
@@ -144,16 +149,16 @@ def is_file(path: Path) -> bool:
 
 def read_text(path: Path) -> str:
     """
-    Return the text of a YAML file, of a pipe too if the user names one.
+    Return the text of a YAML file; a pipe is allowed, if the user names one.
 
     Raises LimitReached, OSError, UnicodeDecodeError.
     """
-    size = 2**19    # bytes of a YAML file
-    return read_bytes(path, size).decode()
+    max_bytes = 2**19    # of a YAML file
+    return read_bytes(path, max_bytes).decode()
 
 
 def read_bytes(path: Path, size: int) -> bytes:
-    """Return a file of at most ``size`` bytes, or raise LimitReached: a device has no end."""
+    """Return a file of at most ``size`` bytes; raises LimitReached, as a device may be endless."""
     with path.open('rb') as file:
         data = file.read(int(size * limit_factor()) + 1)
     check(len(data), size, f'{path}: the text')

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Text in the formats of other programs: terminal, shell, launch file, XML, table, YAML.
+Safe text in the formats of other programs: terminal, shell, launch file, XML, table, YAML.
 
-Names in a bag (frame, topic, type, joint, file) are untrusted: each writer passes them through the
-function of its format. A frame is accepted only if ROS accepts it, since programs act on files
-that contain it. YAML values have the same type for every reader; YAML is read with limits.
+Names in a bag (frame, topic, type, joint, file) are untrusted: code that writes a format passes
+them through the function of this format. A frame is accepted only if ROS accepts it, since
+programs act on files that contain it. YAML values have the same type for every reader; YAML is
+read with limits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -123,7 +124,7 @@ def date_text(iso: str) -> str:
 
 
 def parameter_block(values: Mapping[str, Any], key: str = '/**') -> str:
-    """Return ROS parameters as YAML; key: node name pattern; dicts among the values: groups."""
+    """Return ROS parameters as YAML; a dict among the values is a group.   key : node names."""
     return f'{key}:\n  ros__parameters:\n{_lines(values, 4)}'
 
 

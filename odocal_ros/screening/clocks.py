@@ -19,10 +19,10 @@ import numpy as np
 from odocal_ros.data.arrays import (
     bin_means,
     Bools,
-    by_step,
     enclosing_slices,
     Floats,
     Ints,
+    map_windows,
     median,
     running_sum,
 )
@@ -107,7 +107,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         since: Floats = np.multiply(received_ns - base, 1e-9)
         return since
 
-    if not by_step(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
+    if not map_windows(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
         # queued messages arrive together: their mean is used
         arrival, group, count = np.unique(seconds(imu.received_ns), return_inverse=True,
                                           return_counts=True)
@@ -158,7 +158,7 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
     """Return the rows after which a clock was set, and by how much, s: arrivals do not step."""
-    if len(samples.stamp_ns) < 2 * STEP_LAG_ROWS or not by_step(
+    if len(samples.stamp_ns) < 2 * STEP_LAG_ROWS or not map_windows(
             _may_be_clock_step, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)

@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from odocal_ros.data.arrays import chunks, Floats, Ints, PIECE_ROWS, runs, work_array
+from odocal_ros.data.arrays import CHUNK_ROWS, chunks, Floats, Ints, runs, work_array
 
 BLOCK_TIME = 1.0          # s, judgement: of rows whose mean time shows a lost row
 WINDOW_BLOCKS = 20        # judgement: blocks of a mean; at 100 Hz jitter / sqrt(2000) remains
@@ -71,7 +71,7 @@ class _EvenTimes:
     def _mean_lateness(self, t: Floats) -> Floats:
         """Return the trimmed mean of stamp minus row number times interval, of each block, s."""
         n, blocks, means = self.per_block, len(t) // self.per_block, []
-        for some in np.array_split(np.arange(blocks), 1 + len(t) // PIECE_ROWS):
+        for some in np.array_split(np.arange(blocks), 1 + len(t) // CHUNK_ROWS):
             rows = np.arange(some[0] * n, (some[-1] + 1) * n)
             lateness = np.sort((t[rows] - self.interval * rows).reshape(-1, n), axis=1)
             means.append(lateness[:, n // 10:n - n // 10].mean(axis=1))

@@ -13,7 +13,7 @@ contain no information on the scale.
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints, running_sum
-from odocal_ros.data.samples import FixSamples, LOCAL
+from odocal_ros.data.samples import FixSamples, LOCAL_STATUS
 from odocal_ros.nav.geodesy import ecef_from_geodetic, radii
 from odocal_ros.nav.time_series import MISSING_INTERVALS, running_integral
 from odocal_ros.reasons import Code, Reason
@@ -64,7 +64,7 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
     use = ~(no_fix | invalid | poor)
     reasons: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
-        local = bool((fix.status == LOCAL).any())
+        local = bool((fix.status == LOCAL_STATUS).any())
         name = 'reference.default_sigma' if local else 'gnss.default_sigma'
         reasons += (Reason(
             Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {received} fixes have '

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import (
     Bools,
-    by_row,
-    by_step,
     columns,
     Floats,
     lengths,
+    map_rows,
+    map_windows,
     median,
     reduce_columns,
     runs,
@@ -67,7 +67,7 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
         usable = (size <= largest) & ((size >= min_value) | (size == 0))
         return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
-        return by_row(not_usable, column)
+        return map_rows(not_usable, column)
 
 
 def without_invalid_orientations(samples: Oriented) -> Oriented:
@@ -80,7 +80,7 @@ def without_invalid_orientations(samples: Oriented) -> Oriented:
                 | (np.abs(variance) > widest_variance))
 
     impossible = is_impossible('q_ni', samples.q_ni)
-    invalid = by_row(is_invalid, impossible, samples.q_ni, samples.yaw_variance)
+    invalid = map_rows(is_invalid, impossible, samples.q_ni, samples.yaw_variance)
     if not (impossible | invalid & ~np.isnan(samples.yaw_variance)).any():
         return samples
     return replace(samples, q_ni=np.where(invalid[:, None], 0.0, samples.q_ni),
@@ -111,7 +111,7 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     All False if so many rows jump that it is normal for the sensor.
     """
     is_spike = np.zeros(len(x), bool)
-    steps = by_step(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
+    steps = map_windows(lambda x: reduce_columns(np.maximum, np.abs(np.diff(x, axis=0))), x)
     large = np.flatnonzero(steps > min_step)
     if not len(large):
         return is_spike
@@ -154,7 +154,7 @@ def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
 
     outliers = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
-        outliers[edge:-edge] = by_step(is_outlier, x, steps=2 * edge)
+        outliers[edge:-edge] = map_windows(is_outlier, x, following=2 * edge)
     outliers &= outliers.sum() <= max(GLITCH_SHARE * len(x), GROUP_ROWS)
     return outliers
 
@@ -186,7 +186,7 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
-    same = by_step(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
+    same = map_windows(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
                    & reduce_columns(np.logical_or, w[1:] != 0), w)
     repeats = runs(same)
     begin, end = t[repeats].T

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import bin_means, by_row, chunks, Complexes, Floats, lengths, medians
+from odocal_ros.data.arrays import bin_means, chunks, Complexes, Floats, lengths, map_rows, medians
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import wrap
@@ -205,7 +205,7 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
 def _unit_reasons(median_f_b: Floats, w_b: Floats, imu: ImuConfig) -> list[Reason]:
     """Return reasons about missing or wrongly scaled signals; as ``unit_and_axis_reasons``."""
     bias, size = medians(w_b), float(np.linalg.norm(median_f_b))
-    top_rate = float(np.percentile(by_row(lambda w: lengths(w - bias), w_b), 99.9,
+    top_rate = float(np.percentile(map_rows(lambda w: lengths(w - bias), w_b), 99.9,
                                    overwrite_input=True))
     reasons = []
     if not any(w_b[some].any() for some in chunks(len(w_b))):

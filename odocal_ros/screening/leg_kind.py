@@ -79,7 +79,7 @@ def settings_by_frame(fix: samples.FixSamples, config: Config) -> Config:
 
 def is_local(fix: samples.FixSamples) -> bool:
     """Return True if the fixes are positions in a local frame."""
-    return bool((fix.status == samples.LOCAL).any())
+    return bool((fix.status == samples.LOCAL_STATUS).any())
 
 
 def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
@@ -91,10 +91,10 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     if not is_local(leg.fix):
         return leg, ()
     left_out = ['GNSS velocities'] * bool(len(leg.rows('fix_velocity').stamp_ns))
-    leg = leg.with_rows(fix_velocity=samples.VelocitySamples.none())
+    leg = leg.with_rows(fix_velocity=samples.VelocitySamples.empty())
     if config.alignment.heading_source == 'auto' and len(leg.rows('heading').stamp_ns):
         left_out += ['external headings']
-        leg = leg.with_rows(heading=samples.HeadingSamples.none())
+        leg = leg.with_rows(heading=samples.HeadingSamples.empty())
     latitude = math.radians(config.reference.latitude_deg)
     unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, by_step, chunks, Floats, Ints, work_array
+from odocal_ros.data.arrays import Bools, chunks, Floats, Ints, map_windows, work_array
 from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import Samples, take
@@ -43,7 +43,7 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
     """Return IMU_GAP if IMU data is missing for over ``limit`` s between t_from and t_stop."""
     t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
-    long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
+    long = np.flatnonzero(map_windows(lambda t: np.diff(t) > limit, t))
     ends = [(t_from, t[0]), *zip(t[long], t[long + 1], strict=True), (t[-1], t_stop)] \
         if len(t) else [(t_from, t_stop)]
     gaps = [(float(b - a), float(a)) for a, b in ends if b - a > limit]
@@ -112,12 +112,12 @@ def _finite(samples: Any, slot: str, leg: Leg, reasons: list[Reason]) -> tuple[B
     """Return masks of rows with a stamp and all required values, and of finite impossible rows."""
     stamped = samples.stamp_ns > 0
     finite, impossible = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
-    possible = INPUTS[slot].possible
-    for name in INPUTS[slot].needed:
+    limits = INPUTS[slot].value_limits
+    for name in INPUTS[slot].required_columns:
         column = getattr(samples, name)
         invalid = glitches.is_impossible(name, column)
-        if possible is not None:
-            invalid |= ~((column >= possible[0]) & (column <= possible[1]))
+        if limits is not None:
+            invalid |= ~((column >= limits[0]) & (column <= limits[1]))
         finite &= ~invalid
         impossible[invalid] |= np.isfinite(column[invalid]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import by_row, Floats, median, release_mapped_memory
+from odocal_ros.data.arrays import Floats, map_rows, median, release_mapped_memory
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySamples
+from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL_STATUS, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
@@ -133,8 +133,8 @@ def _usable(leg: Leg, config: Config, check_faults: bool, reasons: list[Reason])
     external = {slot: rows(slot) for slot in EXTERNAL_SLOTS}
     release_mapped_memory()
     wheels = travel_of_wheels(leg, config, rows, reasons)
-    reasons += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
-                for form in (leg.form, leg.form_right) if form and form.chosen]
+    reasons += [Reason(Code.ODOMETER_CHOSEN, form.selection_text)
+                for form in (leg.form, leg.form_right) if form and form.selection_text]
     return UsableTopics(imu, t_imu, wheels, *rows('fix'), external)
 
 
@@ -147,7 +147,7 @@ def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) 
     reasons += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]
     # receivers without a height publish 0
-    height = fix.height if fix.height.any() or (fix.status == LOCAL).any() else np.full(
+    height = fix.height if fix.height.any() or (fix.status == LOCAL_STATUS).any() else np.full(
         len(fix.height), np.nan)
     geodetic = np.stack([fix.latitude, fix.longitude, height], -1)[use]
     rounding, rounding_reasons = rounding_variance(geodetic, covariance[use])
@@ -158,7 +158,7 @@ def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) 
     ) if config.gnss.use_velocity else ()
     reasons += contradiction
     if contradiction:
-        external = external | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
+        external = external | {'fix_velocity': UsableRows(VelocitySamples.empty(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'external': external,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
@@ -177,7 +177,7 @@ def _inputs_of(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, An
 
 def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
     # of two wheels with unknown sides only the mean is defined
-    several = wheels.wheels if leg.form.sides and len(wheels.wheels) > 1 else ()
+    several = wheels.wheels if leg.form.sides_known and len(wheels.wheels) > 1 else ()
     return {'travel': wheels.mean, 'travels': several,
             'uncertain_t': wheels.uncertain_t, 'uncertain_sigma': wheels.uncertain_sigma}
 
@@ -197,7 +197,7 @@ def _without_dead_reckoned(inputs: Inputs, config: Config, reasons: list[Reason]
     located = locate_fixes(inputs, config)
     if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
-    rate = by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
+    rate = map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
     # the median is the bias: drives have straights, and turns to both sides
     rate -= median(rate)
     t = inputs.t_imu[::1 + len(inputs.t_imu) // TRACK_ROWS]

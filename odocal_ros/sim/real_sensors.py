@@ -245,7 +245,7 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     """Return the published velocity of the antenna; none without a sigma."""
     sigma = options.velocity_sigma
     if sigma is None:
-        return VelocitySamples.none()
+        return VelocitySamples.empty()
     ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
     # the velocity is the derivative of positions with its own filter
     filtered = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))

@@ -91,7 +91,7 @@ class Drive:
     @property
     def odometer_right(self) -> samples.OdometerSamples:
         """Return the samples of the right wheel, no rows without one."""
-        return self.wheels[1] if len(self.wheels) > 1 else samples.OdometerSamples.none()
+        return self.wheels[1] if len(self.wheels) > 1 else samples.OdometerSamples.empty()
 
     @property
     def reference(self) -> Reference:
@@ -185,10 +185,10 @@ def simulate(options: SimOptions | None = None) -> Drive:
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu if options.imu else samples.ImuSamples.none(),
+        form=FORMS[options.odometer], imu=imu if options.imu else samples.ImuSamples.empty(),
         wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
-        heading=(samples.HeadingSamples.none() if options.heading_sigma is None
+        heading=(samples.HeadingSamples.empty() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
         velocity=velocity(motion, options),
         pressure=sensors.pressure(motion, options))

@@ -110,7 +110,7 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
     rate, scale_height, ground = 20.0, 8435.0, 101_325.0    # Hz, m, Pa: standard atmosphere
     sigma = options.pressure_sigma
     if sigma is None:
-        return samples.ScalarSamples.none()
+        return samples.ScalarSamples.empty()
     ns, t = stamps(motion.duration, rate, PHASE['pressure'])
     state, draw = motion.at(t), make_rng(options.seed, 'pressure').standard_normal
     # change by weather, m/s; by wind, m per (m/s)^2; by temperature, relative

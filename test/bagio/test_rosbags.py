@@ -73,7 +73,7 @@ def test_a_rosbag1_with_a_circular_index_is_refused(tmp_path, monkeypatch):
 def test_a_rosbag1_that_decompresses_beyond_the_limit_is_refused(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
     part = rosbags_readers.Rosbag1File(path, Allowance(path, 2**40), lambda raw, _: raw)
-    part._allowance.most = 1000
+    part._allowance.limit = 1000
     with pytest.raises(LimitReached):
         list(part.batches({'/imu/data': 'sensor_msgs/msg/Imu'}))
     part.close()

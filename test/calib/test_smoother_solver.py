@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.data.arrays import HELD_BYTES, release_mapped_memory, work_array
+from odocal_ros.data.arrays import MAX_RESIDENT_BYTES, release_mapped_memory, work_array
 from odocal_ros.estimator import cramer_rao_bound
 from odocal_ros.estimator.chain import Normal, NotPositive, solve
 from odocal_ros.estimator.cold_start import cold_start
@@ -232,7 +232,7 @@ def test_turn_rates_in_a_file_are_read_in_chunks():
     rows, step = 6_000_000, 1e-3        # 100 min at 1 kHz
     t, w_b = work_array(rows), work_array(rows, 3)
     t[:] = np.arange(rows) * step
-    assert w_b.nbytes > HELD_BYTES
+    assert w_b.nbytes > MAX_RESIDENT_BYTES
     release_mapped_memory()
     before = resident()
     mean_rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))

@@ -14,10 +14,10 @@ import pytest
 
 from odocal_ros.data import arrays, samples as s, spool
 from odocal_ros.data.arrays import (
+    CHUNK_ROWS,
     lengths,
     median,
     medians,
-    PIECE_ROWS,
     reduce_columns,
     release_mapped_memory,
     thinned,
@@ -77,7 +77,7 @@ def test_cut_and_joined_samples_equal_the_whole(imu):
     assert s.join([imu]) is imu
 
 
-@pytest.mark.parametrize('empty', [kind.none for kind in s.Samples.__subclasses__()])
+@pytest.mark.parametrize('empty', [kind.empty for kind in s.Samples.__subclasses__()])
 def test_an_empty_block_has_no_rows_and_joins_with_others(empty):
     assert len(empty().stamp_ns) == 0
     assert len(s.join([empty(), empty()]).stamp_ns) == 0
@@ -116,23 +116,23 @@ UNLIKE = {'noise': lambda x: x, 'steps': np.round, 'one': np.ones_like, 'sorted'
 
 @pytest.mark.parametrize('kind', UNLIKE)
 def test_median_of_many_rows_equals_that_of_numpy(kind):
-    for n in (PIECE_ROWS, PIECE_ROWS + 1):
+    for n in (CHUNK_ROWS, CHUNK_ROWS + 1):
         x = UNLIKE[kind](np.random.default_rng(5).normal(size=n))
         np.testing.assert_array_equal(median(x), np.median(x))
         both = np.stack([x, -x], -1)
         np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
 
 
-@pytest.mark.parametrize('rows', [0, 5, PIECE_ROWS, 2 * PIECE_ROWS + 100])
+@pytest.mark.parametrize('rows', [0, 5, CHUNK_ROWS, 2 * CHUNK_ROWS + 100])
 def test_evenly_spaced_rows_equal_a_slice(rows):
     x = np.arange(3 * rows).reshape(-1, 3)
-    for expected in (4, 1000, PIECE_ROWS):
+    for expected in (4, 1000, CHUNK_ROWS):
         np.testing.assert_array_equal(thinned(x, expected), x[::max(1, rows // expected)])
 
 
 def test_an_integral_over_pieces_equals_the_integral_at_once():
     rng = np.random.default_rng(4)
-    t = np.cumsum(rng.uniform(0.5, 1.5, 2 * PIECE_ROWS + 100))
+    t = np.cumsum(rng.uniform(0.5, 1.5, 2 * CHUNK_ROWS + 100))
     x = rng.normal(size=(len(t), 2))
     slices = (x[:-1] + x[1:]) / 2 * np.diff(t)[:, None]
     whole = np.concatenate([np.zeros((1, 2)), np.cumsum(slices, axis=0)])
@@ -152,7 +152,7 @@ def small(monkeypatch):
     for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
                        ('MERGED_BYTES', 20_000)):
         monkeypatch.setattr(spool, name, size)
-    monkeypatch.setattr(arrays, 'HELD_BYTES', 0)
+    monkeypatch.setattr(arrays, 'MAX_RESIDENT_BYTES', 0)
 
 
 def fed(recorder, imu, first, last):
@@ -204,10 +204,10 @@ def test_large_arrays_in_files_are_released(monkeypatch):
                               Path('/proc/self/smaps').read_text(), re.MULTILINE)
         return int(block) * 1024
 
-    monkeypatch.setattr(arrays, 'HELD_BYTES', array.nbytes)
+    monkeypatch.setattr(arrays, 'MAX_RESIDENT_BYTES', array.nbytes)
     release_mapped_memory()
     assert resident() == array.nbytes
-    monkeypatch.setattr(arrays, 'HELD_BYTES', array.nbytes - 1)
+    monkeypatch.setattr(arrays, 'MAX_RESIDENT_BYTES', array.nbytes - 1)
     release_mapped_memory()
     assert resident() == 0
     assert array.sum() == len(array)

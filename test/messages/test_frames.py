@@ -15,7 +15,7 @@ import ros_messages as make
 
 from odocal_ros.bagio.encode import imu
 from odocal_ros.bagio.write import drive_topics, write_bag
-from odocal_ros.data.samples import columns_of, join, LOCAL
+from odocal_ros.data.samples import columns_of, join, LOCAL_STATUS
 from odocal_ros.errors import BadData
 from odocal_ros.library.calibrate_bag import calibrate_bag
 from odocal_ros.messages.decode import make_reader
@@ -191,7 +191,7 @@ def test_each_type_gives_its_position_and_no_covariance(message):
     block = fixes_of([message])
     np.testing.assert_allclose(local(block), [[3.0, -4.0, 1.5]], atol=TENTH_MM)
     assert block.stamp_ns.tolist() == [5 * 10**9]
-    assert block.status.tolist() == [LOCAL]
+    assert block.status.tolist() == [LOCAL_STATUS]
     covariance, unknown = covariances(block, 2.5)
     assert unknown.all()
     assert covariance[0, 0, 0] == 2.5**2

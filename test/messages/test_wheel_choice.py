@@ -85,7 +85,8 @@ def test_an_ambiguous_choice_gives_an_explanation(names, count):
 def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_reported():
     made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
     leg = made.leg()
-    blind = replace(leg, form=replace(leg.form, sides=False, chosen='the mean is used'))
+    blind = replace(leg, form=replace(leg.form, sides_known=False,
+                                      selection_text='the mean is used'))
     config = settings(made, method='auto')
     result = calibrate(blind, config)
     assert 'scale_factor_left' not in result.methods['smoother'].estimates
@@ -102,6 +103,6 @@ def test_a_dead_wheel_of_unknown_side_is_still_found():
     made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
     leg = made.leg()
     dead = replace(leg.odometer_right, value=leg.odometer_right.value * 0)
-    result = calibrate(replace(leg, odometer_right=dead, form=replace(leg.form, sides=False)),
-                       settings(made))
+    form = replace(leg.form, sides_known=False)
+    result = calibrate(replace(leg, odometer_right=dead, form=form), settings(made))
     assert Code.WHEEL_DEAD in reason_texts(result)

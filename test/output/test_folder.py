@@ -157,7 +157,7 @@ def test_a_late_file_is_added_only_to_its_own_result(tmp_path):
     assert first.add('late.html', 'one late')
     second = put(tmp_path / 'out', 'two')
     assert not first.add('late.html', 'one late')
-    assert (first.written, second.written) == (False, True)
+    assert (first.is_unchanged, second.is_unchanged) == (False, True)
     assert held(tmp_path / 'out') == texts('two')
 
 
@@ -220,7 +220,7 @@ def test_ctrl_c_waits_for_the_swap(tmp_path, monkeypatch):
     one = ResultFolder(tmp_path / 'out', MAIN, OURS)
     with pytest.raises(KeyboardInterrupt):
         one.put(texts('two'), True)
-    assert one.written
+    assert one.is_unchanged
     assert held(tmp_path / 'out') == texts('two')
     assert os.listdir(tmp_path) == ['out']
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import LOCAL
+from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.estimator import make_smoother_leg, prepare
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.prepare import _priors
@@ -226,7 +226,7 @@ def test_a_result_in_a_local_frame_has_no_map(made):
 
 def test_map_coordinates_are_refused_with_a_remedy(made):
     far = posed(made, position=made.positions() + [691_000.0, 5_334_000.0, 0.0])
-    assert (far.fix.status == LOCAL).all()
+    assert (far.fix.status == LOCAL_STATUS).all()
     _, found = screen(far, settings(made))
     refused = {r.text: r.remedy for r in found if r.code is Code.FIXES_UNUSABLE}
     assert refused[f'all {len(far.fix.stamp_ns)} positions are NaN or more than 20 km from the '

@@ -12,7 +12,7 @@ import pytest
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.write import drive_topics, write_bag
-from odocal_ros.data.samples import LOCAL
+from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.read_bag import read_bag
 from odocal_ros.sim.noise import reference_drift
@@ -235,7 +235,7 @@ def test_a_bag_contains_the_positions_of_the_leg(kind, tmp_path):
         assert {'/odometer/left', '/odometer/right'} <= set(opened.topics)
     fix = read_bag(bag, {'imu': '/imu/data', 'odometer': '/odometer/left',
                          'fix': topic}).samples('fix')
-    assert (fix.status == LOCAL).all()
+    assert (fix.status == LOCAL_STATUS).all()
     for name in ('stamp_ns', 'latitude', 'longitude', 'height', 'covariance_n',
                  'covariance_type'):
         np.testing.assert_array_equal(getattr(fix, name), getattr(leg.fix, name), name)

@@ -14,7 +14,7 @@ from collections.abc import Collection
 import numpy as np
 
 from odocal_ros.calib.number_text import differing
-from odocal_ros.data.arrays import Array, by_row, Floats, thinned
+from odocal_ros.data.arrays import Array, Floats, map_rows, thinned
 from odocal_ros.estimator.convergence import CONVERGENCE
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, PARAMETER_COUNT
 from odocal_ros.estimator.factors.gnss import Fixes
@@ -259,7 +259,7 @@ def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str
         inside = (t >= keys[0]) & (t < keys[-1])
         return np.where(inside, rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
-    parts = by_row(part, leg.t_imu)
+    parts = map_rows(part, leg.t_imu)
     in_motion, at_rest = (np.flatnonzero(parts == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
     return (sample_noise(leg, in_motion) if len(in_motion) >= MIN_NOISE_SAMPLES else {},
             sample_noise(leg, at_rest) if len(at_rest) >= MIN_NOISE_SAMPLES else {})

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from odocal_ros.data.arrays import by_row, Floats, Ints, running_sum
+from odocal_ros.data.arrays import Floats, Ints, map_rows, running_sum
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.interval_noise import accelerating_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -174,7 +174,7 @@ class _Signals:
         """Return the increments of q of a steered wheel, (W9): (k - 1,) 1/m."""
         leg, scale = self.leg, state.scale
         t = np.arange(self.t[0], self.t[-1], STEER_GRID)
-        turn = integral_at(t, leg.t_imu, by_row(
+        turn = integral_at(t, leg.t_imu, map_rows(
             lambda w_b: (w_b - state.gyro_bias.mean(axis=0)) @ up, leg.w_b))
         wheels = [wheel for wheel in leg.wheels if not wheel.ahead]
         s = np.mean([as_rolled(wheel, state.constants)(t) for wheel in wheels], axis=0)
