@@ -104,28 +104,28 @@ class Solved:
             cross[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
         return JointMarginals(diagonal, cross, self.covariance[:len(s_c), :len(s_c)])
 
-    def products(self, g: Floats, g_constants: Floats) -> tuple[Floats, Floats]:
+    def quadratic_forms(self, g: Floats, g_constants: Floats) -> tuple[Floats, Floats]:
         """
         Return G' H^-1 G of r right-hand sides G, (r, r), and of H^-1 G the constants, (m, r).
 
         g : (N, n, r) of the blocks.   g_constants : (m, r).   Call it before ``marginals``.
         """
-        assert self._elimination is not None, 'call products() before marginals()'
+        assert self._elimination is not None, 'call quadratic_forms() before marginals()'
         gains, inverse = self._elimination
         N, n = self.step.shape
         m = len(self._scale_constants)
-        square = np.zeros((g.shape[2],) * 2)
-        rest = g_constants * self._scale_constants[:, None]
+        forms = np.zeros((g.shape[2],) * 2)
+        g_reduced = g_constants * self._scale_constants[:, None]
         y = np.zeros((n, g.shape[2]))
         for k in iterate_releasing(range(N)):
             y = g[k] * self._scale[k][:, None] - y
-            square += y.T @ inverse[k] @ y
+            forms += y.T @ inverse[k] @ y
             eliminated = gains[k][:, :n + m].T @ y
-            rest -= eliminated[n:]
+            g_reduced -= eliminated[n:]
             y = eliminated[:n]
-        rest /= self._scale_constants[:, None]
-        solution = self.covariance[:, :m] @ rest
-        return square + rest.T @ solution[:m], solution
+        g_reduced /= self._scale_constants[:, None]
+        solution = self.covariance[:, :m] @ g_reduced
+        return forms + g_reduced.T @ solution[:m], solution
 
 
 @dataclass(frozen=True, eq=False)

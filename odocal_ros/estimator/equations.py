@@ -4,14 +4,11 @@
 """
 The least-squares problem of a leg, linearised at one state.
 
-``Equations`` has all factors (sensors and priors) at the state, ``Weighted`` the same at given
-noise levels: normal equations, cost, and variance components. An additional sensor or prior is one
-more class in ``FACTORS``. ``find_constant_steps`` tests whether scale, yaw or pitch change within
-the leg: docs/method.md (S27c). A step of a constant at a time is one more column of the equations,
-that of the constant in all rows after this time: no second fit is needed.
+``Equations`` has the factors (sensors and priors) at the state. ``Weighted`` has them at given
+noise levels, and returns the sums over all factors: normal equations, cost, variance components.
+An additional sensor or prior is one more class in ``FACTORS``.
 """
 
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -30,16 +27,7 @@ from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.levels import LevelInformation, LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    LN_K,
-    PITCH,
-    Priors,
-    SIZE_WITH_SLOW,
-    SIZE_WITHOUT_SLOW,
-    State,
-    YAW,
-)
-from odocal_ros.settings.levels import FAULT_SIGMAS
+from odocal_ros.estimator.state import Priors, SIZE_WITH_SLOW, SIZE_WITHOUT_SLOW, State
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
@@ -50,18 +38,18 @@ EXTERNAL_FACTORS = tuple(kind for kind in FACTORS if issubclass(kind, ExternalRo
 
 def preintegrate_at(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:
     """Return the sums over all intervals, and up to the times of the rows of each factor."""
-    leg, c = problem.leg, state.constants
-    times = {kind.name: kind.times(problem, c) for kind in FACTORS
+    times = {kind.name: kind.times(problem, state.constants) for kind in FACTORS
              if issubclass(kind, PointRows) and kind.is_present(problem)}
-    all_t = np.concatenate(list(times.values()))
-    order = np.argsort(all_t, kind='stable')
+    all_times = np.concatenate(list(times.values()))
+    order = np.argsort(all_times, kind='stable')
     intervals, points = preintegrate(
         problem.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
-        as_rolled(leg.travel, c), state.scale * state.forward, all_t[order], c)
-    indices = np.split(np.argsort(order, kind='stable'),
-                       np.cumsum([len(t) for t in times.values()])[:-1])
-    return intervals, {name: points.take(index)
-                       for name, index in zip(times, indices, strict=True)}
+        as_rolled(problem.leg.travel, state.constants), state.scale * state.forward,
+        all_times[order], state.constants)
+    # place of each time among the sorted ones, by factor
+    places = np.split(np.argsort(order, kind='stable'),
+                      np.cumsum([len(t) for t in times.values()])[:-1])
+    return intervals, {name: points.take(rows) for name, rows in zip(times, places, strict=True)}
 
 
 class Equations:
@@ -76,10 +64,6 @@ class Equations:
         self.constants_in_use = point.priors.used_count
         self.factors = {kind.name: kind(problem, point) for kind in FACTORS
                         if kind.is_present(problem)}
-
-    def at(self, levels: Levels) -> 'Weighted':
-        """Return the equations weighted by levels."""
-        return Weighted(self, levels)
 
 
 class Weighted:
@@ -127,12 +111,12 @@ class Weighted:
 
         The sizes of imperfections come last: their errors are those independent of the noises.
         """
-        names = sorted(self.levels.values, key=lambda name: name in SIZES)
-        sides = LevelRightHandSides(len(self.state.t), self.n, self.m, names)
+        noises = [name for name in self.levels.values if name not in SIZES]
+        sides = LevelRightHandSides(len(self.state.t), self.n, self.m, (*noises, *SIZES))
         for factor in self.factors.values():
             factor.add_levels(sides)
-        fitted, derivatives = solved.products(sides.g, sides.g_constants)
-        return LevelInformation(sides.names, (sides.square - fitted) / 2, derivatives)
+        fitted, derivatives = solved.quadratic_forms(sides.g, sides.g_constants)
+        return LevelInformation(sides.names, (sides.q_products - fitted) / 2, derivatives)
 
     def cost(self) -> float:
         """Return the weighted sum of squares of all rows; point rows with their robust loss."""
@@ -152,62 +136,3 @@ class Weighted:
         """
         return {name: pair for factor in self.factors.values()
                 for name, pair in factor.components(marginals).items()}
-
-
-STEP_PLACES = 15        # judgement: places where steps are tested, at equal distances on the path
-TESTED_CONSTANTS = LN_K, YAW, PITCH      # definition: for steps; the scale first
-WARMING_CHANGE = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
-
-
-@dataclass(frozen=True)
-class ConstantStep:
-    """A step of a constant within a leg."""
-
-    constant: int   # index in CONSTANTS
-    t: float        # s since the start mark
-    size: float     # relative or rad, value after t minus value before
-    sigma: float
-
-    @property
-    def is_certain(self) -> bool:
-        """Return True if noise does not explain the step."""
-        return abs(self.size) > FAULT_SIGMAS * self.sigma
-
-
-def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantStep, ...]:
-    """Return the most significant step of each constant; call before ``solved.marginals``."""
-    rows = weighted[MotionRows]
-    path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
-    at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
-    g, g_constants, square, score = rows.step_sides(at, TESTED_CONSTANTS)
-    # ``solved`` may have shortened its step: the scores are those at the minimum of the equations
-    remaining = 1 / solved.step_fraction - 1
-    score -= remaining * (np.einsum('kil,ki->l', g, solved.step)
-                          + g_constants.T @ solved.step_constants[:len(g_constants)])
-    information = square - solved.products(g, g_constants)[0]
-    diagonal = np.diag(information).copy()
-    scale = slice(STEP_PLACES)
-    score[scale], diagonal[scale] = _with_gradual_change(score[scale], information[scale, scale])
-    shape = len(TESTED_CONSTANTS), STEP_PLACES
-    # no information: at rest before or after the place, or a constant that no row depends on
-    known = diagonal > 1e-9 * np.diag(square)
-    sigma = (1 / np.sqrt(np.where(known, diagonal, np.inf))).reshape(shape)
-    score, t = score.reshape(shape), weighted.state.t[at]
-    largest = np.argmax(np.abs(score) * sigma, axis=1)
-    return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
-                              float(sigma[i, k]))
-                 for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
-                 if sigma[i].any())
-
-
-def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Floats]:
-    """Return score and information of each step of the scale if it also changes gradually."""
-    # equal steps at all places are a linear change over the path, steps that grow linearly a
-    # quadratic one; both have a prior sigma and are eliminated
-    linear_and_constant = np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
-    shares = WARMING_CHANGE / STEP_PLACES * linear_and_constant
-    cross = information @ shares
-    solution = np.linalg.solve(np.eye(2) + shares.T @ cross,
-                               np.column_stack([cross.T, shares.T @ score]))
-    return (score - cross @ solution[:, -1],
-            np.diag(information) - (cross * solution[:, :-1].T).sum(axis=1))

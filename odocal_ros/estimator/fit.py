@@ -18,8 +18,9 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Solved
+from odocal_ros.estimator.constant_steps import ConstantStep, find_constant_steps
 from odocal_ros.estimator.convergence import CONVERGENCE, Progress
-from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps, Weighted
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -116,7 +117,8 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     count, state = 0, state.with_mean_up()
     while True:
         count += 1
-        weighted = Equations(problem, state, priors, variance_factors, progress.fitted).at(levels)
+        weighted = Weighted(
+            Equations(problem, state, priors, variance_factors, progress.fitted), levels)
         solved = damp_step(weighted.solved(), progress.previous_step)
         progress.update(count, solved)
         state = state.updated(solved.step, solved.step_constants).with_mean_up()

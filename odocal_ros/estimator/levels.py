@@ -95,7 +95,7 @@ class LevelRightHandSides:
         self.names = tuple(names)
         self.g = work_array(N, n, len(self.names))
         self.g_constants = np.zeros((m, len(self.names)))
-        self.square = np.zeros((len(self.names),) * 2)
+        self.q_products = np.zeros((len(self.names),) * 2)
 
     def columns(self, names: Iterable[str]) -> list[int]:
         """Return the columns of some levels."""

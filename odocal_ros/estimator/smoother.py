@@ -11,7 +11,7 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.cold_start import cold_start, Start
-from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES
 from odocal_ros.estimator.imu import imu_rows
@@ -164,4 +164,5 @@ def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Lev
 
     truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
-    return Equations(make_problem(leg, config), truth, fitted=True).at(levels).solved().covariance
+    equations = Equations(make_problem(leg, config), truth, fitted=True)
+    return Weighted(equations, levels).solved().covariance

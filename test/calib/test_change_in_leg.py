@@ -15,8 +15,9 @@ from smoother_legs import leg_of, made, reason_texts
 from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
+from odocal_ros.estimator.constant_steps import ConstantStep, find_constant_steps
 from odocal_ros.estimator.convergence import CONVERGENCE
-from odocal_ros.estimator.equations import ConstantStep, Equations, find_constant_steps
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import _change_reasons, MIN_REPORTED_CHANGE
@@ -109,7 +110,7 @@ def test_shortened_last_iteration_does_not_change_the_steps(fitted):
     equations = equations_at(problem, fit, constants)
     found = []
     for fraction in (1.0, 0.4):
-        weighted = equations.at(fit.levels)
+        weighted = Weighted(equations, fit.levels)
         full = solve(weighted.normal())
         solved = replace(full, step=fraction * full.step, step_fraction=fraction,
                          step_constants=fraction * full.step_constants)

@@ -11,7 +11,7 @@ from smoother_legs import made
 
 from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.estimator.chain import solve
-from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import point_rows, signals
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.level_steps import prior_information
@@ -40,7 +40,7 @@ def weighted_equations():
 
         def at(**by):
             levels = fit.levels.replaced(**{n: fit.levels[n] * np.exp(x) for n, x in by.items()})
-            weighted = equations.at(levels)
+            weighted = Weighted(equations, levels)
             solved = solve(weighted.normal())
             return weighted.apply_step(solved), solved
 

@@ -12,7 +12,7 @@ from smoother_legs import leg_of, made, truth, with_velocity
 
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import Normal, solve
-from odocal_ros.estimator.equations import Equations, FACTORS
+from odocal_ros.estimator.equations import Equations, FACTORS, Weighted
 from odocal_ros.estimator.factors import motion
 from odocal_ros.estimator.factors.axle import Axle
 from odocal_ros.estimator.factors.motion import D, squared_bounce
@@ -227,7 +227,7 @@ def least(problem, state, levels):
     Also return a function of levels: rows, step and logarithm of the restricted likelihood.
     """
     def at(levels):
-        weighted = Equations(problem, state).at(levels)
+        weighted = Weighted(Equations(problem, state), levels)
         solved = solve(weighted.normal())
         weighted.apply_step(solved)
         return weighted, solved, -0.5 * (weighted.cost() + weighted.log_R_total()

@@ -11,7 +11,7 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import signals
 from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -99,7 +99,7 @@ def scores(fitted):
     """Return the scores of the IMU errors at the truth from noise alone, in their sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    weighted = Equations(problem, state, fitted=fitted).at(problem.initial_levels)
+    weighted = Weighted(Equations(problem, state, fitted=fitted), problem.initial_levels)
     rows = weighted[MotionRows]
     J = rows.J[:, :, -rows.m:]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))
@@ -155,7 +155,7 @@ def test_whole_signal_counts_without_noise(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
-        Equations(problem, state, fitted=x).at(problem.initial_levels)[MotionRows]
+        Weighted(Equations(problem, state, fitted=x), problem.initial_levels)[MotionRows]
         for x in (False, True)))
     for i, name in enumerate(CONSTANTS[:raw.shape[2]]):
         if name in GYRO_ERRORS or name in ACCEL_ERRORS and road is BANKED:

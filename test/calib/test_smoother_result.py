@@ -105,8 +105,8 @@ def test_stated_sigma_equals_the_bound_at_the_truth_and_the_sum_of_its_sources()
                       for name in CONSTANTS[IMPERFECTIONS]])
     problem = make_problem(leg, config)
     problem.priors.sigma[IMPERFECTIONS] = usual
-    covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
-        Levels.from_sigmas(details['noise'])).solved().covariance
+    equations = Equations(problem, truth(drive, config, leg), fitted=True)
+    covariance = Weighted(equations, Levels.from_sigmas(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same except for heavy tails

@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import MAX_RESIDENT_BYTES, release_mapped_memory, wo
 from odocal_ros.estimator import cramer_rao_bound
 from odocal_ros.estimator.chain import Normal, NotPositive, solve
 from odocal_ros.estimator.cold_start import cold_start
-from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.axle import mean_rates_at
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.pseudo_observations import (
@@ -177,9 +177,9 @@ def test_absent_constants_have_their_priors_in_the_marginal_information():
                                    atol=1e-12, err_msg=name)
     assert some.log_determinant == pytest.approx(all_of.log_determinant, abs=1e-9)
     sides, border = np.ones((N, STATES, 2)), np.ones((BORDER, 2))
-    squares, moves = some.products(sides, border)
+    squares, moves = some.quadratic_forms(sides, border)
     wide = np.concatenate([border, np.zeros((2, 2))])
-    for found, want in zip((squares, moves), all_of.products(sides, wide), strict=True):
+    for found, want in zip((squares, moves), all_of.quadratic_forms(sides, wide), strict=True):
         np.testing.assert_allclose(found, want, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(some.marginals()[1], solved.marginals()[1], rtol=1e-12)
 
@@ -203,7 +203,7 @@ def peak_of_a_pass(duration):
     state = cold_start(leg, problem.imu, problem.priors).state
     levels = problem.initial_levels.replaced(correlation_time=60.0)
     tracemalloc.start()
-    weighted = Equations(problem, state).at(levels)
+    weighted = Weighted(Equations(problem, state), levels)
     solved = solve(weighted.normal())
     weighted.apply_step(solved)
     near = solved.marginals()

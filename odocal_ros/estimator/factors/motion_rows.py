@@ -7,12 +7,12 @@ The motion factor: IMU and odometer between adjacent keyframes.
 Rows and derivatives are those of ``Motion`` (motion.py), their noise that of ``IntervalNoise``.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from weakref import ref
 
 import numpy as np
 
-from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
+from odocal_ros.data.arrays import blocks, Bools, Floats, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import (
@@ -165,32 +165,7 @@ class MotionRows(Factor):
             out.g[rows, :, columns] += g[:, :n]
             out.g[ends, :, columns] += g[:, n:2 * n]
             out.g_constants[:, columns] += g[:, 2 * n:].sum(axis=0)
-            out.square[np.ix_(columns, columns)] += (np.swapaxes(q, 1, 2) @ q).sum(axis=0)
-
-    def step_sides(self, at: Ints, constants: Sequence[int]) -> tuple[Floats, Floats, Floats,
-                                                                      Floats]:
-        """
-        Return the right-hand sides of L steps of constants, (S27c).
-
-        at : intervals, from each of which on each of the constants has a step; the L columns C of
-        one constant are adjacent. The result is g of the keyframes, (N, n, L), and of the
-        constants, (m, L), C' R^-1 C, (L, L), and -C' R^-1 r, (L,).
-        """
-        n, L = self.n, len(at) * len(constants)
-        g, g_constants = work_array(len(self.r) + 1, n, L), np.zeros((self.m, L))
-        square, score = np.zeros((L, L)), np.zeros(L)
-        for rows in blocks(len(self.r)):
-            J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
-            after = np.arange(rows.start, rows.stop)[:, None] >= at
-            columns = (J[:, :, [2 * n + i for i in constants], None] * after[:, None, None]
-                       ).reshape(*J.shape[:2], L)
-            product = np.swapaxes(J, 1, 2) @ columns
-            g[rows] += product[:, :n]
-            g[ends] += product[:, n:2 * n]
-            g_constants += product[:, 2 * n:].sum(axis=0)
-            square += (np.swapaxes(columns, 1, 2) @ columns).sum(axis=0)
-            score -= np.einsum('kil,ki->l', columns, self.r[rows])
-        return g, g_constants, square, score
+            out.q_products[np.ix_(columns, columns)] += (np.swapaxes(q, 1, 2) @ q).sum(axis=0)
 
     def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """Return estimates of the unit noises, in sigmas, and their variances: (K, c) each."""

@@ -114,7 +114,7 @@ class TravelError(Factor):
         i, = out.columns((self.name,))
         g = self.weight * self.state.travel_error / self.variance
         out.g[:, E, i] += g
-        out.square[i, i] += g @ self.state.travel_error
+        out.q_products[i, i] += g @ self.state.travel_error
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         cross = self.all_parameter_covariances(marginals)

@@ -196,7 +196,7 @@ class PointRows(Factor):
             if self.J_end is not None:
                 end = np.swapaxes(gather(self.J_end), 1, 2) @ q_i
                 out.g[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
-        out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
+        out.q_products[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
     def _fitted_variances(self, marginals: JointMarginals, present: Ints,
                           gather: Gather) -> Floats:

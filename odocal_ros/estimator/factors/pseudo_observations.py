@@ -121,7 +121,7 @@ class PriorRows(factor.Factor):
         sigma = self.priors.sigma[layout.IMPERFECTIONS]
         kinds = np.eye(len(SIZES))[layout.KIND_OF]
         out.g_constants[layout.IMPERFECTIONS, columns] += kinds * (deviation / sigma**2)[:, None]
-        out.square[columns, columns] += kinds.T @ (deviation / sigma)**2
+        out.q_products[columns, columns] += kinds.T @ (deviation / sigma)**2
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""

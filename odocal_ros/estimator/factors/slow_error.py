@@ -144,7 +144,7 @@ class SlowError(factor.Factor):
         columns = out.columns(names)
         for i, g_i in zip(columns, g, strict=True):
             out.g[:, SLOW, i] += g_i
-        out.square[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
+        out.q_products[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
 
     def _precision(self) -> Floats:
         """Return the inverse covariance of the process times the error: (N, 3)."""

@@ -1,0 +1,108 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Score test for a step of scale, yaw or pitch within a leg, at the converged fit: (S27c).
+
+A constant with a step has one more column C of derivatives: that of the constant in the rows of
+``MotionRows`` after the step, zero before it. J, R, r and H are those of the fit, docs/method.md.
+With all other unknowns free,
+
+    score = -C' R^-1 r,    information = C' R^-1 C - g' H^-1 g,    g = J' R^-1 C
+
+estimate the step, score / information, and its sigma, information^-1/2, without a second fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import blocks, Floats, Ints, work_array
+from odocal_ros.estimator.chain import Solved
+from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.state import LN_K, PITCH, YAW
+from odocal_ros.settings.levels import FAULT_SIGMAS
+
+STEP_PLACES = 15        # judgement: places where steps are tested, at equal distances on the path
+TESTED_CONSTANTS = LN_K, YAW, PITCH      # definition: for steps; the scale first
+WARMING_CHANGE = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
+
+
+@dataclass(frozen=True)
+class ConstantStep:
+    """A step of a constant within a leg."""
+
+    constant: int   # index in CONSTANTS
+    t: float        # s since the start mark
+    size: float     # relative or rad, value after t minus value before
+    sigma: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Return True if noise does not explain the step."""
+        return abs(self.size) > FAULT_SIGMAS * self.sigma
+
+
+def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantStep, ...]:
+    """Return the most significant step of each constant; call before ``solved.marginals``."""
+    rows = weighted[MotionRows]
+    path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
+    first = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
+    score, matrix, with_others_known = _scores(rows, solved, first)
+    information = np.diag(matrix).copy()
+    scale = slice(STEP_PLACES)
+    score[scale], information[scale] = _with_gradual_change(score[scale], matrix[scale, scale])
+    # no information: at rest before or after the place, or a constant that no row depends on
+    has_information = information > 1e-9 * with_others_known
+    shape = len(TESTED_CONSTANTS), STEP_PLACES
+    sigma = (1 / np.sqrt(np.where(has_information, information, np.inf))).reshape(shape)
+    score, t = score.reshape(shape), weighted.state.t[first]
+    largest = np.argmax(np.abs(score) * sigma, axis=1)
+    return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
+                              float(sigma[i, k]))
+                 for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
+                 if sigma[i].any())
+
+
+def _scores(rows: MotionRows, solved: Solved, first: Ints) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the scores of L steps, (L,), their information, (L, L), and C' R^-1 C, (L,).
+
+    first : intervals in which steps begin. The steps of a constant are adjacent.
+    """
+    n, L = rows.n, len(TESTED_CONSTANTS) * len(first)
+    g, g_constants = work_array(len(rows.r) + 1, n, L), np.zeros((rows.m, L))
+    products, score = np.zeros((L, L)), np.zeros(L)
+    for some in blocks(len(rows.r)):
+        J, ends = rows.J[some], slice(some.start + 1, some.stop + 1)
+        after = np.arange(some.start, some.stop)[:, None] >= first
+        C = (J[:, :, [2 * n + i for i in TESTED_CONSTANTS], None] * after[:, None, None]
+             ).reshape(*J.shape[:2], L)
+        g_some = np.swapaxes(J, 1, 2) @ C
+        g[some] += g_some[:, :n]
+        g[ends] += g_some[:, n:2 * n]
+        g_constants += g_some[:, 2 * n:].sum(axis=0)
+        products += (np.swapaxes(C, 1, 2) @ C).sum(axis=0)
+        score -= np.einsum('kil,ki->l', C, rows.r[some])
+    # a shortened step of the fit ends before the minimum of the equations: move the scores to it
+    to_minimum = 1 / solved.step_fraction - 1
+    score -= to_minimum * (np.einsum('kil,ki->l', g, solved.step)
+                           + g_constants.T @ solved.step_constants[:len(g_constants)])
+    return score, products - solved.quadratic_forms(g, g_constants)[0], np.diag(products)
+
+
+def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """
+    Return score and information of each step of the scale if it also changes gradually: (L,) each.
+
+    Equal steps at all places are a linear change over the path, steps that grow linearly a
+    quadratic one. Both have a prior sigma, WARMING_CHANGE, and are eliminated (Schur complement).
+    """
+    growth = np.linspace(-1.0, 1.0, STEP_PLACES)
+    steps = WARMING_CHANGE / STEP_PLACES * np.stack([growth, np.ones(STEP_PLACES)], -1)
+    cross = information @ steps
+    solution = np.linalg.solve(np.eye(2) + steps.T @ cross,
+                               np.column_stack([cross.T, steps.T @ score]))
+    return (score - cross @ solution[:, -1],
+            np.diag(information) - (cross * solution[:, :-1].T).sum(axis=1))
