@@ -83,7 +83,7 @@ def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 def half_step(inputs: Inputs) -> float:
     """Return half a step relative to the mean speed, the bias if truncated; 0.0 without steps."""
-    coarse = _speed_grid(inputs)
+    coarse = _coarse_speed(inputs)
     if coarse is None:
         return 0.0
     pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
@@ -108,7 +108,7 @@ def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     if count > coarse_count_m:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
                        'by up to this distance')]
-    coarse = _speed_grid(inputs)
+    coarse = _coarse_speed(inputs)
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
@@ -129,8 +129,8 @@ def _speed_text(step: float, scale: float, scale_unit: str) -> str:
         f'{step:.3g} {unit} ({speed})')
 
 
-def _speed_grid(inputs: Inputs) -> CoarseSpeed | None:
-    """Return the grid of the speed, of the first wheel that has one, None if there is none."""
+def _coarse_speed(inputs: Inputs) -> CoarseSpeed | None:
+    """Return the coarse speed of the first wheel that has one, None if there is none."""
     return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)
 
 

@@ -1,20 +1,16 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Quantised speeds: rounded to a grid, held until changed by a step, zero in a dead band."""
+"""Quantised speeds: rounded to a step, held until changed by a step, zero in a dead band."""
 
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import (
-    CoarseSpeed,
-    find_coarse_speed,
-    find_grid_step,
-    find_held_speed,
-)
+from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.odometer import make_travel
+from odocal_ros.nav.speed_step import find_coarse_speed, find_held_speed, find_step
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.wheels import held_until_step, quantized
@@ -54,8 +50,8 @@ def test_time_in_motion_is_that_of_the_rows_and_not_of_whole_intervals():
 def test_step_is_found_with_noise_and_in_a_slow_drive():
     t, v = sent(KMH, 'floor')
     noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)
-    # the mean of some hundred places of 0.01 m/s, over a lever of tens of cells: below 1e-3
-    assert find_grid_step(noisy) == pytest.approx(KMH, rel=1e-3)
+    # the mean of some hundred places of 0.01 m/s, over a span of tens of steps: below 1e-3
+    assert find_step(noisy) == pytest.approx(KMH, rel=1e-3)
     slow = SPEED / 8
     assert find_coarse_speed(*sent(KMH, 'round', speed=slow)).step == pytest.approx(KMH, rel=1e-6)
     assert find_coarse_speed(T, slow) is None
@@ -69,7 +65,7 @@ def test_only_the_knots_of_an_interpolated_speed_are_used():
     assert np.isin(found.t[1:-1], t).all()
 
 
-def test_speeds_have_a_grid_also_if_reversed_and_counts_have_none():
+def test_speeds_have_a_step_also_if_reversed_and_counts_have_none():
     t, v = sent(KMH, 'floor')
     found = make_travel(t, v, RATE, reversed_counts=True)[0].coarse
     np.testing.assert_array_equal(found.value, -v)
@@ -90,17 +86,17 @@ def test_speed_at_step_transitions_is_within_its_sigma(how, offset, rate):
     assert np.abs(stated.value).min() > KMH
 
 
-def test_instants_have_a_side_in_reverse_and_none_is_next_to_zero():
+def test_instants_have_a_sign_in_reverse_and_none_is_next_to_zero():
     t, v = sent(KMH, 'floor')
-    np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.side, -1.0)
-    # a dead band of a cell: from 0 to 2 at once
+    np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.sign, -1.0)
+    # a dead band of a step: from 0 to 2 at once
     t, v = sent(KMH, 'floor', speed=SPEED / 8)
     stated = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).instants
     assert np.abs(stated.value).min() > 1.9 * KMH
 
 
-def test_a_smooth_start_to_one_cruise_has_no_grid():
-    # values crowd at rest and at the cruise, and so lie on any grid that has both
+def test_a_smooth_start_to_one_cruise_has_no_step():
+    # values crowd at rest and at the cruise, and so are multiples of any step of both
     t = np.arange(0.0, 60.0, 0.04)
     x = np.clip((t - 10.0) / 12.0, 0.0, 1.0)
     speed = 11.7647 * (x**3 * (10 - 15 * x + 6 * x**2))      # no jerk at either end

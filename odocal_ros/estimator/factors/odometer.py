@@ -172,7 +172,7 @@ class SpeedSteps(PointRows):
             self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
         ) - axle.means_by_path(point.intervals)
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
-        speed_by_wheel = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
+        speed_by_wheel = self.instants.value + self.instants.sign * c[layout.SPEED_OFFSET]
         speed_by_wheel *= state.scale * self.scale_ratio
         # derivative by ln K. The error of the published value is multiplied by K: with derivatives
         # by that value all scales of IMU and odometer would shrink together
@@ -215,7 +215,7 @@ class SpeedSteps(PointRows):
         c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.scale_ratio
-        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_gradient, K * self.instants.side
+        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_gradient, K * self.instants.sign
         c[:, layout.TYRES] = (self.speed_gradient / self.scale_ratio)[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
