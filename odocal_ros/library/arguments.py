@@ -21,7 +21,8 @@ from odocal_ros.settings.config import Config, with_settings
 Progress = Callable[..., None]
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
-EPOCH = Decimal('1e8')        # s; larger times count from 1970, smaller from the bag's start
+# judgement: s; larger times count from 1970, smaller ones from the bag's first message
+MIN_UNIX_TIME = Decimal('1e8')
 EACH_STOP = 'each-stop'
 LEG_FORMS = ("required: 'A:B' or (A, B) in seconds, 'A/B' for ISO 8601 dates, or "
              f"'{EACH_STOP}'")
@@ -61,7 +62,8 @@ class LegSpan:
 
     start_ns: int | None
     stop_ns: int | None
-    relative: tuple[bool, bool] = (False, False)   # start, stop: count from the first message
+    start_is_relative: bool = False    # counts from the bag's first message, else from 1970
+    stop_is_relative: bool = False
 
 
 def paths_of(argument: Any) -> list[Path]:
@@ -85,7 +87,7 @@ def topics_of(argument: Any) -> dict[str, str]:
     if argument is not None and not isinstance(argument, Mapping):
         raise BadUsage("topics: required: a mapping of slot to topic such as {'imu': "
                        f"'/imu/data'}}, not {type(argument).__name__}")
-    unknown = [one for one in argument or () if one not in TOPICS]
+    unknown = [slot for slot in argument or () if slot not in TOPICS]
     if unknown:
         raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is not a slot; required: '
                        f'one of {", ".join(TOPICS)}')
@@ -115,10 +117,10 @@ def config_of(argument: Settings, journal: Mapping[str, object] | None = None) -
 
 def legs_of(argument: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     """
-    Return legs in the form of ``find_legs``.
+    Return the requested legs, each a LegSpan or EACH_STOP.
 
     argument : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates,
-        'each-stop', or (A, B), None for open; one or many.
+        'each-stop', or (A, B), where None is the start or end of the recording; one or many.
 
     Raises BadUsage: one is not of these forms.
     """
@@ -155,7 +157,7 @@ def parse_leg(text: str) -> LegSpan:
     if (start is not None and stop is not None and start_relative == stop_relative
             and stop <= start):
         raise BadUsage(f'--leg {text}: the end is not after the start; give the start first')
-    return LegSpan(start, stop, (start_relative, stop_relative))
+    return LegSpan(start, stop, start_relative, stop_relative)
 
 
 def _time_ns(text: str, leg: str) -> tuple[int | None, bool]:
@@ -168,7 +170,7 @@ def _time_ns(text: str, leg: str) -> tuple[int | None, bool]:
             if seconds.copy_abs() >= LATEST_NS // 10**9:
                 raise BadUsage(f'--leg {leg}: {text[:40]} is out of range; the limit is the '
                                'year 2116')
-            return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
+            return int((seconds * 10**9).to_integral_value()), abs(seconds) < MIN_UNIX_TIME
     except InvalidOperation:
         pass
     try:

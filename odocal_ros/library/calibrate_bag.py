@@ -14,6 +14,7 @@ from odocal_ros.library.arguments import (
     config_of,
     Leg,
     legs_of,
+    LegSpan,
     Listener,
     Notes,
     paths_of,
@@ -75,7 +76,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
         notes.note(f'{", ".join(different)}: differ between the journals; each leg uses its '
                    f'own settings, limits and files use those of {bags[-1].path.name}')
     results, inputs = unique_names([bag.path for bag in bags], [bag.legs for bag in bags],
-                                   [bag.entry for bag in bags])
+                                   [bag.input_entry for bag in bags])
     frame = next((bag.imu_frame for bag in bags if bag.imu_frame), '')
     result, settings = with_imu_frame(combine(results, settings, imu=imu), settings, frame)
     return Calibration(result, settings, tuple(inputs), tuple(notes.texts))
@@ -83,9 +84,11 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 
 @dataclass(frozen=True)
 class _Arguments:
+    """The arguments of ``calibrate_bag``, checked."""
+
     topics: dict[str, str]
     config: Settings
-    legs: list[Any]
+    legs: list[LegSpan | str]
     holdout: bool
 
 
@@ -100,13 +103,13 @@ def _check_bag(path: Path, arguments: _Arguments) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _BagLegs:
-    """Data kept of a bag: the results of its legs, not its rows."""
+    """The results of a bag's legs, without the samples, which need much memory."""
 
     path: Path
-    entry: dict[str, Any]     # its entry in the list of inputs
+    input_entry: dict[str, Any]     # of calibration.json: name, sha256, topics
     config: Config
-    imu_frame: str            # frame_id of the IMU
-    unit: str                 # of the scale factor
+    imu_frame: str                  # frame_id of the IMU
+    unit: str                       # of the scale factor
     legs: list[LegResult]
 
 
@@ -146,7 +149,7 @@ def _calibrate_one_bag(path: Path, arguments: _Arguments, previous_unit: str | N
 
 
 def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> list[LegResult]:
-    """Return the results of the requested, marked or found legs of a bag."""
+    """Return the results of the legs of a bag: requested, marked by the node, or searched."""
     if bag.dropped and not arguments.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')
@@ -154,12 +157,12 @@ def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> l
     if any(not stop for _, stop in marks):
         listener.note(f'{bag.name}: {OPEN_LEG}')
     spans = bag.spans(arguments.legs)
-    is_searched = not (marks or arguments.legs)      # legs between standstills
+    is_searched = not (marks or arguments.legs)      # between standstills
     coverage = coverage_reasons(bag.recorder) if is_searched else ()
     notes = [bag.notes + coverage + note for note in missing_stop_reasons(spans, marks)]
     results = _calibrate_spans(bag, spans, notes, arguments.holdout, listener)
     if bag.config.leg.automatic and is_searched:
-        return _without_refused(results, listener)
+        return _usable_automatic_legs(results, listener)
     return results
 
 
@@ -182,18 +185,17 @@ def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
     return results
 
 
-def _without_refused(results: list[LegResult], listener: Notes) -> list[LegResult]:
-    """Return automatic legs without the unusable ones, as in the node; all if none is usable."""
+def _usable_automatic_legs(results: list[LegResult], listener: Notes) -> list[LegResult]:
+    """Return the usable legs, as the node does; note the others. All if none is usable."""
     from odocal_ros.pipeline.automatic import rejecting_reason
-    kept, notes = [], []
-    for leg in results:
-        if reason := rejecting_reason(leg):
-            notes.append(f'the leg of {date_text(iso(leg.start_ns))} is not used: {reason}')
-        else:
-            kept.append(leg)
-    for note in notes if kept else ():
-        listener.note(note)
-    return kept or results
+    causes = [rejecting_reason(leg) for leg in results]
+    usable = [leg for leg, cause in zip(results, causes, strict=True) if cause is None]
+    if not usable:
+        return results
+    for leg, cause in zip(results, causes, strict=True):
+        if cause is not None:
+            listener.note(f'the leg of {date_text(iso(leg.start_ns))} is not used: {cause}')
+    return usable
 
 
 def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -232,10 +234,15 @@ def check_all_bags(paths: list[Path], check: Callable[[Path], object]) -> None:
 
 def unique_names(paths: list[Path], legs: list[list[LegResult]],
                  inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
-    """Return each bag's legs and inputs with unique bag names: paths if they are not unique."""
+    """
+    Return the legs of all bags, and the inputs, with bag names that are unique.
+
+    paths, legs, inputs : of each bag. If names are not unique, they are replaced by the paths.
+    """
     names = [entry['bag'] for entry in inputs]
-    if len(set(names)) == len(names):
-        return [leg for bag_legs in legs for leg in bag_legs], inputs
-    return ([replace(leg, bag=one_line(path)) for path, bag_legs in zip(
-        paths, legs, strict=True) for leg in bag_legs],
-            [entry | {'bag': one_line(path)} for path, entry in zip(paths, inputs, strict=True)])
+    if len(set(names)) < len(names):
+        names = [one_line(path) for path in paths]
+        legs = [[replace(leg, bag=name) for leg in bag_legs]
+                for name, bag_legs in zip(names, legs, strict=True)]
+    return ([leg for bag_legs in legs for leg in bag_legs],
+            [entry | {'bag': name} for name, entry in zip(names, inputs, strict=True)])

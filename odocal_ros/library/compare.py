@@ -4,14 +4,14 @@
 """
 Comparison of calibrations of one vehicle, to detect changes of tyres, mounting or sensors.
 
-In: calibrations, the oldest first. Out: the change of each value since the first and the previous
-one, in sigmas, and the likely cause of a significant one.
+In: calibrations, the oldest first. Out: the change of each value since the first and since the
+previous calibration, in sigmas, and the likely cause of a significant change.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 import math
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # values of one drive (turn-on bias, its heading), or derived from another value
 NOT_COMPARED = {'scale_ratio', 'heading_error', 'gyro_bias_x', 'gyro_bias_y', 'gyro_bias_z'}
-ORDER = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
-         'yaw_mounting_angle', 'pitch_mounting_angle')
-CAUSES = {
+SHOWN_FIRST = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
+               'yaw_mounting_angle', 'pitch_mounting_angle')
+CAUSES = {      # likely cause and action, by a word of the parameter's name
     'scale': f'{TYRE_CAUSE}; calibrate again to be sure, then use the newer value',
     'track': 'another rim or tyre; calibrate again to be sure',
     'yaw': 'the IMU was moved, or the heading comes from another source; calibrate again to be '
@@ -41,9 +41,9 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Difference:
-    """A change of one parameter from one calibration to a later one."""
+    """The change of one parameter from one calibration to a later one."""
 
-    since: int                # index of the earlier one
+    since: int                # index of the earlier calibration
     change: float             # in the parameter's unit
     sigma: float | None       # of the change
     sigmas: float | None      # change over sigma, None if a sigma is unknown or zero
@@ -57,11 +57,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class Entry:
-    """A parameter in one calibration, with its change since the first and the one before."""
+    """A parameter in one calibration, with its change since earlier ones."""
 
     index: int                          # of the calibration
     estimate: Estimate
-    to_first: Difference | None         # None: there is no earlier usable one
+    to_first: Difference | None         # None: no earlier calibration is usable
     to_previous: Difference | None
 
 
@@ -82,27 +82,27 @@ def find_changes(stored: list[Stored]) -> list[Change]:
 
     Raises BadUsage: the units of a parameter differ: these are different odometers.
     """
-    names = sorted({n for s in stored for n, e in s.estimates.items()
-                    if e.value is not None} - NOT_COMPARED,
-                   key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
-    if _differently_mounted(stored):
-        names = [n for n in names if n not in ANGLES]
-    return [c for c in (_change(name, stored) for name in names)
-            if sum(stored[e.index].usable for e in c.entries) > 1]
+    known = {name for calibration in stored for name, estimate in calibration.estimates.items()
+             if estimate.value is not None}
+    excluded = NOT_COMPARED.union(ANGLES if _differently_mounted(stored) else ())
+    names = [name for name in SHOWN_FIRST if name in known - excluded]
+    names += sorted(known - excluded - set(SHOWN_FIRST))
+    changes = [_change(name, stored) for name in names]
+    return [change for change in changes
+            if sum(stored[entry.index].usable for entry in change.entries) > 1]
 
 
 def comparability_notes(stored: list[Stored]) -> list[str]:
     """Return notes on calibrations that are not, or not fully, comparable."""
     texts = []
-    for s in stored:
-        if not s.usable:
-            codes = ', '.join(dict.fromkeys(s.reasons[:3]))
-            texts.append(f'{s.name} is rejected ({codes}): shown, but not compared')
-    for i, a in enumerate(stored):
-        for b in stored[i + 1:]:
-            if a.bags & b.bags or a.legs & b.legs:
-                texts.append(f'{a.name} and {b.name} use the same drive: their errors are '
-                             'correlated, so a change is more significant than shown')
+    for calibration in stored:
+        if not calibration.usable:
+            codes = ', '.join(dict.fromkeys(calibration.reasons[:3]))
+            texts.append(f'{calibration.name} is rejected ({codes}): shown, but not compared')
+    for first, second in combinations(stored, 2):
+        if first.bags & second.bags or first.legs & second.legs:
+            texts.append(f'{first.name} and {second.name} use the same drive: their errors are '
+                         'correlated, so a change is more significant than shown')
     if _differently_mounted(stored):
         texts.append('imu.mounting_rpy differs: mounting angles are not compared')
     return texts
@@ -110,21 +110,22 @@ def comparability_notes(stored: list[Stored]) -> list[str]:
 
 def _differently_mounted(stored: list[Stored]) -> bool:
     """Return True if the mounting angles refer to different nominal mountings."""
-    return len({str(s.config.get('imu.mounting_rpy')) for s in stored}) > 1
+    return len({str(calibration.config.get('imu.mounting_rpy')) for calibration in stored}) > 1
 
 
 def _change(name: str, stored: list[Stored]) -> Change:
     """Return a parameter in all calibrations that have it; raise BadUsage if units differ."""
-    indices = [i for i, s in enumerate(stored) if s.value(name) is not None]
+    indices = [i for i, calibration in enumerate(stored) if calibration.value(name) is not None]
     unit = stored[indices[0]].estimates[name].unit
     entries = []
-    first = previous = None
+    first = previous = None      # indices of usable calibrations
     for i in indices:
-        if stored[i].estimates[name].unit != unit:
-            raise BadUsage(f'{stored[i].name}: {name} is in {stored[i].estimates[name].unit}, in '
+        estimate = stored[i].estimates[name]
+        if estimate.unit != unit:
+            raise BadUsage(f'{stored[i].name}: {name} is in {estimate.unit}, in '
                            f'{stored[indices[0]].name} in {unit}; compare calibrations of the '
                            'same odometer and unit')
-        entries.append(Entry(i, stored[i].estimates[name], _difference(name, stored, first, i),
+        entries.append(Entry(i, estimate, _difference(name, stored, first, i),
                              _difference(name, stored, previous, i)))
         if stored[i].usable:
             first, previous = i if first is None else first, i
@@ -136,8 +137,7 @@ def _difference(name: str, stored: list[Stored], since: int | None,
     """Return the difference between two calibrations by index, None without an earlier one."""
     if since is None:
         return None
-    a, b = stored[since], stored[index]
-    old, new = a.estimates[name], b.estimates[name]
+    old, new = stored[since].estimates[name], stored[index].estimates[name]
     assert old.value is not None     # entries have a value
     assert new.value is not None
     change = new.value - old.value
@@ -146,13 +146,20 @@ def _difference(name: str, stored: list[Stored], since: int | None,
     if old.sigma is None or new.sigma is None:
         return Difference(since, change, None, None, None)
     sigma = math.hypot(old.sigma, new.sigma)
-    # an error that is the same in both, effects a and b, adds (a - b)^2 instead of a^2 + b^2
-    shared = sum(2 * effect * b.budget[name][source][0]
-                 for source, (effect, is_shared) in a.budget.get(name, {}).items()
-                 if is_shared and b.budget.get(name, {}).get(source, (0, False))[1])
-    smallest = math.sqrt(max(sigma**2 - shared, 0.0))
-    return Difference(since, change, sigma, change / sigma if sigma > 0 else None,
-                      change / smallest if shared and smallest > 0 else None)
+    shared = _shared_variance(stored[since].budget.get(name, {}),
+                              stored[index].budget.get(name, {}))
+    sigma_without_shared = math.sqrt(max(sigma**2 - shared, 0.0))
+    return Difference(
+        since, change, sigma, change / sigma if sigma > 0 else None,
+        change / sigma_without_shared if shared and sigma_without_shared > 0 else None)
+
+
+def _shared_variance(old: dict[str, tuple[float, bool]],
+                     new: dict[str, tuple[float, bool]]) -> float:
+    """Return the variance that cancels in a difference if shared errors are the same in both."""
+    # effects a and b of one error: (a - b)^2 instead of a^2 + b^2
+    return sum(2 * effect * new[source][0] for source, (effect, is_shared) in old.items()
+               if is_shared and new.get(source, (0, False))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,19 +179,22 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
-        names = [s.name for s in self.stored]
+        names = [calibration.name for calibration in self.stored]
 
-        def difference(d: Difference | None) -> dict[str, Any] | None:
-            return None if d is None else asdict(d) | {'since': names[d.since]}
+        def as_dict(difference: Difference | None) -> dict[str, Any] | None:
+            return None if difference is None else asdict(difference) | {
+                'since': names[difference.since]}
         return {
             'schema': 1, 'changed': self.changed, 'sentence': self.sentence,
             'notes': list(self.notes),
-            'calibrations': [{'file': s.name, 'created': s.created, 'verdict': s.verdict.value,
-                              'legs': len(s.legs)} for s in self.stored],
-            'changes': [{'parameter': c.parameter, 'unit': c.unit, 'values': [
-                {'file': names[e.index], 'value': e.estimate.value, 'sigma': e.estimate.sigma,
-                 'to_first': difference(e.to_first), 'to_previous': difference(e.to_previous)}
-                for e in c.entries]} for c in self.changes]}
+            'calibrations': [{'file': one.name, 'created': one.created,
+                              'verdict': one.verdict.value, 'legs': len(one.legs)}
+                             for one in self.stored],
+            'changes': [{'parameter': change.parameter, 'unit': change.unit, 'values': [
+                {'file': names[entry.index], 'value': entry.estimate.value,
+                 'sigma': entry.estimate.sigma, 'to_first': as_dict(entry.to_first),
+                 'to_previous': as_dict(entry.to_previous)}
+                for entry in change.entries]} for change in self.changes]}
 
 
 def compare(*calibrations: Calibration | Path | str) -> Comparison:
@@ -201,37 +211,40 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
     stored = [stored_from(calibration.to_dict(), f'calibration {number}')
               if isinstance(calibration, Calibration) else read_stored(Path(calibration))
               for number, calibration in enumerate(calibrations, 1)]
-    all_changes = find_changes(stored)
-    return Comparison(tuple(stored), tuple(all_changes), tuple(comparability_notes(stored)),
-                      *_verdict(all_changes, stored))
+    changes = find_changes(stored)
+    sentences, changed = _summary(changes, stored)
+    return Comparison(tuple(stored), tuple(changes), tuple(comparability_notes(stored)),
+                      sentences, changed)
 
 
-def _verdict(all_changes: list[Change],
+def _summary(changes: list[Change],
              stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
     """Return summary sentences, and whether any change is significant; None: not comparable."""
-    if not all_changes:
+    if not changes:
         return ('nothing to compare: no value exists in two calibrations that are not '
                 'rejected',), None
-    compared = [(abs(d.sigmas), c, d) for c in all_changes for e in c.entries
-                if stored[e.index].usable for d in (e.to_first, e.to_previous)
-                if d is not None and d.sigmas is not None]
+    compared = [(abs(difference.sigmas), change, difference)
+                for change in changes for entry in change.entries if stored[entry.index].usable
+                for difference in (entry.to_first, entry.to_previous)
+                if difference is not None and difference.sigmas is not None]
     significant: dict[str, tuple[float, Change, Difference]] = {}
     for size, change, difference in compared:
         if difference.is_significant and size > significant.get(change.parameter, (0.0,))[0]:
             significant[change.parameter] = size, change, difference
     if significant:
-        return tuple(_cause(c, d, stored) for _, c, d in significant.values()), True
+        return tuple(_change_sentence(change, difference, stored)
+                     for _, change, difference in significant.values()), True
     if not compared:
         return ('nothing to compare: no sigma is known',), None
-    size, change, _ = max(compared, key=itemgetter(0))
+    size, change, _ = max(compared, key=lambda entry: entry[0])
     return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label_of(change.parameter)}, '
             f'{size:.1f} sigma',), False
 
 
-def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
+def _change_sentence(change: Change, difference: Difference, stored: list[Stored]) -> str:
     """Return the sentence on a significant change, with its likely cause."""
     words = change.parameter.split('_')
-    cause = next((text for key, text in CAUSES.items() if key in words),
+    cause = next((text for word, text in CAUSES.items() if word in words),
                  'unknown; calibrate again')
     old_value = stored[difference.since].value(change.parameter) or 0.0
     if 'scale' in words and abs(difference.change) > TYRE_CHANGE_LIMIT * old_value:
@@ -257,14 +270,15 @@ def change_text(change: Change, difference: Difference, stored: Sequence[Stored]
     return f'{difference.change:+.3g} {change.unit}'
 
 
-def shared_error_notes(all_changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
+def shared_error_notes(changes: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
     """Yield notes on changes that are significant only if shared errors are the same in both."""
-    for change in all_changes:
+    for change in changes:
         last = change.entries[-1]
-        for d in (last.to_first, last.to_previous):
-            sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
-            if d is not None and stored[last.index].usable and not d.is_significant \
-                    and sigmas > REMARK_SIGMAS:
+        for difference in (last.to_first, last.to_previous):
+            if difference is None or difference.is_significant or not stored[last.index].usable:
+                continue
+            sigmas = abs(difference.sigmas_if_shared_cancels or 0.0)
+            if sigmas > REMARK_SIGMAS:
                 yield (f'note: the change of the {label_of(change.parameter)} is {sigmas:.1f} '
                        'sigma if errors of heading source and lever arms are the same in both')
                 break

@@ -58,9 +58,9 @@ def _log_leg(recording: Any, name: str, pose: series.Series, state: series.Serie
     times = [rerun.TimeColumn('time', timestamp=pose['stamp_ns'].astype('datetime64[ns]'))]
     rerun.send_columns(f'{name}/vehicle', times, rerun.Transform3D.columns(
         translation=track_n, quaternion=rotations), recording=recording)
-    for key, column in state.items():
-        if key not in ('leg', 'stamp_ns', 't_s'):
-            rerun.send_columns(f'{name}/states/{key}', times, rerun.Scalars.columns(
+    for quantity, column in state.items():
+        if quantity not in ('leg', 'stamp_ns', 't_s'):
+            rerun.send_columns(f'{name}/states/{quantity}', times, rerun.Scalars.columns(
                 scalars=column), recording=recording)
 
 
@@ -122,11 +122,12 @@ def write_mcap(result: Calibration, path: Path) -> None:
 
 def _topics(result: Calibration) -> list[encode.Topic]:
     """Return the topics of ``write_mcap``."""
-    pose, bias = (_by_time(make(result)) for make in (series.trajectory, series.states))
+    pose, state = (_by_time(series_of(result))
+                   for series_of in (series.trajectory, series.states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     zeros = np.zeros(n, np.int64)
     (gyro, gyro_sigma), (force, force_sigma) = (
-        [np.stack([bias[f'{sensor}_bias_{axis}{ending}'] for axis in 'xyz'], -1)
+        [np.stack([state[f'{sensor}_bias_{axis}{ending}'] for axis in 'xyz'], -1)
          for ending in ('', '_sigma')] for sensor in ('gyro', 'accelerometer'))
     track = FixSamples(t, t, np.deg2rad(pose['latitude_deg']), np.deg2rad(pose['longitude_deg']),
                        pose['height_m'], np.zeros((n, 3, 3)), zeros, zeros)
@@ -166,6 +167,7 @@ def _component_columns(residual: series.SensorResiduals) -> series.Series:
 
 
 def _by_time(columns: series.Series) -> series.Series:
+    """Return a series in order of its stamps: legs may overlap or be out of order."""
     order = np.argsort(columns['stamp_ns'], kind='stable')
     return {name: column[order] for name, column in columns.items()}
 
@@ -219,6 +221,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
 
 
 def _write(result: Calibration, file: Path) -> None:
+    """Write the file that a name of KNOWN selects."""
     name, ending = file.stem, file.suffix[1:]
     if file.suffix in PICTURES:
         draw = export_pictures.draw_map if name == 'map' else export_pictures.draw_scale_by_speed

@@ -70,7 +70,7 @@ def _add_map_scale(ax: Any) -> None:
     ax.figure.canvas.draw()       # datalim: the final limits
     (west, east), (south, north) = ax.get_xlim(), ax.get_ylim()
     _, _, width = Geod(ellps='WGS84').inv(west, south, east, south)
-    lengths = [step * 10.0**power for power in range(-1, 7) for step in (1, 2, 5)]
+    lengths = [step * 10.0**power for power in range(-1, 7) for step in (1, 2, 5)]      # m
     bar = max([length for length in lengths if length <= width / 3], default=lengths[0])
     x, y = west + 0.04 * (east - west), south + 0.05 * (north - south)
     ax.plot([x, x + bar / width * (east - west)], [y, y], color='black', linewidth=3,
@@ -84,6 +84,7 @@ def _add_map_scale(ax: Any) -> None:
 
 
 def _legs_with_speed_scale(result: Calibration) -> list[tuple[int, SpeedScale]]:
+    """Return (number, scale against speed) of the legs that have one; BadUsage without any."""
     legs = [(number, leg.evidence.by_speed) for number, leg in enumerate(result.legs, 1)
             if leg.evidence is not None and len(leg.evidence.by_speed.bins)]
     if not legs:

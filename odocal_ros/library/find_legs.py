@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The legs of a recording, as spans of stamps: requested, marked by the node, or found.
+The legs of a recording, as spans of stamps: requested, marked by the node, or searched.
 
-Without request and marks, a leg begins and ends at standstills, as the node's automatic legs do.
+A searched leg begins and ends at standstills, as the node's automatic legs do.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -30,11 +30,12 @@ from odocal_ros.settings.config import Config
 if TYPE_CHECKING:
     from odocal_ros.library.read_bag import Recording
 
-Recorded: TypeAlias = 'Bag | Recording'     # an open bag, or one that was read
+AnyBag: TypeAlias = 'Bag | Recording'     # an open bag, or one that was read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 # judgement: of the distance; a first stop after this share does not start a leg
 LATEST_START_SHARE = 0.2
 COVERAGE_TOLERANCE_NS = 10 * 10**9    # judgement: drivers and recorders start and stop within it
+BAG_TIME_TOLERANCE_NS = 10 * 10**9    # judgement: stamps of a bag may be outside its bag times
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
 
@@ -42,8 +43,8 @@ OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: i
 class Standstills(NamedTuple):
     """Standstills of a recording, and the path length up to them."""
 
-    spans_ns: Ints      # (k, 2)
-    path_m: Floats      # (k, 2), at begin and end
+    spans_ns: Ints      # (k, 2) ns, begin and end
+    path_m: Floats      # (k, 2) m, path length at begin and end
     distance: float     # m, path length of the whole recording
 
 
@@ -90,31 +91,32 @@ def has_dropped_legs(bag: Bag) -> bool:
 def last_statuses(bag: Bag) -> list[dict[str, str]]:
     """Return the last status of each leg in a bag."""
     last: dict[tuple[str, int], dict[str, str]] = {}
-    for topic in bag.topics.values():
-        if topic.msgtype != STATUS_TYPE:
+    for values in _statuses(bag):
+        try:
+            start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
+        except (KeyError, ValueError):
             continue
-        message: Any
-        for _, message in bag.messages(topic.name):
-            for status in message.status:
-                if status.name.endswith(STATUS_NAME):
-                    _store_status(last, {kv.key: kv.value for kv in status.values})
+        # ids begin again with each run of the node: a leg is identified by its start too
+        leg_id = values.get('leg_id', ''), start
+        last_event = last.get(leg_id, {}).get('leg_event', '')
+        # a leg without a number has not started; a dropped one stays dropped
+        if leg_id[0] not in ('', '0') and last_event not in DROPPED_EVENTS:
+            last[leg_id] = values | {'leg_event': values.get('leg_event') or last_event}
     return list(last.values())
 
 
-def _store_status(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str]) -> None:
-    """Store a status as the last one of its leg; the event of a dropped leg is kept."""
-    try:
-        start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
-    except (KeyError, ValueError):
-        return
-    # ids begin again with each run of the node: a leg is identified by its start too
-    leg_id = values.get('leg_id', ''), start
-    last_event = last.get(leg_id, {}).get('leg_event', '')
-    if leg_id[0] not in ('', '0') and last_event not in DROPPED_EVENTS:
-        last[leg_id] = values | {'leg_event': values.get('leg_event') or last_event}
+def _statuses(bag: Bag) -> Iterator[dict[str, str]]:
+    """Yield the values of each status message of a node, by key."""
+    for topic in bag.topics.values():
+        if topic.msgtype == STATUS_TYPE:
+            message: Any
+            for _, message in bag.messages(topic.name):
+                for status in message.status:
+                    if status.name.endswith(STATUS_NAME):
+                        yield {kv.key: kv.value for kv in status.values}
 
 
-def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan | str],
+def find_legs(recorder: LegRecorder, bag: AnyBag, requested: Sequence[LegSpan | str],
               marks: Sequence[tuple[int, int]], config: Config,
               stops: Standstills | None = None) -> Spans:
     """
@@ -152,7 +154,7 @@ def find_legs(recorder: LegRecorder, bag: Recorded, requested: Sequence[LegSpan 
     return [_leg_between_standstills(first, last, standstills())]
 
 
-def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans:
+def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: AnyBag) -> Spans:
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
@@ -165,7 +167,7 @@ def _first_and_last(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
     """Return the first and the last stamp of each required slot that has stamps."""
     rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
     stamps = {slot: s[s > 0] for slot, s in rows.items()}
-    # percentiles, not extremes: one implausible stamp must not move the leg
+    # medians of five, not extremes: one implausible stamp must not move the leg
     return {slot: (int(np.median(s[:5])), int(np.median(s[-5:]))) if len(s) > 20
             else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
 
@@ -181,13 +183,15 @@ def _no_common_time_text(recorder: LegRecorder) -> str:
             'together')
 
 
-def _span_in_bag(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
+def _span_in_bag(span: LegSpan, bag: AnyBag, first: int, last: int) -> tuple[int, int]:
     """Return the stamps of a requested leg; raise BadUsage if it is outside the bag."""
-    start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
-    stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
+    start = first if span.start_ns is None else (
+        span.start_ns + bag.start_ns * span.start_is_relative)
+    stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.stop_is_relative
     # stamps may be on another clock than bag times, as in a recording of a replay
     begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
-    if stop <= start or stop < begin - 10**10 or start > end + 10**10:
+    if (stop <= start or stop < begin - BAG_TIME_TOLERANCE_NS
+            or start > end + BAG_TIME_TOLERANCE_NS):
         length = (bag.end_ns - bag.start_ns) * 1e-9
         requested = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
         raise BadUsage(f'{bag.name}: the leg {requested} contains no data; the bag runs '
@@ -229,7 +233,8 @@ def _leg_between_standstills(first: int, last: int, stops: Standstills) -> tuple
     starts_at_rest = stops.path_m[0, 0] < LATEST_START_SHARE * distance
     if starts_at_rest:
         start = int(stops.spans_ns[0, 1])
-    # the same standstill is not start and end
+    # judgement: the drive ends at a standstill if at most 2 % and 1 m of travel follow. A single
+    # standstill is not start and end
     if count > starts_at_rest and distance - stops.path_m[-1, 1] < 0.02 * distance + 1.0:
         stop = int(stops.spans_ns[-1, 1])
     return start, stop

@@ -30,7 +30,7 @@ RTK_SIGMA = 0.02                  # m, physical: of a fix, by receivers' data sh
 
 
 @dataclass(frozen=True)
-class Change:
+class TestedChange:
     """A change of the planned drive or its sensors, and the sigmas that result."""
 
     text: str
@@ -44,15 +44,15 @@ class Change:
         return math.inf if old_sigma is None else old_sigma / new_sigma
 
 
-def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
+def tested_changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[TestedChange]:
     """Return the changes of drive and sensors, each with the sigmas that it leads to."""
-    # the same keyframe spacing: a wider one alone makes a sigma larger
+    # with the keyframe spacing of this drive: a wider one alone makes a sigma larger
     spacing = keyframe_spacing(drive)
     results = []
     for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
                                             *_better_sensors(drive, sigmas, before)):
         after = plan_methods(other_drive, other_sigmas, spacing)
-        results.append(Change(text, {name: after.sigma(name) for name in (SCALE, YAW)}))
+        results.append(TestedChange(text, {name: after.sigma(name) for name in (SCALE, YAW)}))
     return results + _second_leg(drive, sigmas, before)
 
 
@@ -84,12 +84,12 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
         yield (f'RTK fixes ({RTK_SIGMA:g} m)', drive,
                replace(sigmas, fix=RTK_SIGMA, fix_up=2 * RTK_SIGMA))
     alignment = before.two_point.alignment
-    present = alignment.heading_sigma if alignment.heading_separable else math.inf
+    heading_sigma = alignment.heading_sigma if alignment.heading_separable else math.inf
     two_antennas = math.radians(0.1)    # sigma of a heading with a base line of 1 to 2 m
-    better = two_antennas if present > 2 * two_antennas else present / 2
+    better_sigma = two_antennas if heading_sigma > 2 * two_antennas else heading_sigma / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
-                                           'alignment.heading_sigma': better})
-    yield (f'a heading with {math.degrees(better):.2g} deg uncertainty', drive,
+                                           'alignment.heading_sigma': better_sigma})
+    yield (f'a heading with {math.degrees(better_sigma):.2g} deg uncertainty', drive,
            replace(sigmas, config=config))
     better_grades = GRADES[GRADES.index(sigmas.config.imu.grade) + 1:]
     if better_grades:
@@ -101,17 +101,20 @@ def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     """Return the drive up to its farthest point from the start, None if that is the end."""
     inside = drive.t >= 0
     position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
-    k = int(np.argmax(np.abs(position - position[0])))
-    if abs(position[-1] - position[0]) > 0.9 * abs(position[k] - position[0]):
+    from_start = np.abs(position - position[0])
+    farthest = int(np.argmax(from_start))
+    gain = 0.9    # the end is far enough if it has this share of the largest distance
+    if from_start[-1] > gain * from_start[farthest]:
         return None
-    rest = max((b - a for a, b in drive.standstills(sigmas.config.leg.standstill)
-                if a <= drive.t[inside][k] <= b), default=30.0)
-    moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= drive.t[inside][k]))
+    t_farthest = drive.t[inside][farthest]
+    rest = max((end - begin for begin, end in drive.standstills(sigmas.config.leg.standstill)
+                if begin <= t_farthest <= end), default=30.0)      # s
+    moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= t_farthest))
     return drive.cut_at(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
 
 
-def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
-    """Return two legs combined, the second in the opposite direction."""
+def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[TestedChange]:
+    """Return the change to two legs, the second in the opposite direction; [] without a scale."""
     if before.sigma(SCALE) is None:
         return []
     opposite = predict(drive.turn_around(), sigmas).method
@@ -126,21 +129,23 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
         legs = [_with_dummy_values(leg) for leg in (first, second)]
         both = combine_results(name, legs, (0, round(drive.duration * 1e9)), sigmas.config)
         combined[parameter] = both.estimates[parameter].sigma
-    return [Change('a second leg in the other direction', combined)]
+    return [TestedChange('a second leg in the other direction', combined)]
 
 
 def _with_dummy_values(method: MethodResult) -> MethodResult:
     """Return the method with dummy values of undetermined parameters, so that legs combine."""
-    known = {name: e if e.value is not None else Estimate(0.0, 0.0, e.unit)
-             for name, e in method.estimates.items()}
-    return replace(method, estimates=known)
+    return replace(method, estimates={
+        name: estimate if estimate.value is not None else Estimate(0.0, 0.0, estimate.unit)
+        for name, estimate in method.estimates.items()})
 
 
-def ranked(improvements: list[Change], before: Plan, parameter: str) -> list[Change]:
+def ranked(improvements: list[TestedChange], before: Plan, parameter: str) -> list[TestedChange]:
     """Return the changes that reduce the sigma of a parameter, best first."""
     largest_share = 0.98    # of the old sigma: a change that leaves more is not listed
-    helpful = [c for c in improvements if c.gain(before, parameter) > 1 / largest_share]
-    return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigmas[parameter]))
+    helpful = [change for change in improvements
+               if change.gain(before, parameter) > 1 / largest_share]
+    return sorted(helpful, key=lambda change: (-change.gain(before, parameter),
+                                               change.sigmas[parameter]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +156,9 @@ class Planned(Plan):
     sigmas: Sigmas
 
     @cached_property
-    def improvements(self) -> list[Change]:
+    def improvements(self) -> list[TestedChange]:
         """Return the computed improvements; this takes some seconds."""
-        return changes(self.drive, self.sigmas, self)
+        return tested_changes(self.drive, self.sigmas, self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the output of ``odocal plan --json``; sigmas of the scale are relative."""
@@ -183,7 +188,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
          scenario: str | None = None, duration: float | None = None,
          gpx: Path | str | None = None, bag: Path | str | None = None,
          topics: Mapping[str, str] | None = None, config: Settings = None,
-         **figures: float) -> Planned:
+         **errors: float) -> Planned:
     """
     Predict the sigmas of one drive.
 
@@ -192,23 +197,14 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     drive, and its duration, s.   gpx : a GPX track; one without times is driven at ``speed``.
     bag, topics : a recorded bag, with the accuracy and rate of its fixes; of a journal with its
     settings and topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.
-    figures : fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per
+    errors : fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per
     count, sway m/s, slip m/sqrt(s).
 
     Raises BadUsage, BadConfig: not exactly one drive is given, or its values are invalid.
     """
-    kinds = {'scenario': scenario, 'gpx': gpx, 'bag': bag, 'distance': distance}
-    given = [kind for kind, value in kinds.items() if value is not None]
-    if len(given) != 1:
-        raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
-                       f'--distance with --speed{"; not " if given else ""}'
-                       f'{" and ".join("--" + k for k in given)}')
-    if duration is not None and not scenario:
-        raise BadUsage('--duration requires --scenario; otherwise distance and speed give it')
-    if given[0] != 'distance' and (standstill is not None or turns is not None):
-        raise BadUsage(f'--standstill and --turns require --distance, not --{given[0]}')
-    if speed is not None and not (math.isfinite(speed) and speed > 0):
-        raise BadUsage(f'--speed {speed:g}: required: a number above 0')
+    given = [name for name, value in {'scenario': scenario, 'gpx': gpx, 'bag': bag,
+                                      'distance': distance}.items() if value is not None]
+    _check_arguments(given, speed, turns, standstill, duration)
     from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(Path(bag)) if bag else None
     settings = config_of(config, journal.settings if journal else None)
@@ -226,7 +222,22 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         assert distance is not None
         drive = planned_drives.from_figures(
             speed, distance, 30.0 if standstill is None else standstill, turns or 0, acceleration)
-    if 'fix' in figures:
+    if 'fix' in errors:      # twice the horizontal one, unless given too
         bag_sigmas |= {'fix_up': None}
-    sigmas = Sigmas(config=settings, **(bag_sigmas | figures))
+    sigmas = Sigmas(config=settings, **(bag_sigmas | errors))
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)
+
+
+def _check_arguments(given: list[str], speed: float | None, turns: int | None,
+                     standstill: float | None, duration: float | None) -> None:
+    """Raise BadUsage for arguments that do not fit; given: the names of those of a drive."""
+    if len(given) != 1:
+        raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
+                       f'--distance with --speed{"; not " if given else ""}'
+                       f'{" and ".join("--" + name for name in given)}')
+    if duration is not None and given != ['scenario']:
+        raise BadUsage('--duration requires --scenario; otherwise distance and speed give it')
+    if given != ['distance'] and (standstill is not None or turns is not None):
+        raise BadUsage(f'--standstill and --turns require --distance, not --{given[0]}')
+    if speed is not None and not (math.isfinite(speed) and speed > 0):
+        raise BadUsage(f'--speed {speed:g}: required: a number above 0')

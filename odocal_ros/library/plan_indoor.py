@@ -26,7 +26,7 @@ from odocal_ros.sim.scenarios import motion_of
 from odocal_ros.sim.wheels import effective_width, STRAIGHT_RATIO
 
 MARKS = 'marks'
-KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
+REFERENCE_KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
 MARKS_LENGTH = 1.0     # m of path, judgement: correlation length of position errors at marks
 SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever':
          'rotation lever', 'track_width_arc': 'width on arcs', 'lateral_scale_factor': 'lateral',
@@ -46,10 +46,10 @@ class PlannedRun:
         """Return the sigma of an estimate or of ``ratio``, relative, or rad; None: unknown."""
         if name == 'ratio':
             return ratio_sigma(self.method)
-        one = self.method.estimates.get(name)
-        if one is None or one.value is None or one.sigma is None:
+        estimate = self.method.estimates.get(name)
+        if estimate is None or estimate.value is None or estimate.sigma is None:
             return None
-        return one.sigma if one.unit == 'rad' else one.sigma / abs(one.value)
+        return estimate.sigma if estimate.unit == 'rad' else estimate.sigma / abs(estimate.value)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of ``odocal plan --indoor --json``."""
@@ -68,7 +68,7 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     """
     Predict the sigmas of runs of a small robot on a level floor.
 
-    run : of PATTERNS, or ``all``.   reference : of KINDS.   drive : as ``odometer.drive``.
+    run : of PATTERNS, or ``all``.   reference : of REFERENCE_KINDS.   drive : as odometer.drive.
     imu : the robot has an IMU.   size, rounds, speed : m of a straight, repetitions, m/s.
     track_width : m between the wheels; the effective one of skid steering is 1.7 times as large
     in turns on the spot and 1.4 times on a straight.   wheels : number.   slip : m/sqrt(s) of
@@ -78,7 +78,7 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     Raises BadUsage, BadConfig: a name is unknown, or a value is out of range.
     """
     for flag, value, names in (('--indoor', run, ('all', *PATTERNS)), ('--drive', drive, DRIVES),
-                               ('--reference', reference, KINDS)):
+                               ('--reference', reference, REFERENCE_KINDS)):
         if value not in names:
             raise BadUsage(f'{flag} {value}: {unknown_name(value, names)}')
     if not track_width > 0 or not slip > 0:

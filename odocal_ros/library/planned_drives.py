@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import (
     drive_from_rates,
@@ -35,8 +35,8 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     """
     Return a drive of ``distance`` m between two standstills, with 90 deg turns left and right.
 
-    Turns are spread evenly over the section at full speed. A drive too short to reach ``speed``
-    brakes from a lower one.
+    speed, acceleration : m/s, m/s^2; a short drive brakes from a lower speed.   standstill : s at
+    both ends.   turns : number, evenly over the section at full speed.
     """
     for flag, value in (('--speed', speed), ('--distance', distance),
                         ('--acceleration', acceleration)):
@@ -45,6 +45,7 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     if not (math.isfinite(standstill) and standstill >= 0):
         raise BadUsage(f'--standstill {standstill:g}: required: 0 s or more')
     top = min(speed, math.sqrt(distance * acceleration))
+    # s, of the acceleration, and at full speed
     ramp, cruise = top / acceleration, max(0.0, distance / top - top / acceleration)
     duration = 2 * (standstill + ramp) + cruise
     max_metres = 1e6
@@ -117,23 +118,21 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         raise BadUsage(f'{path}: holds {len(points)} track points; required: 2 to '
                        f'{max_points:,}. Export a track, not waypoints')
     try:
-        level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
+        lat_lon_deg = [[float(p.get(name, 'nan')) for name in ('lat', 'lon')] for p in points]
         heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
         times = [_seconds(_child(p, 'time')) for p in points]
     except ValueError as error:
         raise BadUsage(f'{path}: a track point is not readable ({error}); export '
                        'the track again as GPX') from None
-    lat, lon = np.deg2rad(level).T
+    lat, lon = np.deg2rad(lat_lon_deg).T
     if not (np.abs(lat) < np.pi / 2).all() or not (np.abs(lon) <= 2 * np.pi).all():
         raise BadUsage(f'{path}: the latitude or longitude of a track point is missing or out '
                        'of range; export the track again as GPX')
     known = np.isfinite(heights)
     heights = np.interp(np.arange(len(heights)), np.flatnonzero(known), heights[known]) \
         if known.any() else np.zeros(len(heights))
-    geodetic = np.stack([lat, lon, heights], -1)
-    if any(x is None for x in times):
-        return None, geodetic
-    return np.array(times) - times[0], geodetic
+    return (None if None in times else np.array(times) - times[0],
+            np.stack([lat, lon, heights], -1))
 
 
 def _child(point: Any, name: str) -> str | None:
@@ -153,30 +152,24 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     """Return the drive through points (n, 3), m, at times (n,), s; path: for errors."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, points = t[rising], position_n[rising]
-    used = [0]
-    min_step = 5.0    # m between points used: nearer ones are receiver noise
-    for k in range(1, len(t)):
-        if np.hypot(*(points[k] - points[used[-1]])[:2]) >= min_step:
-            used.append(k)
-    if len(used) < 2:
-        raise BadUsage(f'{path}: the track never moves {min_step:g} m; give a driven track')
-    a, b = np.array(used[:-1]), np.array(used[1:])
-    step = points[b] - points[a]
+    used = _used_points(points, path)
+    first, last = used[:-1], used[1:]      # of each step between used points
+    step = points[last] - points[first]
     step_length, horizontal = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
     # a slow step was mostly a stop: its motion is assigned to the interval before its last point
-    mean_speed = step_length / (t[b] - t[a])
+    mean_speed = step_length / (t[last] - t[first])
     slow_speed, slow_share = 0.3, 0.1    # m/s, of the median speed: the larger is the limit
     slow = mean_speed < max(slow_speed, slow_share * np.median(mean_speed))
-    begin = np.where(slow, t[b - 1], t[a])
+    begin, end = np.where(slow, t[last - 1], t[first]), t[last]
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
     if len(grid) < 2 or t[-1] - t[0] > MAX_DRIVE_TIME:
         raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; required: above 0 s, '
                        f'at most {MAX_DRIVE_TIME:g} s')
-    number = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)      # of the step
-    moving = (grid >= begin[number]) & (grid <= t[b][number])
-    speed = np.where(moving, (step_length / np.maximum(t[b] - begin, 1e-3))[number], 0.0)
+    step_at = np.clip(np.searchsorted(end, grid), 0, len(end) - 1)      # number of the step
+    moving = (grid >= begin[step_at]) & (grid <= end[step_at])
+    speed = np.where(moving, (step_length / np.maximum(end - begin, 1e-3))[step_at], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
-    middle = (begin + t[b]) / 2
+    middle = (begin + end) / 2
     # s: faster changes between points are noise and spacing. A rest contains the path to the next
     # used point, and loses half of this time at each end
     smoothing_time = 4.0
@@ -188,6 +181,18 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
         _moving_mean(np.interp(grid, middle, arctan2(step[:, 2], horizontal)),
                      slope_windows * window),
         latitude=latitude, longitude=longitude, height=height)
+
+
+def _used_points(points: Floats, path: Path) -> Ints:
+    """Return the rows of points, (n, 3) m, that are far enough from the used one before."""
+    min_step = 5.0    # m: nearer points are receiver noise
+    used = [0]
+    for k in range(1, len(points)):
+        if np.hypot(*(points[k] - points[used[-1]])[:2]) >= min_step:
+            used.append(k)
+    if len(used) < 2:
+        raise BadUsage(f'{path}: the track never moves {min_step:g} m; give a driven track')
+    return np.array(used)
 
 
 def _moving_mean(x: Floats, window: int) -> Floats:

@@ -19,9 +19,10 @@ from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 Series = dict[str, NDArray[Any]]
 NO_FIT = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
           'use method auto')
-# residuals of the smoother: sensors, units, components
-SMOOTHED = (('fix', 'm', ('east', 'north', 'up')), ('odometer', 'm', ('along', 'left', 'up')),
-            ('gyro', 'rad/s', ('x', 'y', 'z')), ('accelerometer', 'm/s^2', ('x', 'y', 'z')))
+# residuals of the smoother: sensor, unit, components
+SMOOTHER_SENSORS = (
+    ('fix', 'm', ('east', 'north', 'up')), ('odometer', 'm', ('along', 'left', 'up')),
+    ('gyro', 'rad/s', ('x', 'y', 'z')), ('accelerometer', 'm/s^2', ('x', 'y', 'z')))
 
 
 def trajectory(result: Calibration) -> Series:
@@ -32,7 +33,7 @@ def trajectory(result: Calibration) -> Series:
     latitude_deg, longitude_deg, height_m : the same.   qx, qy, qz, qw : rotation from vehicle
     axes (forward, left, up) to n.   Raises BadUsage: no leg has a fit of the smoother.
     """
-    return _of_fits(result, _pose)
+    return _stack_fits(result, _pose)
 
 
 def states(result: Calibration) -> Series:
@@ -44,12 +45,12 @@ def states(result: Calibration) -> Series:
 
     Raises BadUsage: no leg has a fit of the smoother.
     """
-    return _of_fits(result, _state)
+    return _stack_fits(result, _state)
 
 
-def _of_fits(result: Calibration,
-             columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
-    """Return the columns of all legs with a fit; columns: function of leg and details."""
+def _stack_fits(result: Calibration,
+                columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
+    """Return the columns of all legs with a fit of the smoother; columns: of leg and details."""
     legs = [(number, leg, columns(leg, leg.methods['smoother'].details))
             for number, leg in enumerate(result.legs, 1)
             if leg.track_n is not None
@@ -107,7 +108,8 @@ def stack_legs(legs: list[tuple[int, LegResult, Series]]) -> Series:
                't_s': columns['t'],
                **{name: column for name, column in columns.items() if name != 't'}}
               for number, leg, columns in legs]
-    return {name: np.concatenate([one[name] for one in series]) for name in series[0]}
+    return {name: np.concatenate([leg_series[name] for leg_series in series])
+            for name in series[0]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +127,17 @@ class SensorResiduals:
 def sensor_residuals(leg: LegResult) -> list[SensorResiduals]:
     """Return the residuals of each sensor in a leg, none without track and fit."""
     sensors = []
-    if (e := leg.evidence) is not None:
-        sigma = np.repeat(e.fix_sigma[:, None], 2, axis=1)
-        sensors = [SensorResiduals(name, 'm', ('along', 'left'), e.t_fix, rows, sigma)
-                   for name, rows in (('track', e.residual), ('track_before', e.residual_before))]
+    if (evidence := leg.evidence) is not None:
+        sigma = np.repeat(evidence.fix_sigma[:, None], 2, axis=1)
+        sensors = [SensorResiduals(name, 'm', ('along', 'left'), evidence.t_fix, rows, sigma)
+                   for name, rows in (('track', evidence.residual),
+                                      ('track_before', evidence.residual_before))]
     smoothed = getattr(leg.methods.get('smoother'), 'details', {})
-    for sensor, unit, components in SMOOTHED:
-        if f'left_{sensor}' in smoothed:      # residuals, then their sigmas
-            t = smoothed['left_fix_t'] if sensor == 'fix' else smoothed['key_t'][1:]
+    for sensor, unit, components in SMOOTHER_SENSORS:
+        if f'residual_{sensor}' in smoothed:      # residuals, then their sigmas
+            t = smoothed['residual_fix_t'] if sensor == 'fix' else smoothed['key_t'][1:]
             sensors.append(SensorResiduals(sensor, unit, components, t,
-                                           *np.hsplit(smoothed[f'left_{sensor}'], 2)))
+                                           *np.hsplit(smoothed[f'residual_{sensor}'], 2)))
     return sensors
 
 
@@ -152,8 +155,8 @@ def residuals(result: Calibration) -> Series:
 
     Raises BadUsage: no leg has a track.
     """
-    legs = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
-            for one in sensor_residuals(leg)]
+    legs = [(number, leg, _residual_rows(leg, of_sensor))
+            for number, leg in enumerate(result.legs, 1) for of_sensor in sensor_residuals(leg)]
     if not legs:
         raise BadUsage('no leg has a track to compare with its fixes; see the reasons')
     return stack_legs(legs)
@@ -161,13 +164,15 @@ def residuals(result: Calibration) -> Series:
 
 def _residual_rows(leg: LegResult, residuals: SensorResiduals) -> Series:
     """Return the residuals of a sensor as columns, a row for each known component."""
-    m, c = residuals.value.shape
+    times, components = residuals.value.shape
+    n = residuals.value.size
     known = np.isfinite(residuals.sigma).ravel()
-    t, e = np.repeat(residuals.t, c), leg.evidence
-    distance = np.full(m * c, np.nan) if e is None else np.interp(t, e.t, e.distance)
-    columns = {'t': t, 'sensor': np.full(m * c, residuals.sensor),
-               'component': np.tile(residuals.components, m),
+    t, evidence = np.repeat(residuals.t, components), leg.evidence
+    distance = np.full(n, np.nan) if evidence is None else np.interp(t, evidence.t,
+                                                                     evidence.distance)
+    columns = {'t': t, 'sensor': np.full(n, residuals.sensor),
+               'component': np.tile(residuals.components, times),
                'value': residuals.value.ravel().astype(float),
                'sigma': residuals.sigma.ravel().astype(float),
-               'unit': np.full(m * c, residuals.unit), 'distance_m': distance}
+               'unit': np.full(n, residuals.unit), 'distance_m': distance}
     return {name: column[known] for name, column in columns.items()}

@@ -74,7 +74,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
         if len(fitting) == 1:
             chosen[slot] = fitting[0]
         elif not _is_optional(slot, config, fitting):
-            errors.append(_open_slot_text(topics, slot, fitting, config, chosen))
+            errors.append(_unfilled_slot_text(topics, slot, fitting, config, chosen))
     if errors:
         if not all('; choose one with ' in text for text in errors):
             errors.append(f'the bag has:{_described(topics, topics)}')
@@ -162,6 +162,7 @@ def _is_of_receiver(name: str) -> bool:
 
 
 def _types(slot: str, config: Config) -> Iterable[str]:
+    """Return the message types that fit a slot."""
     if slot == 'fix':
         return REFERENCES
     return tuple(map(full_type, types_of(slot, config.odometer))) or ODOMETERS
@@ -172,15 +173,15 @@ def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
     name = next((name for name in (topic, f'/{topic}') if name in topics), '')
     if not name:
         similar = similar_names(topic, topics)
-        wrong = 'no such topic' + (f' (did you mean {similar[0]}?)' if similar else '')
+        problem = 'no such topic' + (f' (did you mean {similar[0]}?)' if similar else '')
     elif not topics[name].count:
-        wrong = 'the topic has no message'
+        problem = 'the topic has no message'
     elif not _fits_slot(topics[name].msgtype, slot):
-        wrong = (f'the topic is of {topics[name].msgtype}, which cannot be used as '
-                 f'{INPUTS[slot].label}')
+        problem = (f'the topic is of {topics[name].msgtype}, which cannot be used as '
+                   f'{INPUTS[slot].label}')
     else:
         return name
-    raise BadTopics(f'{topic_option(slot)} {one_line(topic)}: {wrong}; the bag has:'
+    raise BadTopics(f'{topic_option(slot)} {one_line(topic)}: {problem}; the bag has:'
                     f'{_described(topics, topics)}')
 
 
@@ -198,8 +199,8 @@ def _fits_slot(msgtype: str, slot: str) -> bool:
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
-def _open_slot_text(topics: Topics, slot: str, fitting: list[str], config: Config,
-                    chosen: dict[str, str]) -> str:
+def _unfilled_slot_text(topics: Topics, slot: str, fitting: list[str], config: Config,
+                        chosen: dict[str, str]) -> str:
     """Return the reason for a slot without topic, and the option that selects one."""
     fix = chosen.get('fix', '')
     if slot == 'odometer' and fix and not fitting and topics[fix].msgtype in ODOMETERS:

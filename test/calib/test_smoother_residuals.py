@@ -33,11 +33,11 @@ def in_halves(rows):
     return np.hsplit(rows.astype(float), 2)
 
 
-def left_by_odometer(leg, config):
+def odometer_residuals(leg, config):
     """Return the fit of a leg, and the odometer's residuals and sigmas."""
     problem = make_problem(leg, config)
     fit = best_fit(problem, config)
-    return fit, *in_halves(stored_residuals(leg, problem, fit)['left_odometer'])
+    return fit, *in_halves(stored_residuals(leg, problem, fit)['residual_odometer'])
 
 
 def test_residuals_equal_those_of_the_equations_recomputed_at_the_estimate():
@@ -53,7 +53,7 @@ def test_residuals_equal_those_of_the_equations_recomputed_at_the_estimate():
             ('accelerometer', np.einsum('kij,kj->ki', begin, motion.residual[:, V]) / motion.T),
             ('odometer', np.einsum('kij,kj->ki', middle, motion.residual[:, D])),
             ('fix', -again.factors[Fixes.name].raw)):
-        value, sigma = in_halves(found[f'left_{name}'])
+        value, sigma = in_halves(found[f'residual_{name}'])
         if name == 'odometer':      # its rows end before the end of the last second
             value, sigma, expected = value[:-1], sigma[:-1], expected[:-1]
         # the delay may change by a tenth of its 0.7 ms. One count more or less at 20 Hz, 0.43 m/s,
@@ -70,16 +70,16 @@ def test_residual_sigmas_are_those_of_white_noise_over_an_interval():
     _, _, leg, problem, fit = fitted()
     found = stored_residuals(leg, problem, fit)
     T = np.diff(fit.state.t)
-    _, sigma = in_halves(found['left_gyro'])
+    _, sigma = in_halves(found['residual_gyro'])
     # the random walk of the bias adds less than 1e-3
     np.testing.assert_allclose(sigma, np.sqrt(fit.levels['gyro'] / T)[:, None].repeat(3, 1),
                                rtol=1e-3)
-    _, sigma = in_halves(found['left_accelerometer'])
+    _, sigma = in_halves(found['residual_accelerometer'])
     # gyro noise rotates gravity: most of the horizontal sigma
     assert np.all(sigma > 0.999 * np.sqrt(fit.levels['accel'] / T)[:, None])
     np.testing.assert_allclose(sigma[problem.at_rest[1:], 2], np.sqrt(
         fit.levels['accel'] / T)[problem.at_rest[1:]], rtol=0.02)
-    _, sigma = in_halves(found['left_fix'])
+    _, sigma = in_halves(found['residual_fix'])
     stated = np.sqrt(np.einsum('mii->mi', leg.covariance_n[problem.used_fixes]))
     factor = np.sqrt([fit.levels['fix'], fit.levels['fix'], fit.levels['fix_up']])
     np.testing.assert_allclose(sigma, stated * factor, rtol=1e-3)
@@ -93,7 +93,7 @@ def test_wheel_slip_appears_in_the_residuals_at_its_time():
     more = np.round(share * metres / drive.truth.scale).astype(int)
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, value=lambda value: value + more)),
                  config)
-    fit, value, sigma = left_by_odometer(leg, config)
+    fit, value, sigma = odometer_residuals(leg, config)
     t, along = fit.state.t, value[:, 0]
     slipping = (t[1:] > begin) & (t[:-1] < begin + seconds)
     # the fitted path is shorter than the wheel travel; the IMU determines the path length of a
@@ -109,7 +109,7 @@ def test_odometer_residuals_are_nan_without_odometer_data():
     when = (rows.odometer.stamp_ns - rows.start_ns) * 1e-9
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, **dict.fromkeys(
         ('stamp_ns', 'received_ns', 'value'), lambda column: column[when < 150.0]))), config)
-    fit, value, sigma = left_by_odometer(leg, config)
+    fit, value, sigma = odometer_residuals(leg, config)
     absent = fit.state.t[1:] > 152.0
     assert absent.sum() > 20
     assert np.isnan(value[absent]).all()

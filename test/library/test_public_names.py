@@ -21,7 +21,7 @@ SIGNATURES = {
                 'heading_sigma=None, progress=None, **options)',
     'plan': '(*, distance=None, speed=None, turns=None, standstill=None, acceleration=1.0, '
             'scenario=None, duration=None, gpx=None, bag=None, topics=None, config=None, '
-            '**figures)',
+            '**errors)',
     'compare': '(*calibrations)'}
 METHODS = {
     'to_dict': '(self)', 'to_frame': '(self)', 'residuals': '(self)', 'trajectory': '(self)',

@@ -128,7 +128,8 @@ def test_the_replay_command_gives_the_start_mark_to_a_microsecond_on_any_clock(s
     *_, leg = shlex.split(replay_command("/a b/it's", start_ns))
     span = parse_leg(leg)
     assert span.stop_ns is None
-    assert span.relative == (False, False)
+    assert not span.start_is_relative
+    assert not span.stop_is_relative
     assert 0 <= start_ns - span.start_ns < 1000
 
 

@@ -49,13 +49,13 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
     Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
 
     By name, (n, 6), three residuals and their sigmas; NaN: no data. For each interval, at its end:
-    ``left_odometer`` forward, left, up, m; ``left_gyro`` and ``left_accelerometer``, means in b,
-    rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s: east, north, up, m,
-    without the time-correlated error. Single precision, to save memory.
+    ``residual_odometer`` forward, left, up, m; ``residual_gyro`` and ``residual_accelerometer``,
+    means in b, rad/s and m/s^2. ``residual_fix``, for each fix used, at ``residual_fix_t``, s:
+    east, north, up, m, without the time-correlated error. Single precision, to save memory.
     """
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
-    return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
-            for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.used_fixes]}
+    return {f'residual_{name}': np.concatenate(pair, axis=1).astype(np.float32)
+            for name, pair in rows.items()} | {'residual_fix_t': leg.t_fix[problem.used_fixes]}
 
 
 def correlation(t: Floats, residual: Floats) -> float:
