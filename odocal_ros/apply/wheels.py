@@ -44,7 +44,7 @@ class Wheels:
         self._vehicle, self._notes = vehicle, notes
         self._reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
-        self._has_two_topics = config.odometer.own_topics
+        self._has_two_topics = config.odometer.has_two_topics
         self._waiting: list[Rows] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
         self.zero_ns = 0

@@ -148,10 +148,10 @@ class Bag:
             return
         count = self.topics[topic].count
         if not row_count:
-            raise BadData(f'{topic}: none of its {count} messages can be used: {reader.trouble}')
+            raise BadData(f'{topic}: none of its {count} messages can be used: {reader.error}')
         self._reader_notes.append(Reason(
             Code.BAD_ROWS_DROPPED, f'{reader.unreadable} of {count} messages of {topic} were '
-            f'skipped: {reader.trouble}'))
+            f'skipped: {reader.error}'))
 
     def messages(self, topic: str) -> Iterator[tuple[int, object]]:
         """Yield (bag time ns, deserialised message) of a topic; empty without that topic."""

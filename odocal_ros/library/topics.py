@@ -101,7 +101,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     if slot in ('odometer', 'odometer_right'):
         fitting = [name for name in fitting if not _contains(name, COMMANDS)]
         fitting = without_estimates(fitting)
-        if config.odometer.own_topics:
+        if config.odometer.has_two_topics:
             fitting = [name for name in fitting if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input

@@ -58,12 +58,12 @@ class Journal:
         self._ended = False              # its samples are complete
         self._last_event = ''            # event of its last stored status
         self._dropped: set[int] = set()  # legs reported as dropped
-        self._reported = ''              # the logged trouble
+        self._reported = ''              # the logged error
 
     @property
-    def trouble(self) -> str:
+    def error(self) -> str:
         """Return the explanation why the leg cannot be written, empty if it can."""
-        return self._writer.trouble if self._limit else ''
+        return self._writer.error if self._limit else ''
 
     @property
     def folder(self) -> str:
@@ -92,8 +92,8 @@ class Journal:
         if self._ended and not is_busy:
             self._leg_id, self._ended = 0, False
             self._writer.submit(self._writer.finish)
-        if self.trouble != self._reported:
-            self._reported = self.trouble
+        if self.error != self._reported:
+            self._reported = self.error
             if self._reported:
                 self._log.warning(f'the journal cannot be written: {self._reported}')
 

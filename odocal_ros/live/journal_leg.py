@@ -105,16 +105,16 @@ class JournalPlan:
 
 class LegJournal:
     """
-    Writes the journal of one leg; ``trouble`` is the cause while writing fails, else empty.
+    Writes the journal of one leg; ``error`` is the cause while writing fails, else empty.
 
     Chunks that cannot be written wait in memory for the next attempt. Above WAITING_BYTES the
-    journal ends with the data written so far, and the trouble stays.
+    journal ends with the data written so far, and the error stays.
     """
 
     def __init__(self, plan: JournalPlan, channels: dict[int, Channel],
                  chunks: list[PackedChunk]) -> None:
         self.plan = plan
-        self.trouble = ''
+        self.error = ''
         self._channels = channels
         self._waiting = chunks        # the pre-roll is written with the start mark, not before
         self._bag: SegmentedBag | None = None
@@ -134,9 +134,9 @@ class LegJournal:
         self._waiting += chunks
         if self._waiting:
             self._attempt(self._write)
-        if self.trouble and not self._is_closed and sum(
+        if self.error and not self._is_closed and sum(
                 chunk.size for chunk in self._waiting) > WAITING_BYTES:
-            self._give_up(f'{self.trouble}; no further attempt in this leg')
+            self._give_up(f'{self.error}; no further attempt in this leg')
 
     def finish(self) -> None:
         """Join the files to one complete bag."""
@@ -167,7 +167,7 @@ class LegJournal:
     def _add_late(self) -> None:
         assert self._bag is not None
         self._bag.add(self.late)
-        self.late, self.trouble = [], ''
+        self.late, self.error = [], ''
 
     def _write(self) -> None:
         if self._bag is None:
@@ -207,16 +207,16 @@ class LegJournal:
         used_bytes = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
         self._bag.finish(free_bytes=self.plan.limit - used_bytes - HEADS_BYTES)
 
-    def _give_up(self, trouble: str) -> None:
-        self.trouble, self._is_closed, self._waiting = trouble, True, []
+    def _give_up(self, error: str) -> None:
+        self.error, self._is_closed, self._waiting = error, True, []
 
     def _attempt(self, write: Callable[[], object]) -> None:
         try:
             write()
         except OSError as error:
             where = error.filename or self.plan.root
-            self.trouble = (f'{where}: {error.strerror or error}; free disk space or set '
-                            'output.directory to a writable folder')
+            self.error = (f'{where}: {error.strerror or error}; free disk space or set '
+                          'output.directory to a writable folder')
         else:
             if not self._is_closed:
-                self.trouble = ''
+                self.error = ''

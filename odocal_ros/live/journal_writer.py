@@ -71,11 +71,11 @@ class JournalWriter:
     """
     The jobs of the journal's thread; other threads call only ``submit`` and ``close``.
 
-    Any thread may read ``trouble`` (why writing fails) and ``folder`` of the newest leg.
+    Any thread may read ``error`` (why writing fails) and ``folder`` of the newest leg.
     """
 
     def __init__(self) -> None:
-        self.trouble = self.folder = ''
+        self.error = self.folder = ''
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}            # topic -> channel
         self._counts: dict[str, int] = {}             # topic -> messages packed
@@ -104,14 +104,14 @@ class JournalWriter:
                 job(*values)
             except Exception as error:  # a journal error must not stop a calibration
                 self._leg = None
-                self.trouble = ('internal error, please report it: '
-                                f'{type(error).__name__}: {error}')
+                self.error = ('internal error, please report it: '
+                              f'{type(error).__name__}: {error}')
             else:
                 self._show()
 
     def _show(self) -> None:
         if self._leg is not None:
-            self.trouble, self.folder = self._leg.trouble, self._leg.folder
+            self.error, self.folder = self._leg.error, self._leg.folder
 
     # jobs
 
@@ -125,7 +125,7 @@ class JournalWriter:
         for leg in self._closed.values():     # a mark that drops a leg must reach its journal
             if leg.late:
                 leg.retry()
-                self.trouble = leg.trouble
+                self.error = leg.error
         if self._leg is not None:
             self._leg.put(chunks * self._is_recording + ([self._packed(marks)] if marks else []))
 
@@ -148,7 +148,7 @@ class JournalWriter:
         if leg_id in self._closed:
             leg = self._closed[leg_id]
             leg.add([self._packed(marks)])
-            self.trouble = leg.trouble
+            self.error = leg.error
 
     def finish(self) -> None:
         """Close the journal of the open leg and join its files."""

@@ -159,8 +159,8 @@ class LegCompletion:
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
             stage=self._computing.stage, saved=self._saver.saved, lost_leg=self._lost_leg_text(),
-            save_trouble=self._saver.trouble, journal=self._journal.folder,
-            journal_trouble=self._journal.trouble, has_received=recording.has_received(),
+            save_error=self._saver.error, journal=self._journal.folder,
+            journal_error=self._journal.error, has_received=recording.has_received(),
             is_local=recording.is_local, has_imu=not inputs.without_imu)
 
     def show_status(self) -> None:
@@ -239,14 +239,14 @@ class LegCompletion:
             session.carried, session.is_automatic, self._computing.report),
             self._handle_leg_result)
 
-    def _fail(self, trouble: str) -> None:
+    def _fail(self, error: str) -> None:
         """Report that the computation of a leg, or the publication of its result, failed."""
         if self.session.state is State.COMPUTING:      # else the result is available
-            self.session.fail(trouble)
-        self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
+            self.session.fail(error)
+        self._log.error(f'leg {self.session.leg_id} failed: {error}')
         remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
                   'it') if self.session.has_open_leg else 'call ~/reset'
-        self._computing.answer(False, f'failed: {trouble}; {remedy}')
+        self._computing.answer(False, f'failed: {error}; {remedy}')
 
     def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
         leg_id, self._snapshot, self._view_at_stop = self.session.leg_id, None, None

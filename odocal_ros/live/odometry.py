@@ -91,7 +91,7 @@ class OdometryNode(CheckedNode):
         for text in vehicle.assumptions:
             self.get_logger().warning(text)
         self._odometry = Odometry(vehicle, self.config)
-        wheels = WHEELS[:2] if self.config.odometer.own_topics else WHEELS[:1]
+        wheels = WHEELS[:2] if self.config.odometer.has_two_topics else WHEELS[:1]
         self._inputs = {slot: Input(self, slot, types_of(slot, self.config.odometer))
                         for slot in ('imu', *wheels)}
         params.check_qos(self, (source.topic for source in self._inputs.values()))

@@ -85,10 +85,10 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'not_observable': '; '.join(known.not_observable) if known else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
-        'saved': view.saved, 'save_trouble': view.save_trouble, 'lost': view.lost_leg,
+        'saved': view.saved, 'save_error': view.save_error, 'lost': view.lost_leg,
         'automatic': _automatic(view), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
-        'journal': view.journal, 'journal_trouble': view.journal_trouble,
+        'journal': view.journal, 'journal_error': view.journal_error,
         'computing_stage': stage.name, 'computing_passes': stage.passes,
         'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done,
     } | quantities.status_keys(ok) | status_keys(view.forecast, view.forecast_age_s)
@@ -128,7 +128,7 @@ def level(view: SessionView) -> Any:
     unused = view.session.unused_reason
     has_warning = (
         state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
-        or view.missing or view.clocks or view.journal_trouble or view.save_trouble
+        or view.missing or view.clocks or view.journal_error or view.save_error
         or view.lost_leg or view.faults or view.duplicate_publishers or _changes(view.session)
         or unused and unused.code not in SHORT_MOVE_CODES)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
@@ -157,12 +157,12 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
     if view.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {view.restored}'
     within_limits = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
-    troubles = [f'{statement}: {trouble}' for statement, trouble in (
-        ('the result is not saved', view.save_trouble),
-        ('the journal cannot be written', view.journal_trouble)) if trouble]
+    errors = [f'{statement}: {error}' for statement, error in (
+        ('the result is not saved', view.save_error),
+        ('the journal cannot be written', view.journal_error)) if error]
     return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.lost_leg,
                                    hint, _unused(session), *view.duplicate_publishers,
-                                   losses_text(view.lost_messages), *troubles)))
+                                   losses_text(view.lost_messages), *errors)))
 
 
 def _changes(session: Session) -> list[str]:

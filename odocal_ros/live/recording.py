@@ -66,7 +66,7 @@ class Inputs:
         """Return the topics without which no leg can be started."""
         has_surveyed_ends = config.reference.start and config.reference.end
         slots = ['imu'] * (not self.without_imu) + ['odometer']
-        slots += ['odometer_right'] * config.odometer.own_topics
+        slots += ['odometer_right'] * config.odometer.has_two_topics
         slots += [] if has_surveyed_ends else ['fix']
         slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
         return [self.by_slot[slot] for slot in slots if slot in self.by_slot]

@@ -156,12 +156,12 @@ class ResultSaver:
     """
     Writes results into new folders by the worker, and answers with the folder or the error.
 
-    show : called when ``saved`` (the newest folder that is not withdrawn) or ``trouble`` (error of
+    show : called when ``saved`` (the newest folder that is not withdrawn) or ``error`` (error of
     the newest save) has changed.   node : full name, for the default folder.
     """
 
     def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
-        self.saved = self.trouble = ''
+        self.saved = self.error = ''
         self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
@@ -185,7 +185,7 @@ class ResultSaver:
             self._saves_running -= 1
             if error is None:
                 folder, unchanged_reason = outcome
-                self.saved, self.trouble = str(folder), ''
+                self.saved, self.error = str(folder), ''
                 if unchanged_reason and by_operator:
                     self._not_latest = calibration
                 text = f'saved to {folder}'
@@ -194,8 +194,8 @@ class ResultSaver:
                              f'{" again" * by_operator} to point it to this result anyway')
                 future.set_result((True, text))
             else:
-                self.trouble = answers.error_line(error)
-                future.set_result((False, f'not saved: {self.trouble}'))
+                self.error = answers.error_line(error)
+                future.set_result((False, f'not saved: {self.error}'))
             log = self._log.info if error is None else self._log.warning
             log(future.result()[1])
             self._show()
@@ -252,7 +252,7 @@ class ResultSaver:
 
     def withdraw(self, since_ns: int) -> None:
         """Move ``latest`` and ``saved`` back to the newest result of legs before ``since_ns``."""
-        self.trouble = ''
+        self.error = ''
 
         def on_done(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)

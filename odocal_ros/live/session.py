@@ -263,9 +263,9 @@ class SessionView:
     stage: Stage = Stage()                      # progress of the computation
     saved: str = ''                             # folder of the newest saved result
     lost_leg: str = ''                          # text on a leg that was dropped automatically
-    save_trouble: str = ''                      # why the newest result is not saved
+    save_error: str = ''                        # why the newest result is not saved
     journal: str = ''                           # folder of the newest leg's journal
-    journal_trouble: str = ''                   # why it cannot be written
+    journal_error: str = ''                     # why it cannot be written
     has_received: bool = True                   # any message on any topic so far
     is_local: bool = False                      # positions are in a local frame
     has_imu: bool = True                        # it is needed or published

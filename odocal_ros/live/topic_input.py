@@ -89,7 +89,7 @@ class Input:
         self.msgtype = ''
         self.reader: Reader | None = None
         self.health = Health()
-        self.trouble = ''      # why the topic or its last messages cannot be used
+        self.error = ''      # why the topic or its last messages cannot be used
         self.plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
         self.frame = ''        # frame_id of the IMU's messages, once one has come
         self.publishers: list[TopicEndpointInfo] = []
@@ -145,7 +145,7 @@ class Input:
                 'mixed; stop all but one')
 
     def find_type(self, config: Config) -> None:
-        """Find the message type and subscribe; an error is logged and stored in ``trouble``."""
+        """Find the message type and subscribe; an error is logged and stored in ``error``."""
         if self.reader is not None:
             return
         published = [p.topic_type for p in self.publishers[:1]]
@@ -153,10 +153,10 @@ class Input:
             for msgtype in self.allowed if len(self.allowed) == 1 else published:
                 self.subscribe(msgtype, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
-            trouble = error_text(error)
-            if trouble != self.trouble:
-                self._node.get_logger().error(trouble)
-            self.trouble = trouble
+            text = error_text(error)
+            if text != self.error:
+                self._node.get_logger().error(text)
+            self.error = text
 
     def subscribe(self, msgtype: str, config: Config) -> None:
         """Create the reader and the subscription; raise OdocalError for a wrong type."""
@@ -178,7 +178,7 @@ class Input:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
         self._deserialize = partial(deserialize_message, message_type=kind)
         self.waiting.subscribe(kind, self.name, qos)
-        self.reader, self.msgtype, self.trouble = reader, msgtype, ''
+        self.reader, self.msgtype, self.error = reader, msgtype, ''
         if isinstance(reader, TransformReader):
             self.static = StaticTransforms(self._node, self.topic, kind, reader.static)
         self._node.get_logger().info(
@@ -243,11 +243,11 @@ class Input:
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node
             self._failed += len(raws)
-            self.trouble = f'{self.topic}: {error_text(error)}'
+            self.error = f'{self.topic}: {error_text(error)}'
             pairs = []
         self.health.unusable = self._failed + reader.unreadable
-        if not pairs and reader.trouble:
-            self.trouble = f'{self.topic}: {reader.trouble}'
+        if not pairs and reader.error:
+            self.error = f'{self.topic}: {reader.error}'
         return pairs
 
     @property
@@ -263,8 +263,8 @@ class Input:
         if self.is_flowing():
             return ''
         silent = self.health.silent_s(time.monotonic_ns())
-        if self.trouble:
-            return self.trouble
+        if self.error:
+            return self.error
         if self.health.stampless:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:

@@ -43,7 +43,7 @@ class RowReader(Protocol):
     """What a bag calls with the messages of a topic: a ``Reader``, or a collector."""
 
     unreadable: int
-    trouble: str
+    error: str
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs: ...
@@ -54,14 +54,14 @@ class Reader:
     Reads the messages of one topic into samples; block sizes have no effect.
 
     ``unreadable`` counts messages without a row (damaged, or without the selected wheel);
-    ``trouble`` is the reason for the last of them.
+    ``error`` is the reason for the last of them.
     """
 
     def __init__(self, slot: str, msgtype: str, plan: SensorPlan | OdometerPlan) -> None:
         self.slot = slot
         self.msgtype = msgtype
         self.unreadable = 0
-        self.trouble = ''
+        self.error = ''
         self.frames: FrameFilter | None = None      # of an IMU
         self.by_arrival = False      # the stamps of the messages are not used
         self._plan = plan
@@ -82,7 +82,7 @@ class Reader:
     @property
     def wheels(self) -> tuple[str, ...]:
         """Return the keys (joints, indices) of the odometer values, in order."""
-        return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
+        return self._plan.wheel_keys if isinstance(self._plan, OdometerPlan) else ()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
@@ -178,7 +178,7 @@ class Reader:
             paths = column.find_paths(layout)
             value = layout.columns(table, paths) if paths else None
             if value is None:
-                self._count_unreadable(len(table), self._plan.missing(layout))
+                self._count_unreadable(len(table), self._plan.missing_reason(layout))
                 return None
             values.append(np.asarray(value, column.dtype))
         return values
@@ -194,7 +194,7 @@ class Reader:
                 self.unreadable += k
                 return k
             if view is not None:
-                self.trouble = self._plan.missing(view)
+                self.error = self._plan.missing_reason(view)
         self.unreadable += len(raws)
         return len(raws)
 
@@ -208,8 +208,8 @@ class Reader:
             reason = f'too short or damaged from {field} on' if field else (
                 'too short or damaged' if isinstance(error, struct.error | ValueError | IndexError)
                 else ' '.join(str(error).split())[:200])
-            self.trouble = (f'a message of {len(raw)} bytes cannot be read as {self.msgtype}: '
-                            f'{reason}')
+            self.error = (f'a message of {len(raw)} bytes cannot be read as {self.msgtype}: '
+                          f'{reason}')
             return None
 
     def _read_into_row(self, arrays: list[NDArray[Any]], i: int, raw: bytes,
@@ -227,7 +227,7 @@ class Reader:
         except (AttributeError, LookupError, TypeError, ValueError):
             values = [None]
         if any(value is None for value in values):
-            self._count_unreadable(1, self._plan.missing(view))
+            self._count_unreadable(1, self._plan.missing_reason(view))
             return False
         for target, value in zip(arrays, values, strict=True):
             target[i] = value
@@ -235,7 +235,7 @@ class Reader:
 
     def _count_unreadable(self, count: int, reason: str) -> None:
         self.unreadable += count
-        self.trouble = reason
+        self.error = reason
 
 
 def make_reader(slot: str, msgtype: str, config: Config) -> Reader:

@@ -171,7 +171,7 @@ class SensorPlan:
         """Return True: no column depends on the content of the first message."""
         return True
 
-    def missing(self, view: View) -> str:
+    def missing_reason(self, view: View) -> str:
         return 'a message is incomplete'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:

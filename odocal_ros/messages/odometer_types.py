@@ -11,7 +11,6 @@ wheel, and their meaning.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral
-import re
 from typing import Any
 
 import numpy as np
@@ -47,8 +46,10 @@ class OdometerPlan:
 
     Some of it is determined by the first message (does a JointState have positions? which of its
     joints are wheels? is a field of an unknown type an integer?): ``complete`` is called with
-    messages in order until it returns True. ``keys`` are the wheels in a message, joint names or
-    indices; ``form`` is the meaning of their values.
+    messages in order until it returns True.
+
+    wheel_keys : the wheels in a message, joint names or indices; ('',) for a single value.
+    columns    : the values to read, () until the plan is complete.   form : their meaning.
     """
 
     has_readings = True      # messages can be read as plain numbers
@@ -57,28 +58,26 @@ class OdometerPlan:
         self.slot, self.msgtype, self.odometer = slot, msgtype, config.odometer
         self.is_known_type = msgtype in DEFAULT_FIELD
         self.field = config.odometer.field or DEFAULT_FIELD.get(msgtype, '')
-        self.keys = _wheel_keys(slot, config)
+        self.wheel_keys = _configured_wheels(slot, config)
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
-        self.unclear_reason = ''        # reason why the last message did not determine the wheels
+        self._unclear_reason = ''       # why the last message did not determine the wheels
         self._check_settings()
-        has_key = _split_key(self.field)[1] or self.keys[0]
-        self.selects_wheels = self._is_list() and not has_key
+        has_key = _split_key(self.field)[1] or self.wheel_keys[0]
+        self._selects_wheels = self._is_list() and not has_key
+        self._fields: tuple[str, ...] = (self.field,)      # the first one with values is used
         if msgtype == JOINTS and not self.field:
-            self.fields: tuple[str, ...] = {
-                'auto': ('position', 'velocity'), 'rate': ('velocity',)}.get(
+            self._fields = {'auto': ('position', 'velocity'), 'rate': ('velocity',)}.get(
                 self.odometer.quantity, ('position',))
-        else:
-            self.fields = (self.field,)
         if self.is_known_type:
-            self.form = self._odometer_form(self.fields[0])
-            if len(self.fields) == 1 and not self.selects_wheels:
-                self._set_columns(self.field or self.fields[0])
+            self.form = self._form_of(self._fields[0], self._value_type(self._fields[0]))
+            if len(self._fields) == 1 and not self._selects_wheels:
+                self._set_columns(self._fields[0])
 
     def _check_settings(self) -> None:
         """Raise an error for settings that must fail, before the first message."""
-        if not self.is_known_type and not self.field and len(self.keys) < 2:
+        if not self.is_known_type and not self.field and len(self.wheel_keys) < 2:
             raise BadData(
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
                 f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
@@ -88,12 +87,12 @@ class OdometerPlan:
                             'twist.linear.x, data[0] or position[joint]')
         if not self.is_known_type:
             return
-        kinds = _value_types(self.msgtype)
+        types = _value_types(self.msgtype)
         base, key = _split_key(self.field)
-        if self.field and base not in kinds:
+        if self.field and base not in types:
             raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; values: '
-                          f'{", ".join(kinds)}')
-        has_several_wheels = len(self.keys) > 1
+                          f'{", ".join(types)}')
+        has_several_wheels = len(self.wheel_keys) > 1
         if has_several_wheels and not self._is_list():
             raise BadConfig(f'odometer.wheels: {self.msgtype} holds one value ({self.field}); '
                             "use 'topic' for odometer.left and odometer.right on two topics")
@@ -114,11 +113,11 @@ class OdometerPlan:
             assert isinstance(view, MessageView)
             self._complete_unknown_type(view)
             return True
-        for field in self.fields:
-            if self.selects_wheels and view.count(field):
+        for field in self._fields:
+            if self._selects_wheels and view.count(field):
                 self._select_wheels(field, view)
                 return bool(self.columns)
-            if not self.selects_wheels and self._paths_of_wheel(field, self.keys[0])(view):
+            if not self._selects_wheels and self._paths_of_wheel(field, self.wheel_keys[0])(view):
                 self._set_columns(field)
                 return True
         return False
@@ -127,25 +126,23 @@ class OdometerPlan:
         """Select the wheels among the values of a list, by their names."""
         choice = select_wheels(view.names, view.count(field))
         if isinstance(choice, str):
-            self.unclear_reason = choice
+            self._unclear_reason = choice
             return
-        side = {'odometer_right': 'right'}.get(
-            self.slot, 'left' if self.odometer.own_topics else '')
-        if side:
-            key = key_on_side(choice, side)
-            if not key:
-                self.unclear_reason = choice.explanation
+        keys, is_right = choice.keys, self.slot == WHEELS[1]
+        if self.odometer.has_two_topics or is_right:      # one wheel in each topic
+            keys = (key_on_side(choice, 'right' if is_right else 'left'),)
+            if not keys[0]:
+                self._unclear_reason = choice.explanation
                 return
-            self.keys = (key,)
-        else:
-            self.keys = choice.keys
+        self.wheel_keys = keys
         self._set_columns(field)
-        self.form = replace(self.form, sides_known=choice.sides, selection_text=choice.explanation)
+        self.form = replace(self.form, sides_known=choice.sides_known,
+                            selection_text=choice.explanation)
 
     def _complete_unknown_type(self, view: MessageView) -> None:
         """Determine columns and meaning of an unknown type from its first message."""
         value = None
-        for key in self.keys:
+        for key in self.wheel_keys:
             path = self._path(self.field, key)
             try:
                 value = view.value(path)
@@ -158,31 +155,32 @@ class OdometerPlan:
         self.stamped = hasattr(view.message, 'header')
         self._set_columns(self.field, 'int64' if isinstance(value, Integral) else 'float64')
 
-    def _set_columns(self, field: str, kind: str = '') -> None:
-        """Set columns and form for a field; ``kind`` of unknown types is that of their values."""
-        self.form = self._odometer_form(field, kind)
-        is_integer = 'int' in (kind or self._kind(field))
-        dtype = np.int64 if is_integer else np.float64
+    def _set_columns(self, field: str, value_type: str = '') -> None:
+        """Set columns and form for a field; ``value_type`` is required for unknown messages."""
+        value_type = value_type or self._value_type(field)
+        self.form = self._form_of(field, value_type)
+        dtype = np.int64 if 'int' in value_type else np.float64
         self.columns = STAMP * self.stamped + tuple(
-            Column(dtype, 1, self._paths_of_wheel(field, key)) for key in self.keys)
+            Column(dtype, 1, self._paths_of_wheel(field, key)) for key in self.wheel_keys)
 
-    def _kind(self, field: str) -> str:
+    def _value_type(self, field: str) -> str:
+        """Return the type of the values of a field in a known message, such as 'int32'."""
         return _value_types(self.msgtype)[_split_key(field)[0]].split('[')[0]
 
-    def _odometer_form(self, field: str, kind: str = '') -> OdometerForm:
-        """Return the meaning of a field; ``kind``: type of its values in unknown messages."""
-        bits = 0
-        if self.is_known_type:
-            kind = self._kind(field)
-            bits = int(re.sub(r'\D', '', kind))      # such as 32 of uint32
-        is_integer = 'int' in kind
-        joint = self.msgtype == JOINTS and _split_key(field)[0] in ('position', 'velocity')
+    def _form_of(self, field: str, value_type: str) -> OdometerForm:
+        """Return the meaning of the values of a field."""
+        is_integer = 'int' in value_type
+        joint_field = _split_key(field)[0] if self.msgtype == JOINTS else ''
         quantity = self.odometer.quantity
         if quantity == 'auto':
-            quantity = 'cumulative' if is_integer or joint and 'position' in field else 'rate'
-        modulus = (self.odometer.wrap or (2**bits if bits else 0)) * (
-            is_integer and quantity == 'cumulative')
-        unit = 'm/rad' if joint else 'm/pulse' if is_integer or quantity != 'rate' else '1'
+            quantity = 'cumulative' if is_integer or joint_field == 'position' else 'rate'
+        modulus = 0
+        if is_integer and quantity == 'cumulative':
+            modulus = self.odometer.wrap
+            if not modulus and self.is_known_type:     # of others the width is not known
+                modulus = 2**(8 * np.dtype(cdr.NUMPY_TYPES[value_type]).itemsize)
+        unit = ('m/rad' if joint_field in ('position', 'velocity') else
+                'm/pulse' if is_integer or quantity != 'rate' else '1')
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
@@ -194,56 +192,57 @@ class OdometerPlan:
     def _paths_of_wheel(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
         """Return a function that returns the paths of a wheel's values in a message."""
         path = self._path(field, key)
-        base, side = _split_key(field)
+        base, key_of_field = _split_key(field)
         if not self.is_known_type or '[' not in _value_types(self.msgtype)[base]:
             return lambda view: (path,)
-        key = key or side        # not by parsing the path: a joint may have any name
+        key = key or key_of_field     # not by parsing the path: a joint may have any name
 
         def find_paths(view: View) -> Sequence[str] | None:
-            n = view.count(base)
-            names = view.names
-            index = names.index(key) if key in names else int(key) if key.isdigit() else n
-            return (f'{base}[{index}]',) if index < n else None
+            count, names = view.count(base), view.names
+            index = names.index(key) if key in names else int(key) if key.isdigit() else count
+            return (f'{base}[{index}]',) if index < count else None
         return find_paths
 
-    def missing(self, view: View) -> str:
+    def missing_reason(self, view: View) -> str:
         """Return the reason why a message has no value, as text."""
-        if self.unclear_reason and not self.columns:
-            return self.unclear_reason
-        required = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
+        if self._unclear_reason and not self.columns:
+            return self._unclear_reason
+        wheels = ' and '.join(key for key in self.wheel_keys if key)
+        required = wheels or self.field or 'any position'
         names = f'; names: {", ".join(view.names)}' if view.names else ''
         return f'no {required} in a {self.msgtype}{names}'
 
     @property
     def _slots(self) -> tuple[str, ...]:
-        return WHEELS[:len(self.keys)] if len(self.keys) > 1 else (self.slot,)
+        return WHEELS[:len(self.wheel_keys)] if len(self.wheel_keys) > 1 else (self.slot,)
 
     def readings(self, received_ns: Sequence[int], values: list[Any]
                  ) -> list[tuple[str, list[Reading]]]:
         """Return (slot, rows in plain numbers) from the values of each message."""
-        value_from = 2 * self.stamped
+        first_wheel = len(STAMP) * self.stamped      # columns before the values
         return [(slot, [
-            (row[0][0] * 10**9 + row[1][0] if value_from else received, received, row[wheel][0])
+            (row[0][0] * 10**9 + row[1][0] if self.stamped else received, received, row[wheel][0])
             for received, row in zip(received_ns, values, strict=True)])
-            for wheel, slot in enumerate(self._slots, value_from)]
+            for wheel, slot in enumerate(self._slots, first_wheel)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
+        """Return (slot, samples) of each wheel from the values of ``columns``."""
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
-        values = columns[2:] if self.stamped else columns
+        values = columns[len(STAMP) * self.stamped:]
         return [(slot, from_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
                 for slot, value in zip(self._slots, values, strict=True)]
 
 
-def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
+def _configured_wheels(slot: str, config: Config) -> tuple[str, ...]:
     """Return the keys of the wheels in one message; ('',) if none is configured."""
     odometer = config.odometer
-    keys, sides_setting = odometer.keys, (odometer.left, odometer.right)
-    if odometer.wheels and any(sides_setting):
+    keys, left_right = odometer.wheel_keys, (odometer.left, odometer.right)
+    if odometer.wheels and any(left_right):
         raise BadConfig('odometer.left and odometer.right are the wheels of odometer.wheels: set '
                         'only one of both')
-    if odometer.own_topics or not keys:
+    if odometer.has_two_topics or not keys:
         return ('',)
-    if not odometer.wheels and not all(sides_setting):
+    if not odometer.wheels and not all(left_right):
         raise BadConfig('odometer.left and odometer.right belong together: set both or neither')
     if len(set(keys)) < len(keys) or '' in keys or len(keys) > len(WHEELS):
         setting_name = 'odometer.wheels' if odometer.wheels else 'odometer.left and odometer.right'
@@ -254,8 +253,9 @@ def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
 
 def _value_types(msgtype: str) -> dict[str, str]:
     """Return path -> type of the numbers of a known message type."""
-    lines = (line.split() for line in cdr.SCHEMAS[msgtype])
-    return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
+    fields = (line.split() for line in cdr.SCHEMAS[msgtype])
+    return {path: field_type for field_type, path in fields
+            if not field_type.startswith(('string', 'dim'))}
 
 
 def _split_key(path: str) -> tuple[str, str]:

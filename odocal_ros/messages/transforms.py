@@ -94,7 +94,7 @@ class TransformReader(Reader):
         stamps, received, position = self._chain.pop_positions()
         self._has_position = self._has_position or len(stamps) > 0
         self.unreadable = self._damaged if self._has_position else self._messages
-        self.trouble = 'damaged messages' if self._has_position else self._missing_reason()
+        self.error = 'damaged messages' if self._has_position else self._missing_reason()
         return [('fix', self._build(stamps, received, position))] if len(stamps) else []
 
     def _read(self, raw: bytes, deserialize: Deserialize) -> list[Transform]:

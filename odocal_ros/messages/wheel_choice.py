@@ -31,10 +31,10 @@ LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
 
 @dataclass(frozen=True)
 class Choice:
-    """The selected values (joint names or indices), left before right if ``sides`` is true."""
+    """The selected values (joint names or indices), left before right if ``sides_known``."""
 
     keys: tuple[str, ...]
-    sides: bool
+    sides_known: bool
     explanation: str      # text for the user; '' if there was no choice
 
 
@@ -77,7 +77,8 @@ def key_on_side(choice: Choice, side: str) -> str:
     """Return the key of the wheel on one side, 'left' or 'right'; '' if sides are unknown."""
     if len(choice.keys) == 1:
         return choice.keys[0]
-    return choice.keys[side == 'right'] if choice.sides else ''
+    left, right = choice.keys
+    return (left if side == 'left' else right) if choice.sides_known else ''
 
 
 def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:

@@ -41,12 +41,12 @@ TWO_POINT_CODES = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARA
 
 
 class _TopicSamples:
-    """A reader that stores its samples; an error is stored in ``trouble``, for other topics."""
+    """A reader that stores its samples; an error is stored in ``error``, for other topics."""
 
     unreadable = 0      # as the bag sees it: one bad topic must not end the reading of the others
 
     def __init__(self, reader: Reader) -> None:
-        self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
+        self.reader, self.recorder, self.error = reader, LegRecorder(), ''
         has_list = reader.msgtype in wheel_survey.FIELDS
         self.values = wheel_survey.Values(reader.msgtype) if has_list else None
         self.form_by_fixes: OdometerForm | None = None
@@ -65,7 +65,7 @@ class _TopicSamples:
             for slot, block in self.reader.rows(raws, received_ns, deserialize):
                 self.recorder.feed(slot, block)
         except OdocalError as error:
-            self.trouble = str(error)
+            self.error = str(error)
         return []
 
 
@@ -93,7 +93,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     for facts in topics:
         if 'odometer' in facts:
             facts['odometer']['not_following'] = facts['name'] in not_following
-        if fixes and (fields := collectors.get(facts['name'])) and not fields.trouble:
+        if fixes and (fields := collectors.get(facts['name'])) and not fields.error:
             facts['fields'] = fields.facts(fixes)
     odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
     content = _bag_facts(bag, path) | {
@@ -178,19 +178,19 @@ def _static_readers(samples_by_topic: dict[str, _TopicSamples],
 
 
 def _topic_facts(bag: Bag, info: TopicInfo, topic_samples: _TopicSamples | None,
-                 trouble: str) -> dict[str, Any]:
+                 error: str) -> dict[str, Any]:
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
                              'rate_hz': survey.rate_of(info.count, seconds)}
     if topic_samples is None:
-        return facts | ({'trouble': trouble} if trouble else {})
+        return facts | ({'error': error} if error else {})
     reader, slot = topic_samples.reader, topic_samples.reader.slot
     rows = topic_samples.recorder.rows(slot)
-    trouble = topic_samples.trouble or (
-        f'{counted(reader.unreadable, "message")} skipped: {reader.trouble}'
+    error = topic_samples.error or (
+        f'{counted(reader.unreadable, "message")} skipped: {reader.error}'
         if reader.unreadable else '')
-    if trouble:
-        facts['trouble'] = trouble
+    if error:
+        facts['error'] = error
     if not len(rows.stamp_ns):
         return facts
     schema = cdr.SCHEMAS.get(info.msgtype)

@@ -244,9 +244,9 @@ def _topic_reasons(content: dict[str, Any], mapping: dict[str, str],
                 code, f'{", ".join(empty)} has no messages', NO_MESSAGES_REMEDY) if empty else
                 Reason(code, f'no topic for the {word}',
                        f'Record it, or name it with --{slot}-topic.'))
-        elif 'trouble' in facts and 'timing' not in facts:
+        elif 'error' in facts and 'timing' not in facts:
             reasons.append(Reason(
-                code, f'{facts["name"]}: no message can be used: {facts["trouble"]}',
+                code, f'{facts["name"]}: no message can be used: {facts["error"]}',
                 'Check the type and the driver of the topic, or name another topic.'))
     return reasons
 

@@ -25,7 +25,7 @@ def text(content: dict[str, Any]) -> str:
     roles = {topic: slot for slot, topic in content['mapping'].items()}
     blocks = [_head(content), _topics(content, roles)]
     blocks += [_details(topic, roles) for topic in content['topics']
-               if {'timing', 'motions', 'fields', 'trouble'} & topic.keys()]
+               if {'timing', 'motions', 'fields', 'error'} & topic.keys()]
     blocks += [_drive(content), _findings(content), _command(content)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
@@ -166,7 +166,7 @@ STATEMENTS: dict[str, Callable[[dict[str, Any], Any], Iterable[str]]] = {
     'fields': _field_statements, 'imu': _imu_statements, 'chosen': lambda _topic, chosen: [chosen],
     'motions': lambda _topic, motions: motions, 'odometer': _odometer_statements,
     'fix': _fix_statements, 'timing': _timing_statements,
-    'trouble': lambda _topic, trouble: [trouble]}
+    'error': lambda _topic, error: [error]}
 
 
 def _drive(content: dict[str, Any]) -> list[str]:

@@ -50,7 +50,7 @@ class Fields:
     unreadable = 0       # an unreadable topic is no error
 
     def __init__(self, count: int) -> None:
-        self.count, self.trouble = count, ''
+        self.count, self.error = count, ''
         self.paths: list[str] = []
         self.is_integer: list[bool] = []
         self._stride, self._messages_seen, self._times, self._values = 1, 0, array('q'), array('d')
@@ -62,7 +62,7 @@ class Fields:
         first = -self._messages_seen % self._stride
         self._messages_seen += len(raws)
         k = first
-        while k < len(raws) and not self.trouble:
+        while k < len(raws) and not self.error:
             self._take(raws[k], int(received_ns[k]), deserialize)
             k += self._stride
         return []
@@ -74,7 +74,7 @@ class Fields:
                 self._find_fields(view.message)
             values = [float(view.value(path)) for path in self.paths]
         except OdocalError as error:
-            self.trouble = str(error)
+            self.error = str(error)
         except MemoryError:
             raise
         except Exception:    # a damaged message, or one with a shorter list

@@ -33,7 +33,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     not_following : odometer topics that do not follow the path of the fixes, while another does.
     """
     chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
-    if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
+    if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
             pair := _left_right_pair(topics, [
                 t for t in candidates(topics, 'odometer', config, chosen)
                 if t not in not_following])):

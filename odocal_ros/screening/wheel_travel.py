@@ -191,7 +191,7 @@ def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, 
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
     samples, t = rows(slots[0])
-    if len(slots) == 1 and len(config.odometer.keys) > 1 and len(t):
+    if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
         reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                               'marks: only the left wheel is used'))
     wheels = [_corrected_travel(samples, t, leg.form, config, reasons, names[0])]

@@ -91,25 +91,26 @@ class OdometerConfig:
                                  'right wheel; 0: unknown.')
 
     @property
-    def keys(self) -> tuple[str, ...]:
+    def wheel_keys(self) -> tuple[str, ...]:
         """Return the configured keys of the wheels, () if they are selected by name."""
         return self.wheels or tuple(filter(None, (self.left, self.right)))
 
     @property
-    def own_topics(self) -> bool:
+    def has_two_topics(self) -> bool:
         """Return True if the left and the right wheel have a topic each."""
         return 'topic' in (self.left, self.right)
 
     @property
     def needs_imu(self) -> bool:
         """Return False for several wheels, which are sufficient on a level floor."""
-        return len(self.keys) < len(SIDES) and self.drive == DIFFERENTIAL
+        return len(self.wheel_keys) < len(SIDES) and self.drive == DIFFERENTIAL
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of ``count`` wheels in texts and results: '' for a single one."""
         if count <= len(SIDES):
             return SIDES if count == len(SIDES) else ('',)
-        return self.keys if len(self.keys) == count else tuple(map(str, range(1, count + 1)))
+        keys = self.wheel_keys
+        return keys if len(keys) == count else tuple(str(k) for k in range(1, count + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,8 +279,8 @@ class Config:
     @property
     def inputs(self) -> tuple[str, ...]:
         """Return the inputs that these settings use, including optional ones."""
-        used = {'odometer_right': self.odometer.own_topics, 'fix_velocity': self.gnss.use_velocity,
-                'pressure': self.imu.use_pressure,
+        used = {'odometer_right': self.odometer.has_two_topics,
+                'fix_velocity': self.gnss.use_velocity, 'pressure': self.imu.use_pressure,
                 'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
         return tuple(slot for slot in TOPICS if used.get(slot, True))
 

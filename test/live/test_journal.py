@@ -143,12 +143,12 @@ def test_no_message_is_lost_by_a_temporarily_full_disk_or_the_end_of_the_node(pl
     # simulates a full disk: no file may exceed some bytes
     resource.prlimit(leg.node.process.pid, resource.RLIMIT_FSIZE, (100, limit[1]))
     leg.play(10, 40)
-    status = wait_for(lambda: client.status['journal_trouble'] and client.status, 'the warning')
-    assert 'File too large' in status['journal_trouble']
+    status = wait_for(lambda: client.status['journal_error'] and client.status, 'the warning')
+    assert 'File too large' in status['journal_error']
     assert status['level'] == b'\x01'
     resource.prlimit(leg.node.process.pid, resource.RLIMIT_FSIZE, limit)
     leg.play(40, 45)
-    wait_for(lambda: not client.status['journal_trouble'], 'the end of the warning')
+    wait_for(lambda: not client.status['journal_error'], 'the end of the warning')
     assert leg.node.end() == 0
     assert (journal / f'{journal.name}_0.mcap').exists()
     assert set(np.diff(stamps_of(journal, '/imu/data'))) == {50_000_000}

@@ -42,11 +42,11 @@ def driven(root):
     logged = []
     for k in range(CHUNKS):
         one.put([chunk(k)])
-        logged.append(one.trouble)
+        logged.append(one.error)
     one.finish()
-    logged.append(one.trouble)
+    logged.append(one.error)
     one.add([chunk(CHUNKS)])
-    return one, [*logged, one.trouble]
+    return one, [*logged, one.error]
 
 
 def chunk(k):
@@ -88,7 +88,7 @@ def test_one_failed_disk_operation_loses_no_message(tmp_path, monkeypatch):
         assert found in (expected_times, expected_times[:-2]), (step, name)
         one.retry()
         assert sorted(set(times(one.folder))) == expected_times, (step, name)
-        assert one.trouble == '' or found == expected_times, (step, name)
+        assert one.error == '' or found == expected_times, (step, name)
         folders = os.listdir(tmp_path / str(step))
         assert len(folders) == 1, folders
         assert not [n for n in os.listdir(one.folder) if n.endswith('.part')], name
@@ -128,11 +128,11 @@ def test_a_missing_folder_is_reported_and_used_again_when_it_is_back(tmp_path, w
     away = tmp_path / 'away'
     folder.rename(away)
     one.put([chunk(1)])
-    assert 'No such file or directory' in one.trouble
-    assert NAME in one.trouble
+    assert 'No such file or directory' in one.error
+    assert NAME in one.error
     away.rename(folder)
     one.put([chunk(2)])
-    assert one.trouble == ''
+    assert one.error == ''
     one.finish()
     assert times(one.folder) == times_of(*range(3))
 
@@ -144,7 +144,7 @@ def test_two_nodes_with_one_folder_write_separate_journals(tmp_path):
             one.put([chunk(10 * n + k)])
     for one in both:
         one.finish()
-        assert one.trouble == ''
+        assert one.error == ''
     assert [times(one.folder)[0] for one in both] == [0, 10 * SECOND]
     assert sorted(os.listdir(tmp_path)) == [NAME, f'{NAME}-2']
 
@@ -208,7 +208,7 @@ def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
         for k in range(5):
             one.put([large(k)])
         one.finish()
-        assert one.trouble == ''
+        assert one.error == ''
     assert len(taken) == 4 * (5 + 1 + 1)
     assert 900_000 < max(taken) <= limit
     assert [f.name for f in journal_folders(tmp_path)][-1] == 'leg_4'
@@ -220,7 +220,7 @@ def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypat
     one = journal(tmp_path, limit=500_000)
     for k in range(20):
         one.put([large(k)])
-    assert 'raise journal.max_bytes' in one.trouble
+    assert 'raise journal.max_bytes' in one.error
     one.finish()
     folder, = journal_folders(tmp_path)
     assert folder_size(folder) <= 500_000
@@ -238,7 +238,7 @@ def test_unwritten_data_waits_in_memory_up_to_a_limit(tmp_path, monkeypatch):
         Refusing(1, for_ever=True).put_in(patch)
         for k in range(1, 6):
             one.put([large(k)])
-    assert 'no further attempt in this leg' in one.trouble
+    assert 'no further attempt in this leg' in one.error
     assert not one._waiting
     one.put([large(6)])                # an early end is better than a gap
     one.finish()

@@ -69,11 +69,11 @@ def test_a_read_only_folder_is_reported_and_used_once_it_is_writable(
     node = start({'output.directory': folder} | QUICK, before=OBEY)
     client = connect()
     leg(driven, [node], [client])
-    status = wait_for(lambda: client.status['save_trouble'] and client.status, 'the warning')
-    assert 'Permission denied' in status['save_trouble']
-    assert str(folder) in status['save_trouble']
-    assert 'Permission denied' in status['journal_trouble']
-    assert 'output.directory' in status['journal_trouble']
+    status = wait_for(lambda: client.status['save_error'] and client.status, 'the warning')
+    assert 'Permission denied' in status['save_error']
+    assert str(folder) in status['save_error']
+    assert 'Permission denied' in status['journal_error']
+    assert 'output.directory' in status['journal_error']
     assert status['level'] == b'\x01'
     for words in ('the journal cannot be written: ', 'the result is not saved: '):
         assert words in status['message']
@@ -83,14 +83,14 @@ def test_a_read_only_folder_is_reported_and_used_once_it_is_writable(
     assert list(folder.iterdir()) == []
     # no warning if no journal is required
     assert client.set(journal__max_bytes=0).successful
-    client.until(journal='', journal_trouble='')
+    client.until(journal='', journal_error='')
     folder.chmod(0o755)
     answer = client.call('save')
     assert answer.success, answer.message
     one, = results(folder)
     assert true(whole_content(one))
     assert (folder / 'latest').resolve() == one
-    assert client.until(save_trouble='')['saved'] == str(one)
+    assert client.until(save_error='')['saved'] == str(one)
     # the folder of the next save can be set after the leg, too
     assert client.set(output__directory=str(tmp_path / 'other')).successful
     answer = client.call('save')
@@ -109,12 +109,12 @@ def test_a_folder_removed_during_a_leg_is_created_again(start, connect, driven, 
         wait_for(lambda: list(folder.glob('journal/*/*.mcap')), 'the journal')
         shutil.rmtree(folder)
     leg(driven, [node], [client], remove)
-    wait_for(lambda: client.status['journal_trouble'] or (folder / 'journal').exists(),
+    wait_for(lambda: client.status['journal_error'] or (folder / 'journal').exists(),
              'a warning, or the journal anew')
     wait_for((folder / 'latest').exists, 'the result')
     one, = results(folder)
     assert true(whole_content(one))
-    assert client.until(saved=str(one))['save_trouble'] == ''
+    assert client.until(saved=str(one))['save_error'] == ''
 
 
 def test_two_nodes_that_save_into_one_folder_have_a_result_each(

@@ -59,10 +59,10 @@ def test_a_failed_save_is_a_warning_until_a_save_succeeds(saving, tmp_path):
     success, text = saving.save(GOOD, tmp_path / 'file')
     assert not success
     assert saving.messages == [text]
-    assert saving.saver.trouble in text
-    assert 'output.directory' in saving.saver.trouble
+    assert saving.saver.error in text
+    assert 'output.directory' in saving.saver.error
     assert saving.save(GOOD, tmp_path)[0]
-    assert saving.saver.trouble == ''
+    assert saving.saver.error == ''
 
 
 def test_a_worse_result_becomes_latest_by_the_second_save_of_the_operator(save, tmp_path):

@@ -129,6 +129,9 @@ ODOMETERS = {
         [1, 2, 3, 4], [7, 7, 7, 7]), {}, [[3.0], [4.0]], ANGLE, [9]),
     'velocities': ([make.joints(9, 'ab', velocity=[1, 2]), make.joints(10, 'ab', [5, 5], [3, 4])],
                    {}, [[1, 3], [2, 4]], TURNING, [9, 10]),
+    'a speed of a joint named position': (
+        make.joints(9, ['position'], [1], [2]), {'odometer__field': 'velocity[position]'}, [[2.0]],
+        TURNING, [9]),
     'two topics': (make.whole(1, 'Int32'), BOTH, [[1]], ('cumulative', 2**32, 'm/pulse'), [7]),
     'left and right': (TWO, {'odometer__left': 'l', 'odometer__right': 'r'}, [[1], [2]], ANGLE,
                        [1]),
@@ -157,26 +160,26 @@ def test_two_unnamed_wheels_are_averaged_and_four_require_a_setting():
     # each counter rolls over separately: the mean of raw counts would be wrong
     found, reader = read('odometer', [make.whole_array([4, 5])])
     assert [block.value.tolist() for block in found.values()] == [[4], [5]]
-    assert not reader.form.sides
-    assert 'the mean of 0 and 1 is used' in reader.form.chosen
+    assert not reader.form.sides_known
+    assert 'the mean of 0 and 1 is used' in reader.form.selection_text
     found, reader = read('odometer', [make.whole_array([4, 5, 6, 7])])
     assert found == {}
-    assert 'a list of 4 values' in reader.trouble
-    assert 'odometer.wheels (indices from 0)' in reader.trouble
+    assert 'a list of 4 values' in reader.error
+    assert 'odometer.wheels (indices from 0)' in reader.error
 
 
-@pytest.mark.parametrize(('messages', 'more', 'values', 'trouble'), [
+@pytest.mark.parametrize(('messages', 'more', 'values', 'error'), [
     ([make.joints(1, ARM, [9, 9]), make.joints(2, WHEEL, [1, 2]), make.joints(3, ARM, [9, 9]),
       make.joints(4, WHEEL, [3, 4])], {}, [1, 3], 'names: elbow, wrist'),
     ([make.joints(1, ['arm'], [9.0]), make.joints(2, ['l', 'r'], [1, 2]),
       make.joints(3, ['arm'], [9.0]), make.joints(4, ['r', 'l'], [4, 3])],
      {'odometer__field': 'position[l]'}, [1, 3], 'names: arm')])
-def test_messages_without_the_wheel_are_omitted_and_counted(messages, more, values, trouble):
+def test_messages_without_the_wheel_are_omitted_and_counted(messages, more, values, error):
     found, reader = read('odometer', messages, **more)
     assert found['odometer'].value.tolist() == values
     assert found['odometer'].stamp_ns.tolist() == [2, 4]
     assert reader.unreadable == 2
-    assert trouble in reader.trouble
+    assert error in reader.error
 
 
 @pytest.mark.parametrize(('slot', 'value'), [('odometer', 1.0), ('odometer_right', 2.0)])
@@ -195,7 +198,7 @@ def test_a_joint_may_have_any_name(name):
 def test_two_wheels_as_a_list_are_left_and_right():
     assert config(odometer__wheels=('l', 'r')).odometer.names(2) == ('left', 'right')
     # YAML reads a list of indices as numbers
-    assert config(odometer__wheels=[0, 1]).odometer.keys == ('0', '1')
+    assert config(odometer__wheels=[0, 1]).odometer.wheel_keys == ('0', '1')
 
 
 @pytest.mark.parametrize(('field', 'value', 'form'), [
@@ -258,7 +261,7 @@ def test_damaged_messages_are_omitted_and_counted():
                                   make.deserializer('sensor_msgs/msg/Imu'))
         assert block.received_ns.tolist() == [1, 3]
         assert reader.unreadable == 1
-        assert reader.trouble == text(len(bad), why)
+        assert reader.error == text(len(bad), why)
     assert reader.rows([], [], None) == []
     assert reader.rows([bad], [1], make.deserializer('sensor_msgs/msg/Imu')) == []
 
@@ -267,4 +270,4 @@ def test_a_missing_joint_gives_no_rows_and_the_reason():
     found, reader = read('odometer', [make.joints(1, ['a'], [1.0])],
                          odometer__field='velocity[b]')
     assert found == {}
-    assert reader.trouble == 'no velocity[b] in a sensor_msgs/msg/JointState; names: a'
+    assert reader.error == 'no velocity[b] in a sensor_msgs/msg/JointState; names: a'

@@ -162,7 +162,7 @@ def test_a_repeated_correction_gives_no_position():
     still = raws((T_MAP, lambda t: corrections(0 * t), 'odom', 'map'), (T_ODOM, *BY_WHEELS))
     source = reader()
     assert not len(read(source, still)[0][0])
-    assert 'without corrections the positions are odometry alone' in source.trouble
+    assert 'without corrections the positions are odometry alone' in source.error
 
 
 def test_a_recording_that_starts_again_is_read_to_its_end():
@@ -182,7 +182,7 @@ def test_the_reason_for_missing_positions_is_reported(frames, static, message_):
     source = reader(**{'reference.frames': frames})
     read(source, MOVING[:50], static)
     assert source.unreadable == 50
-    assert message_ in source.trouble
+    assert message_ in source.error
 
 
 def test_a_block_may_exceed_the_number_of_waiting_transforms(monkeypatch):
@@ -203,7 +203,7 @@ def test_damaged_messages_are_counted_and_random_bytes_raise_nothing():
     assert source.rows(whole, range(100), DESERIALIZE)
     source.rows(cut + noise, range(300), DESERIALIZE)
     assert 250 < source.unreadable <= 300
-    assert source.trouble == 'damaged messages'
+    assert source.error == 'damaged messages'
 
 
 def test_both_tf_topics_of_a_bag_are_read(tmp_path):

@@ -44,7 +44,7 @@ REAL = {
 def test_the_wheels_of_real_robots_are_found(robot):
     names, pair = REAL[robot]
     found = select_wheels(names, len(names))
-    assert (found.keys, found.sides) == (pair, True)
+    assert (found.keys, found.sides_known) == (pair, True)
     assert pair[0] in found.explanation
 
 
@@ -69,7 +69,7 @@ def test_a_single_wheel_is_found(names, keys):
 def test_two_wheels_of_unknown_sides_are_averaged(names):
     found = select_wheels(names, len(names) or 2)
     assert found.keys == tuple(names[:2] or '01')
-    assert not found.sides
+    assert not found.sides_known
     assert 'the mean of' in found.explanation
 
 

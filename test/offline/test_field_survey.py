@@ -209,7 +209,7 @@ def test_the_number_of_searched_fields_and_messages_is_limited():
     assert len(requests) < 400_000 / len(fields.paths) + 1
     image = Fields(5)
     image.rows([bytes(2**20)] * 5, range(5), deserialize)
-    assert image.trouble == 'no numeric field'
+    assert image.error == 'no numeric field'
 
 
 def plain(path, made, *more, **changes):

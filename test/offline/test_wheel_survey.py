@@ -44,7 +44,7 @@ def test_the_sides_of_unnamed_joints_are_found_from_their_motion(inspect_drive):
         ns, names, [0.4 * np.sin(i / 30), right, left]))
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
-    assert 'the wheels among the joints j1, j2, j3 are not clear' in wheels['trouble']
+    assert 'the wheels among the joints j1, j2, j3 are not clear' in wheels['error']
     assert printed['command'].endswith('--set odometer.left=j3 --set odometer.right=j2')
     assert 'j1 travels' in text
 
@@ -76,4 +76,4 @@ def test_wheels_found_by_their_names_are_shown_with_their_settings(inspect_drive
     assert 'left_wheel is used as left wheel, right_wheel as right' in wheels['chosen']
     assert found['command'].endswith(
         '--set odometer.left=left_wheel --set odometer.right=right_wheel')
-    assert 'trouble' not in wheels
+    assert 'error' not in wheels
