@@ -138,7 +138,7 @@ def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
 def _finding_facts(findings: list[Reason], config: Config,
                    options: list[str]) -> list[dict[str, Any]]:
     """Return findings as facts; ``method`` : the only one that they affect, None: all."""
-    has_wheels = config.odometer.keys or any(
+    has_wheels = config.odometer.wheel_keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
     codes = TWO_POINT_CODES - {Code.NO_STANDSTILL} if has_wheels else TWO_POINT_CODES
     return [reason.as_dict() | {'method': 'two_point' if (
@@ -235,7 +235,7 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
                    motions: dict[str, list[dict[str, Any]]]) -> list[str]:
     """Return the settings for the odometer; add the motion of each joint to ``topics``."""
     options: list[str] = []
-    is_unconfigured = not (config.odometer.keys or config.odometer.field)
+    is_unconfigured = not (config.odometer.wheel_keys or config.odometer.field)
     for facts in topics:
         if facts['name'] not in motions:
             continue
