@@ -112,7 +112,7 @@ def test_the_mean_is_that_of_the_wheels_that_do_not_steer():
 def test_the_distance_ahead_follows_from_the_turns():
     one = made()
     inputs, _ = screen(one.leg(), config(one))
-    front = [wheel.ahead * one.truth.scale for wheel in inputs.travels]
+    front = [wheel.distance_ahead * one.truth.scale for wheel in inputs.travels]
     assert front == pytest.approx([2.7, 2.7, 0.0, 0.0], rel=0.02)
 
 

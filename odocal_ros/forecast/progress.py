@@ -123,7 +123,7 @@ class OdometerProgress:
             steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
         path = self.total + np.cumsum(np.abs(steps))
         for total, stamp in zip(path, stamps, strict=True):
-            if total - self._moved_total > self._rows.still:
+            if total - self._moved_total > self._rows.rest_travel:
                 rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
                 if rest_ns > SHORTEST_REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)

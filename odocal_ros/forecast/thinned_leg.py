@@ -173,6 +173,6 @@ class RecentCounts:
 
 def _at_sampling_times(rows: data.OdometerSamples) -> data.OdometerSamples:
     """Return rows with rising stamps at their estimated sampling times."""
-    sampled_s = sampling_times(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
+    sampled_s, _ = sampling_times(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED)
     sampled_ns = rows.stamp_ns[0] + np.rint(sampled_s * 1e9).astype(np.int64)
     return replace(rows, stamp_ns=np.maximum.accumulate(sampled_ns))

@@ -30,7 +30,8 @@ class Travel:
     quantum: float    # size of one count, scale units; 0 for speeds and floats
     coarse: CoarseSpeed | None = None    # measured speeds, if in steps and of one wheel
     name: str = ''         # of the wheel, '' for a single one or a mean
-    ahead: float = 0.0     # m, of a steered wheel from the axle that does not steer; else 0
+    # scale units, of a steered wheel from the axle that does not steer; 0: it does not steer
+    distance_ahead: float = 0.0
 
     def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""

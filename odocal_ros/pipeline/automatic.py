@@ -78,7 +78,7 @@ class LegSearch:
             self._add_imu_stamps(block.stamp_ns)
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or StepReader(form)
-            self._still = self._steps.still
+            self._still = self._steps.rest_travel
             steps, stamps, _ = self._steps.read(block)
             travel = self._travel + np.cumsum(steps)
             if len(travel):

@@ -123,11 +123,12 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
 def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track: Track,
                     reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
-    fixed = [axle for axle in pair_wheels(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
+    fixed = [axle for axle in pair_wheels(inputs.travels)
+             if len(axle) > 1 and not axle[0].distance_ahead]
     if not fixed or not inputs.has_accelerometer or WHEEL_FAULT_CODES & {r.code for r in reasons}:
         return (), NO_SLIPS
     from odocal_ros.calib.wheel_faults import wheel_faults
-    odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
+    odometer, count = config.odometer, sum(not wheel.distance_ahead for wheel in inputs.travels)
     axle_reasons, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
         located.origin.latitude, located.rough, odometer.track_width, inputs.uncertain_t,

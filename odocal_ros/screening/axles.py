@@ -60,10 +60,10 @@ def usable_axles(wheels: Wheels, imu: Imu,
     ahead = iter(_distances_ahead([axle for axle in usable if axle], imu, between,
                                   wheels.uncertain_t))
     distances = [next(ahead) if axle else np.inf for axle in usable]
-    working = [replace(wheel, ahead=distance)
+    working = [replace(wheel, distance_ahead=distance)
                for axle, of_axle, distance in zip(axles, faults, distances, strict=True)
                if not of_axle for wheel in axle]
-    steered, fixed = ([wheel for wheel in working if bool(wheel.ahead) is steers]
+    steered, fixed = ([wheel for wheel in working if bool(wheel.distance_ahead) is steers]
                       for steers in (True, False))
     if fault_reasons and (not fixed or sum(map(bool, usable)) < 2):
         return wheels, fault_reasons
@@ -73,7 +73,7 @@ def usable_axles(wheels: Wheels, imu: Imu,
         reasons.append(Reason(Code.WHEELS_STEERED, f'{_subject(steered)} steered: a '
                               'steered wheel travels farther in turns. The scale factor is that '
                               f'of the mean of {_names(fixed)}'))
-    return wheels.only(working), reasons
+    return wheels.replaced(working), reasons
 
 
 def _working_wheel(axle: Axle, faults: Sequence[Reason]) -> Axle:

@@ -29,11 +29,15 @@ MIN_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm that 
 ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
-def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, reasons: list[Reason],
-                   name: str = 'odometer') -> Floats:
-    """Return the sampling times of rows stamped at t, (n,) s: late ones are moved back."""
+def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
+                   name: str = 'odometer') -> tuple[Floats, list[Reason]]:
+    """
+    Return the sampling times of rows stamped at t, (n,) s, and the reason if rows are late.
+
+    name : of the odometer, in the reason.
+    """
     if len(t) < 4 * NODE_STEP:
-        return t
+        return t, []
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
         # a speed is as smooth as travel, but does not determine the time of a row in a burst
@@ -46,13 +50,13 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm, reas
     delay = t - sampled
     min_delay, min_share = 0.02, 0.3    # s, of an interval: larger delays are reported
     late = delay > max(min_delay, min_share * intervals(t)[0])
-    if late.any():
-        worst, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
-        reasons.append(Reason(
-            Code.ODOMETER_LATE, f'{int(late.sum())} of {len(t)} {name} messages arrived late, in '
-            f'{max(bursts, 1)} burst{"s" * (bursts > 1)}, by up to {delay[worst]:.3g} s at t = '
-            f'{t[worst]:.2f} s; moved back to their estimated times'))
-    return sampled
+    if not late.any():
+        return sampled, []
+    worst, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
+    return sampled, [Reason(
+        Code.ODOMETER_LATE, f'{int(late.sum())} of {len(t)} {name} messages arrived late, in '
+        f'{max(bursts, 1)} burst{"s" * (bursts > 1)}, by up to {delay[worst]:.3g} s at t = '
+        f'{t[worst]:.2f} s; moved back to their estimated times')]
 
 
 def arrival_jitter(t: Floats) -> float | None:

@@ -4,8 +4,8 @@
 """
 Odometer rows with false values: false counts, frozen counters, lost increments.
 
-False rows are dropped if the counter continues normally after them; unknown travel (a reset, a gap
-of speeds or increments) is an uncertainty in the error budget.
+Rows with false counts are dropped if the counter continues normally after them. Travel
+that is not measured, at a reset or in a gap of speeds or increments, is a source of the budget.
 """
 
 from dataclasses import replace
@@ -22,36 +22,38 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import is_impossible, speed_glitches
 
 ADJACENT_STEPS = 5    # judgement: steps next to a jump or gap that give the speed there
-# counts, rad, m: smaller travel is not reported
-STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
+# judgement: largest apparent travel at rest, by the unit of the scale factor: counts, rad, m
+REST_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
-                       reasons: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
+                       name: str) -> tuple[OdometerSamples, Floats, list[Reason]]:
     """
-    Return rows and times, s, without false or repeated counts; false increments are interpolated.
+    Return rows and their times, s, without false or repeated counts, and reasons.
 
-    name : of the odometer, for the reasons, which are added to ``reasons``.
+    False increments are interpolated.   name : of the odometer, in the reasons.
     """
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
-        if false.any():
-            reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                  'counts are frozen or isolated outliers, first at t = '
-                                  f'{t[np.argmax(false)]:.2f} s; dropped'))
+        reasons = _false_row_reasons(false, t, f'{name} counts are frozen or isolated outliers',
+                                     'dropped')
         samples, t = take(samples, ~false), t[~false]
-        held = held_counts(samples.value, form.modulus)
-        return take(samples, ~held), t[~held]
-    if form.quantity == 'increment':
-        false = speed_glitches(t, samples.value.astype(float))
-        if false.any():
-            good = np.interp(t, t[~false], samples.value[~false].astype(float))
-            kept: NDArray[Any] = np.where(false, good, samples.value).astype(samples.value.dtype)
-            samples = replace(samples, value=kept)
-            reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                  'increments are isolated outliers, first at t = '
-                                  f'{t[np.argmax(false)]:.2f} s; replaced by interpolation'))
-    return samples, t
+        is_new = ~repeated_counts(samples.value, form.modulus)
+        return take(samples, is_new), t[is_new], reasons
+    value = samples.value
+    false = speed_glitches(t, value.astype(float)) if form.quantity == 'increment' \
+        else np.zeros(len(t), bool)
+    if false.any():
+        interpolated = np.interp(t, t[~false], value[~false].astype(float))
+        corrected: NDArray[Any] = np.where(false, interpolated, value).astype(value.dtype)
+        samples = replace(samples, value=corrected)
+    return samples, t, _false_row_reasons(false, t, f'{name} increments are isolated outliers',
+                                          'replaced by interpolation')
+
+
+def _false_row_reasons(false: Bools, t: Floats, fault: str, action: str) -> list[Reason]:
+    return [Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {fault}, first at t = '
+                   f'{t[np.argmax(false)]:.2f} s; {action}')] if false.any() else []
 
 
 def counter_steps(value: Values, modulus: int) -> Floats:
@@ -63,8 +65,8 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
     Return a mask of false counter rows, (n,).
 
-    A counter that is frozen continues with a jump, as if it had counted; an isolated false value
-    is a jump and a jump back.
+    Rows before a jump are false if the counter was frozen there: its jump is the travel since it
+    stopped. Rows between a jump and a jump back are false.
     """
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
@@ -73,38 +75,38 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     dt = np.diff(t)
     rate = step / np.maximum(dt, np.median(dt))
     size = np.abs(rate)
-    top = float(np.percentile(size[size > 0], 95))
-    jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
+    high_rate = float(np.percentile(size[size > 0], 95))
+    jumps = np.flatnonzero(size > max(RESET_FACTOR * high_rate, 3 / np.median(dt))).tolist()
     max_jumps = 200    # with more the counter is not corrected; the check decides
     if len(jumps) > max_jumps:
         return false
     last_false = -1
-    longest_excursion = 30.0    # s between a jump and the jump back
-    for j in jumps:
-        if j <= last_false:
+    max_duration = 30.0    # s between a jump and the jump back
+    for jump in jumps:
+        if jump <= last_false:
             continue
-        stall = _stall_begin(step, j)
-        returns = [k for k in jumps if k > j and t[k + 1] - t[j] <= longest_excursion]
-        # candidates, first and last step: frozen before the jump, or the jump and back
-        for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in returns]:
-            travel = counter_steps(value[[a, b + 1]], modulus)[0]  # exact, unlike a sum of steps
-            possible = 1.2 * top * (t[b + 1] - t[a]) + 3      # travel in this time
-            is_excursion = a == j and abs(travel) <= possible and (
-                min(abs(step[a]), abs(step[b])) > 2 * possible)
-            if is_excursion or _continues(t, travel, rate, a, b):
-                false[a + 1:b + 1] = True
-                last_false = b
+        freeze = _first_zero_step(step, jump)
+        candidates = [(freeze, jump)] * (freeze < jump) + [      # first and last step
+            (jump, k) for k in jumps if k > jump and t[k + 1] - t[jump] <= max_duration]
+        for first, last in candidates:
+            travel = counter_steps(value[[first, last + 1]], modulus)[0]    # exact, unlike sums
+            max_travel = 1.2 * high_rate * (t[last + 1] - t[first]) + 3
+            jumps_back = first == jump and abs(travel) <= max_travel and (
+                min(abs(step[first]), abs(step[last])) > 2 * max_travel)
+            if jumps_back or _fits_adjacent_rates(t, travel, rate, first, last):
+                false[first + 1:last + 1] = True
+                last_false = last
                 break
     return false
 
 
-def held_counts(value: Values, modulus: int) -> Bools:
+def repeated_counts(value: Values, modulus: int) -> Bools:
     """
-    Return a mask of counter rows that repeat a value until the next update.
+    Return a mask of counter rows that only repeat a value, (n,).
 
-    A counter that is published faster than it is read repeats each value, and its travel is known
-    at the updates only. Rows of a standstill are kept at the mean interval of updates, counted
-    back from the next one.
+    A counter that is published faster than it is read repeats each value until its next update,
+    and its travel is known at the updates only. At a standstill one row is kept for each mean
+    interval of updates, counted back from the next update.
     """
     size = np.abs(counter_steps(value, modulus))
     update = np.flatnonzero(size) + 1
@@ -114,28 +116,31 @@ def held_counts(value: Values, modulus: int) -> Bools:
     if len(update) < MIN_STEPS or np.median(interval_rows) < 2 or (
             np.median(size[update - 1]) < min_counts * size[update - 1].min()):
         return np.zeros(len(value), bool)
-    moving = interval_rows < 2 * np.median(interval_rows)
+    is_moving = interval_rows < 2 * np.median(interval_rows)
     row = np.arange(len(value))
-    k = np.searchsorted(update, row)      # the next update
-    # number of mean intervals to the next update: one row of each is kept
-    number = np.floor((np.append(update, row[-1])[k] - row) / np.mean(interval_rows[moving]))
-    number[np.r_[False, moving, False][k]] = 0.0
-    held: Bools = np.append(False, size == 0) & np.append(number[1:] == number[:-1], False)
-    return held
+    next_update = np.searchsorted(update, row)
+    rows_to_update = np.append(update, row[-1])[next_update] - row
+    intervals_to_update = np.floor(rows_to_update / np.mean(interval_rows[is_moving]))
+    intervals_to_update[np.r_[False, is_moving, False][next_update]] = 0.0
+    same_interval = np.append(intervals_to_update[1:] == intervals_to_update[:-1], False)
+    repeated: Bools = np.append(False, size == 0) & same_interval
+    return repeated
 
 
-def _continues(t: Floats, travel: float, rate: Floats, a: int, b: int) -> bool:
-    """Return True if the travel from step a to after step b agrees with adjacent speeds."""
-    duration = t[b + 1] - t[a]
-    expected = [_median_or_zero(x) * duration for x in _adjacent(rate, a, b)]
-    largest_share = 0.5    # judgement: largest difference, of the expected travel
-    tolerance = largest_share * max(abs(x) for x in expected) + 3      # counts
+def _fits_adjacent_rates(t: Floats, travel: float, rate: Floats, first: int, last: int) -> bool:
+    """Return True if the travel from step ``first`` to ``last`` agrees with adjacent rates."""
+    duration = t[last + 1] - t[first]
+    expected = [adjacent * duration for adjacent in _adjacent_rates(rate, first, last)]
+    max_share = 0.5    # judgement: largest difference, of the expected travel
+    tolerance = max_share * max(abs(x) for x in expected) + 3      # counts
     return bool(min(expected) - tolerance <= travel <= max(expected) + tolerance)
 
 
-def _adjacent(rate: Floats, a: int, b: int) -> tuple[Floats, Floats]:
-    """Return the rates of the steps next to the steps a to b: before, and after."""
-    return rate[max(0, a - ADJACENT_STEPS):a], rate[b + 1:b + 1 + ADJACENT_STEPS]
+def _adjacent_rates(rate: Floats, first: int, last: int) -> tuple[float, float]:
+    """Return the median rates before step ``first`` and after ``last``; 0 without steps."""
+    sides = rate[max(0, first - ADJACENT_STEPS):first], rate[last + 1:last + 1 + ADJACENT_STEPS]
+    before, after = (float(np.median(side)) if len(side) else 0.0 for side in sides)
+    return before, after
 
 
 def with_gap_uncertainty(travel: Travel, value: Values,
@@ -143,34 +148,36 @@ def with_gap_uncertainty(travel: Travel, value: Values,
     """
     Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel.
 
-    A counter has travel across gaps, but not across resets, which ``travel`` has corrected.
+    A counter measures the travel across gaps; it is uncertain only at resets, which ``travel``
+    does not include.
     """
-    none = np.empty(0)
     if len(travel.t) < MIN_STEPS:
-        return travel, none, none
+        return travel, np.empty(0), np.empty(0)
     dt, step = np.diff(travel.t), np.diff(travel.s)
-    usual = np.median(dt)
-    rate = step / np.maximum(dt, usual)
+    usual_dt = np.median(dt)
+    rate = step / np.maximum(dt, usual_dt)
     if form.quantity == 'cumulative':
         return travel, *_reset_uncertainty(travel, step, rate, counter_steps(value, form.modulus))
-    gaps = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
-    before, after = np.array([[_median_or_zero(x) for x in _adjacent(rate, k, k)]
+    gaps = np.flatnonzero(dt > max(MISSING_INTERVALS * usual_dt, 0.2))
+    before, after = np.array([_adjacent_rates(rate, k, k)
                               for k in gaps.tolist()]).reshape(-1, 2).T
-    missing = dt[gaps] - (usual if form.quantity == 'increment' else 0.0)
+    missing_s = dt[gaps] - (usual_dt if form.quantity == 'increment' else 0.0)
     if form.quantity == 'increment' and len(gaps):
         step = step.copy()
-        step[gaps] += (before + after) / 2 * missing
+        step[gaps] += (before + after) / 2 * missing_s
         travel = Travel(travel.t, running_sum(step), travel.quantum)
-    # speed within a gap: uniform between the adjacent ones, and uniform within 2 % of these for
-    # each second of the gap, at most 30 %
-    speed_sigma = np.abs(after - before) / np.sqrt(12) + np.minimum(
-        missing / 50, 0.3) * np.maximum(np.abs(before), np.abs(after)) / np.sqrt(3)
-    times, sigma = travel.t[gaps], speed_sigma * missing
+    # the mean speed in a gap is uniform between the adjacent ones (sigma: width / sqrt(12)), and
+    # then uniform within +- 2 % of them for each second, at most 30 % (half width / sqrt(3)).
+    # Judgement
+    max_change = np.minimum(missing_s / 50, 0.3) * np.maximum(np.abs(before), np.abs(after))
+    speed_sigma = np.abs(after - before) / np.sqrt(12) + max_change / np.sqrt(3)
+    times, sigma = travel.t[gaps], speed_sigma * missing_s
     if form.quantity == 'rate':
-        hidden = np.copysign(_travel_below_threshold(travel, value), step)
-        rows = np.flatnonzero(hidden)
-        travel = replace(travel, s=travel.s + running_sum(hidden))
-        times, sigma = np.r_[times, travel.t[rows]], np.r_[sigma, np.abs(hidden[rows]) / 2]
+        unpublished = np.copysign(_travel_below_threshold(travel, value), step)
+        rows = np.flatnonzero(unpublished)
+        travel = replace(travel, s=travel.s + running_sum(unpublished))
+        times = np.r_[times, travel.t[rows]]
+        sigma = np.r_[sigma, np.abs(unpublished[rows]) / 2]
     return travel, times, sigma
 
 
@@ -181,22 +188,22 @@ def _reset_uncertainty(travel: Travel, step: Floats, rate: Floats,
     # only the adjacent speeds bound the travel since the last count: uniform up to this limit
     limits = []
     for k in resets.tolist():
-        a = _stall_begin(step, k)
-        speed = max(abs(_median_or_zero(x)) for x in _adjacent(rate, a, k))
-        limits.append(speed * (travel.t[k + 1] - travel.t[a]))
+        first = _first_zero_step(step, k)
+        speed = max(map(abs, _adjacent_rates(rate, first, k)))
+        limits.append(speed * (travel.t[k + 1] - travel.t[first]))
     return travel.t[resets], np.array(limits) / np.sqrt(3)
 
 
 def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
     """
-    Return the travel at speeds published as zero, at stops and starts: (n - 1,).
+    Return the travel at speeds published as zero, at stops and starts, for each step: (n - 1,).
 
-    It is v^2 / 2a with the smallest published speed v and the acceleration a of adjacent rows.
+    It is v^2 / 2a with the last speed v before zero, or the first one after it, and the
+    acceleration a of adjacent rows.
     """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     min_speed = 2 * travel.coarse.step if travel.coarse else 0.0
-    # least ratio to the counted travel in a dead band
-    dead_band_ratio = 1.5
+    min_ratio = 1.5      # to the counted travel: with a smaller one there is no dead band
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
         first, direction = (edge, -1) if stops else (edge + 1, 1)
@@ -207,34 +214,26 @@ def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
         if v > min_speed and change > 0 and duration > 0:
             counted = v * (travel.t[edge + 1] - travel.t[edge]) / 2
             total = min(v**2 * duration / (2 * change), v)      # no longer than 2 s
-            hidden[edge] = total - counted if total > dead_band_ratio * counted else 0.0
+            hidden[edge] = total - counted if total > min_ratio * counted else 0.0
     return hidden
 
 
-def _stall_begin(step: Floats, j: int) -> int:
-    """Return the first of the zero steps directly before step j, or j if there are none."""
-    moves = np.flatnonzero(step[:j])
+def _first_zero_step(step: Floats, k: int) -> int:
+    """Return the first of the zero steps directly before step k, or k if there are none."""
+    moves = np.flatnonzero(step[:k])
     return int(moves[-1]) + 1 if len(moves) else 0
 
 
-def _median_or_zero(rate: Floats) -> float:
-    return float(np.median(rate)) if len(rate) else 0.0
-
-
 class StepReader:
-    """Conversion of rows to steps, in odometer units; for a leg see ``nav.odometer.travel``."""
+    """Conversion of blocks of rows, as they arrive, to steps of travel in odometer units."""
 
     def __init__(self, form: OdometerForm) -> None:
         self.form = form
-        self._last: tuple[Ints, Values] | None = None
-
-    @property
-    def still(self) -> float:
-        """Return the largest apparent travel at rest."""
-        return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
+        self.rest_travel = REST_TRAVEL.get(form.scale_unit, 0.02)
+        self._last: tuple[Ints, Values] | None = None      # stamp and value of the last row
 
     def read(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
-        """Return step, stamp, ns, and duration, s, of each possible row since the one before."""
+        """Return travel, stamp, ns, and duration, s, from each valid row to the next."""
         good = ~is_impossible('value', block.value)
         stamps, values = block.stamp_ns[good], block.value[good]
         if self._last is not None:

@@ -57,12 +57,14 @@ def screen(leg: Leg, config: Config,
     if check_faults:
         leg, clock_steps = clocks.without_clock_steps(leg)
         reasons += [*clock_steps, *clocks.clock_reasons(leg, config)]
-    rows = _usable(leg, config, check_faults, reasons)
-    inputs = _inputs_of(leg, config, rows, _fixes(leg, config, rows, reasons))
+    rows, row_reasons = _usable_topics(leg, config, check_faults)
+    fixes, fix_reasons = _fix_fields(leg, config, rows)
+    reasons += row_reasons + fix_reasons
+    inputs = _make_inputs(leg, config, rows, fixes)
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
     wheels = rows.wheels      # the mean has the rows of the first one
-    for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
-        reasons += topic_gap(slot, one.t)
+    for slot, wheel in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
+        reasons += topic_gap(slot, wheel.t)
     if check_faults:
         reasons += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
         reasons += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
@@ -72,11 +74,15 @@ def screen(leg: Leg, config: Config,
             wheels, axle_reasons = usable_axles(
                 wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
             reasons += axle_reasons
-        inputs = replace(inputs, **_travel(leg, wheels))
+        inputs = replace(inputs, **_travel_fields(leg, wheels))
     release_mapped_memory()
     if check_faults and not local:
-        inputs = _without_dead_reckoned(inputs, config, reasons)
-    return (inputs if levelled else _without_reversing(inputs, config, reasons)), tuple(reasons)
+        inputs, reckoned_reasons = _without_dead_reckoned(inputs, config)
+        reasons += reckoned_reasons
+    if not levelled:
+        inputs, reversing = _without_reversing(inputs, config)
+        reasons += reversing
+    return inputs, tuple(reasons)
 
 
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
@@ -84,7 +90,7 @@ def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason,
     inputs, reasons = screen(leg, config)
     delay_reasons, late_by = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
     for clock, late in late_by.items():
-        slots = [slot for slot, one in INPUTS.items() if one.clock == clock]
+        slots = [slot for slot, source in INPUTS.items() if source.clock == clock]
         by_ns = -round(late * 1e9)
         leg = leg.with_rows(**{
             slot: clocks.shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
@@ -100,6 +106,7 @@ def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason,
 
 
 def _missing(leg: Leg, reasons: list[Reason]) -> list[Reason]:
+    """Return the reasons for topics without messages, except those with a reason already."""
     codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
     known = {reason.code for reason in reasons}      # NO_IMU if imu.frame_id is missing
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
@@ -109,7 +116,7 @@ def _missing(leg: Leg, reasons: list[Reason]) -> list[Reason]:
 
 @dataclass(frozen=True, eq=False)
 class UsableTopics:
-    """Usable rows of each topic, unchanged, and their times from the start mark, s."""
+    """Usable rows of each topic, as sent, and their times from the start mark, (n,) s."""
 
     imu: ImuSamples
     t_imu: Floats
@@ -119,32 +126,39 @@ class UsableTopics:
     external: dict[str, UsableRows]
 
 
-def _usable(leg: Leg, config: Config, check_faults: bool, reasons: list[Reason]) -> UsableTopics:
+def _usable_topics(leg: Leg, config: Config,
+                   check_faults: bool) -> tuple[UsableTopics, list[Reason]]:
     offset = clocks.stamp_offsets(config)
 
-    def rows(slot: str) -> UsableRows:
-        sent, t = usable_rows(slot, leg, config, offset[slot], reasons)
+    def usable(slot: str) -> tuple[UsableRows, list[Reason]]:
+        sent, t, reasons = usable_rows(slot, leg, config, offset[slot])
         if check_faults and hasattr(sent, 'q_ni'):
             sent = without_invalid_orientations(sent)
-        return UsableRows(sent, t)
+        return UsableRows(sent, t), reasons
 
-    imu, t_imu = rows('imu')
+    (imu, t_imu), reasons = usable('imu')
     t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
-    external = {slot: rows(slot) for slot in EXTERNAL_SLOTS}
+    external = {}
+    for slot in EXTERNAL_SLOTS:
+        external[slot], external_reasons = usable(slot)
+        reasons += external_reasons
     release_mapped_memory()
-    wheels = travel_of_wheels(leg, config, rows, reasons)
+    wheels, wheel_reasons = travel_of_wheels(leg, config, usable)
+    reasons += wheel_reasons
     reasons += [Reason(Code.ODOMETER_CHOSEN, form.selection_text)
                 for form in (leg.form, leg.form_right) if form and form.selection_text]
-    return UsableTopics(imu, t_imu, wheels, *rows('fix'), external)
+    (fix, t_fix), fix_reasons = usable('fix')
+    return UsableTopics(imu, t_imu, wheels, fix, t_fix, external), reasons + fix_reasons
 
 
-def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) -> dict[str, Any]:
-    """Return fixes and external sensors as fields of Inputs; add the reasons for unused ones."""
+def _fix_fields(leg: Leg, config: Config,
+                rows: UsableTopics) -> tuple[dict[str, Any], list[Reason]]:
+    """Return fixes and external sensors as fields of Inputs, and reasons for unused rows."""
     fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
     origin = ' of the leg and its pre-roll' if (rows.t_fix < 0).any() else ''
     use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss, origin)
-    reasons += fix_reasons
-    reasons += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
+    # gaps of received fixes: a rejected fix is not a gap
+    reasons = [*fix_reasons, *topic_gap('fix', rows.t_fix)]
     t_fix = rows.t_fix[use]
     # receivers without a height publish 0
     height = fix.height if fix.height.any() or (fix.status == LOCAL_STATUS).any() else np.full(
@@ -161,10 +175,10 @@ def _fixes(leg: Leg, config: Config, rows: UsableTopics, reasons: list[Reason]) 
         external = external | {'fix_velocity': UsableRows(VelocitySamples.empty(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'external': external,
-            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
+            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}, reasons
 
 
-def _inputs_of(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, Any]) -> Inputs:
+def _make_inputs(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, Any]) -> Inputs:
     imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
@@ -172,31 +186,33 @@ def _inputs_of(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, An
         w_b=_rotated(imu.w_i, config.imu.gyro_scale, C_bi),
         f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        scale_unit=leg.form.scale_unit, **_travel(leg, rows.wheels), **fixes)
+        scale_unit=leg.form.scale_unit, **_travel_fields(leg, rows.wheels), **fixes)
 
 
-def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
+def _travel_fields(leg: Leg, wheels: Wheels) -> dict[str, Any]:
+    """Return the travel of the wheels as fields of Inputs."""
     # of two wheels with unknown sides only the mean is defined
     several = wheels.wheels if leg.form.sides_known and len(wheels.wheels) > 1 else ()
     return {'travel': wheels.mean, 'travels': several,
             'uncertain_t': wheels.uncertain_t, 'uncertain_sigma': wheels.uncertain_sigma}
 
 
-def _without_reversing(inputs: Inputs, config: Config, reasons: list[Reason]) -> Inputs:
-    """Return inputs with the counts of starts in reverse made negative; add the reason."""
-    reversed_spans = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
-                           (0.0, inputs.t_stop))
-    metres = locate_fixes(inputs, config).rough or None if len(reversed_spans) else None
-    reasons += reversing_reasons(
-        reversed_spans, inputs.travel, metres, BY_IMU, config.odometer.signed)
-    return inputs.mirrored(reversed_spans)
+def _without_reversing(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
+    """Return inputs with negative counts where the vehicle reverses, and the reason if it does."""
+    spans = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
+                            (0.0, inputs.t_stop))
+    if not len(spans):
+        return inputs, ()
+    metres_per_unit = locate_fixes(inputs, config).rough or None
+    return inputs.mirrored(spans), reversing_reasons(
+        spans, inputs.travel, metres_per_unit, BY_IMU, config.odometer.signed)
 
 
-def _without_dead_reckoned(inputs: Inputs, config: Config, reasons: list[Reason]) -> Inputs:
-    """Return inputs without fixes that the receiver has dead-reckoned; add the reason."""
+def _without_dead_reckoned(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
+    """Return inputs without fixes that the receiver has dead-reckoned, and the reason if any."""
     located = locate_fixes(inputs, config)
     if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
-        return inputs
+        return inputs, ()
     rate = map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
     # the median is the bias: drives have straights, and turns to both sides
     rate -= median(rate)
@@ -206,15 +222,15 @@ def _without_dead_reckoned(inputs: Inputs, config: Config, reasons: list[Reason]
     steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    dropped, drop_reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
-                                                np.interp(inputs.t_fix, t, track))
-    if not drop_reasons:
-        return inputs
-    reasons += drop_reasons
+    dropped, reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,
+                                           np.interp(inputs.t_fix, t, track))
+    if not reasons:
+        return inputs, ()
     kept = ~dropped
-    return replace(inputs, t_fix=inputs.t_fix[kept], geodetic=inputs.geodetic[kept],
-                   covariance_n=inputs.covariance_n[kept], rounding_n=inputs.rounding_n[kept],
-                   fixes_rejected=inputs.fixes_rejected + int(dropped.sum()))
+    inputs = replace(inputs, t_fix=inputs.t_fix[kept], geodetic=inputs.geodetic[kept],
+                     covariance_n=inputs.covariance_n[kept], rounding_n=inputs.rounding_n[kept],
+                     fixes_rejected=inputs.fixes_rejected + int(dropped.sum()))
+    return inputs, reasons
 
 
 def _rotated(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:

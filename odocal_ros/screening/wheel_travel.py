@@ -22,6 +22,7 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.odometer import make_travel, mean_travel, MIN_STEPS, Travel
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.late_rows import sampling_times
 from odocal_ros.screening.odometer_rows import (
     counter_steps,
@@ -46,36 +47,48 @@ class RolloverSpan:
 
 
 def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
-    """Return the span of a counter's uncorrected rollovers, by rows (n,) and steps (n - 1,)."""
+    """
+    Return the rollovers of a counter by its values, (n,), and steps, (n - 1,); None without any.
+
+    A rollover is a jump against the travel, relative to the usual step (a running median).
+    """
     if len(step) < MIN_STEPS or not step.any():
         return None
-    median_reach = 7    # steps on each side of a jump, whose median is the usual step
-    padded = np.pad(step, median_reach, mode='edge')
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1),
+    side_steps = 7    # on each side of a step, in its running median
+    padded = np.pad(step, side_steps, mode='edge')
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * side_steps + 1),
                       axis=-1)
     is_integer = np.issubdtype(value.dtype, np.integer)
     jump = step - usual
-    top = float(np.percentile(np.abs(usual), 99.9))
-    min_jump = 8.0    # counts, smallest jump against the travel
-    large = np.abs(jump) > np.maximum(2 * np.abs(usual) + min_jump * is_integer, 1.5 * top)
-    rows = np.flatnonzero(large & (jump * usual <= 0))      # a frozen counter catches up forwards
+    largest_usual = float(np.percentile(np.abs(usual), 99.9))
+    min_jump = 8.0    # counts
+    is_large = np.abs(jump) > np.maximum(2 * np.abs(usual) + min_jump * is_integer,
+                                         1.5 * largest_usual)
+    # only against the travel: a frozen counter catches up with a jump along it
+    rows = np.flatnonzero(is_large & (jump * usual <= 0))
     if not len(rows):
         return None
     size = np.abs(jump[rows])
     tolerance = np.abs(usual[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
-    span, sigma = _span_of(value, rows, float(np.median(size)), float(np.median(tolerance)))
-    agree = np.abs(size - span) <= 2 * tolerance
-    agreeing_share = 0.8    # share of the jumps that must agree
-    if agree.mean() < agreeing_share:      # also if no span was found, NaN
+    span, sigma = _estimate_span(value, rows, float(np.median(size)),
+                                 float(np.median(tolerance)))
+    agrees = np.abs(size - span) <= 2 * tolerance
+    min_agreeing = 0.8    # share of the jumps; none agrees with NaN
+    if agrees.mean() < min_agreeing:
         return None
-    rows = rows[agree]
+    rows = rows[agrees]
     if _value_range(value, rows) > span + np.median(tolerance):   # rows out of order, two counters
         return None
     return RolloverSpan(span, sigma, rows, -np.sign(jump[rows]).astype(np.int64))
 
 
-def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[float, float]:
-    """Return the span of jumps after rows with this median size, and its sigma; NaN: none."""
+def _estimate_span(value: Values, rows: Ints, size: float,
+                   tolerance: float) -> tuple[float, float]:
+    """
+    Return the span of a counter and its sigma, 0 if certain; (NaN, 0) if it has none.
+
+    rows : (k,) rows before the jumps.   size, tolerance : median size of the jumps, and its error.
+    """
     is_integer = np.issubdtype(value.dtype, np.integer)
     spans = SPANS['integer' if is_integer else 'angle']
     known = float(spans[np.argmin(np.abs(spans - size))])
@@ -88,18 +101,18 @@ def _span_of(value: Values, rows: Ints, size: float, tolerance: float) -> tuple[
         return np.nan, 0.0
     if not is_integer:
         return size, tolerance / np.sqrt(3 * len(rows))
-    span, sigma = _measured_span(value, rows, size, tolerance)
+    span, sigma = _roundest_span(value, rows, size, tolerance)
     return (span, sigma) if span <= spans[-1] else (np.nan, 0.0)    # wider: values are damaged
 
 
 def _value_range(value: Values, rows: Ints) -> float:
-    """Return the range of the values before and after the jumps, which is within one span."""
+    """Return the range of the values before and after jumps, which is less than the span."""
     return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
 
 
-def _measured_span(value: Values, rows: Ints, size: float,
+def _roundest_span(value: Values, rows: Ints, size: float,
                    tolerance: float) -> tuple[float, float]:
-    """Return a span that is no power of two, and its sigma: the roundest number that fits."""
+    """Return the roundest number that can be the span, and its sigma; see ``_estimate_span``."""
     low = _value_range(value, rows) + 1
     high = max(low, size + 2 * tolerance / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
@@ -132,7 +145,7 @@ def correct_rollovers(
         span.size, f'{span.size:.0f}')
     angle = span.size in NAMED_SPANS     # exact, but odometer.wrap needs an integer
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
-    do = '' if angle else f'Set odometer.wrap to {span.size:.0f}.' if only_counter else (
+    remedy = '' if angle else f'Set odometer.wrap to {span.size:.0f}.' if only_counter else (
         f'If both wheels have this modulus, set odometer.wrap to {span.size:.0f}. Otherwise '
         'correct the driver: odometer.wrap is for both.')
     # judgement: few counters roll over so often; values of two counters alternate
@@ -141,7 +154,7 @@ def correct_rollovers(
                     f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
                     f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
                     + '. Check for two publishers on the topic if the counter cannot roll over so '
-                    'often' * two_publishers, do)
+                    'often' * two_publishers, remedy)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (reason,),
@@ -159,81 +172,89 @@ class Wheels:
     @cached_property
     def mean(self) -> Travel:
         """Return the mean of the wheels that do not steer; the first one if another is empty."""
-        fixed = [self.wheels[k] for k in self._fixed]
-        return mean_travel(fixed) if all(len(one.t) for one in fixed) else fixed[0]
+        unsteered = [self.wheels[k] for k in self._unsteered]
+        return mean_travel(unsteered) if all(len(wheel.t) for wheel in unsteered) else unsteered[0]
 
     @property
     def uncertain_t(self) -> Floats:
         """Return the times at which the mean is uncertain, s."""
-        return np.concatenate([self.uncertain_travel[k][0] for k in self._fixed])
+        return np.concatenate([self.uncertain_travel[k][0] for k in self._unsteered])
 
     @property
     def uncertain_sigma(self) -> Floats:
         """Return the sigmas of the mean at these times, scale units."""
-        sigma: Floats = np.concatenate([self.uncertain_travel[k][1] for k in self._fixed])
-        return sigma / len(self._fixed)
+        sigma: Floats = np.concatenate([self.uncertain_travel[k][1] for k in self._unsteered])
+        return sigma / len(self._unsteered)
 
     @property
-    def _fixed(self) -> list[int]:
-        return [k for k, one in enumerate(self.wheels) if not one.ahead]
+    def _unsteered(self) -> list[int]:
+        return [k for k, wheel in enumerate(self.wheels) if not wheel.distance_ahead]
 
-    def only(self, kept: Sequence[Travel]) -> 'Wheels':
-        """Return wheels with the travel in ``kept``, and the uncertain parts by name."""
+    def replaced(self, kept: Sequence[Travel]) -> 'Wheels':
+        """Return the wheels ``kept``, each with the uncertain travel of the wheel of its name."""
         by_name = {wheel.name: uncertain for wheel, uncertain in zip(
             self.wheels, self.uncertain_travel, strict=True)}
         return Wheels(tuple(kept), tuple(by_name[wheel.name] for wheel in kept))
 
 
-def travel_of_wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
-                     reasons: list[Reason]) -> Wheels:
-    """Return the travel of the wheels of a leg; reasons are added to ``reasons``."""
-    # rows(slot) gives usable rows and their times, s
+def travel_of_wheels(leg: Leg, config: Config,
+                     usable_rows: Callable[[str], tuple[UsableRows, list[Reason]]],
+                     ) -> tuple[Wheels, list[Reason]]:
+    """
+    Return the travel of the wheels of a leg, and reasons.
+
+    usable_rows : function of a slot that returns its usable rows, and reasons for the others.
+    """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
-    samples, t = rows(slots[0])
+    (samples, t), reasons = usable_rows(slots[0])
     if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
         reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                               'marks: only the left wheel is used'))
-    wheels = [_corrected_travel(samples, t, leg.form, config, reasons, names[0])]
+    first, first_uncertain, new_reasons = _corrected_travel(samples, t, leg.form, config, names[0])
+    reasons += new_reasons
+    wheels, uncertain = [first], [first_uncertain]
+    only_first = Wheels((first,), (first_uncertain,))
     for slot, name in zip(slots[1:], names[1:], strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
-            reasons.append(Reason(
+            return only_first, [*reasons, Reason(
                 Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used', 'Publish both wheels as one kind of value. If only '
-                'the modulus differs, set odometer.wrap.'))
-            return _joined(wheels[:1])
-        samples, t = rows(slot)
+                'the modulus differs, set odometer.wrap.')]
+        (samples, t), new_reasons = usable_rows(slot)
+        reasons += new_reasons
         if not len(t):
-            reasons.append(Reason(Code.WHEEL_DEAD, f'the {name} wheel has no usable value between '
-                                  f'the marks: only the {names[0]} wheel is used'))
-            return _joined(wheels[:1])
-        wheels.append(_corrected_travel(samples, t, form, config, reasons, name))
-    return _joined(wheels)
-
-
-def _joined(wheels: list[tuple[Travel, Floats, Floats]]) -> Wheels:
-    return Wheels(tuple(one[0] for one in wheels), tuple(one[1:] for one in wheels))
+            return only_first, [*reasons, Reason(
+                Code.WHEEL_DEAD, f'the {name} wheel has no usable value between the marks: only '
+                f'the {names[0]} wheel is used')]
+        wheel, wheel_uncertain, new_reasons = _corrected_travel(samples, t, form, config, name)
+        reasons += new_reasons
+        wheels.append(wheel)
+        uncertain.append(wheel_uncertain)
+    return Wheels(tuple(wheels), tuple(uncertain)), reasons
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
-                      reasons: list[Reason], side: str) -> tuple[Travel, Floats, Floats]:
-    """Return the travel of a wheel, times, s, and sigmas of its uncertain travel."""
+                      side: str) -> tuple[Travel, tuple[Floats, Floats], list[Reason]]:
+    """Return the travel of a wheel, times, s, and sigmas of its uncertain travel, and reasons."""
     name = f"the {side} wheel's counter" if side else 'the counter'
+    odometer = f'{side} odometer'.strip()
     uncertain_t = uncertain_sigma = np.empty(0)
+    reasons: list[Reason] = []
     if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, new_reasons, uncertain_t, uncertain_sigma = correct_rollovers(
+        samples, rollover_reasons, uncertain_t, uncertain_sigma = correct_rollovers(
             t, samples, step, name, only_counter=not side)
-        reasons.extend(new_reasons)
-    samples, t = without_false_rows(samples, t, form, reasons, f'{side} odometer'.strip())
-    t = sampling_times(samples, t, form, reasons, f'{side} odometer'.strip())
-    travel, new_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
-    reasons.extend(new_reasons)
+        reasons += rollover_reasons
+    samples, t, false_reasons = without_false_rows(samples, t, form, odometer)
+    t, late_reasons = sampling_times(samples, t, form, odometer)
+    travel, reset_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
     travel, gap_t, gap_sigma = with_gap_uncertainty(travel, samples.value, form)
-    return (replace(travel, name=side), np.append(uncertain_t, gap_t),
-            np.append(uncertain_sigma, gap_sigma))
+    return (replace(travel, name=side),
+            (np.append(uncertain_t, gap_t), np.append(uncertain_sigma, gap_sigma)),
+            [*reasons, *false_reasons, *late_reasons, *reset_reasons])
 
 
 def _form_text(form: OdometerForm) -> str:

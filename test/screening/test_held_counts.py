@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening.odometer_rows import held_counts
+from odocal_ros.screening.odometer_rows import repeated_counts
 
 STAND, ROWS = 40, 200
 
@@ -26,7 +26,7 @@ def published(rows_per_update, counts):
 @pytest.mark.parametrize('rows', [2.0, 5.0, 10 / 3])
 def test_repeated_counts_in_motion_are_dropped(rows):
     value = published(rows, 4)
-    held = held_counts(value, 2**64)
+    held = repeated_counts(value, 2**64)
     moves = np.flatnonzero(np.diff(value)) + 1
     inside = np.arange(moves[0], moves[-1])
     np.testing.assert_array_equal(~held[inside], np.isin(inside, moves))
@@ -40,7 +40,7 @@ def test_repeated_counts_in_motion_are_dropped(rows):
     published(1.0, 4), published(1.0, 0.3), published(2.0, 0.5), np.zeros(ROWS, np.int64)],
     ids=['each row new', 'coarse', 'coarse and read slowly', 'standing'])
 def test_rows_of_other_counters_are_kept(value):
-    assert not held_counts(value, 2**64).any()
+    assert not repeated_counts(value, 2**64).any()
 
 
 def test_a_counter_read_at_5_hz_and_published_at_50_hz_gives_no_slip():

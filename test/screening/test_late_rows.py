@@ -209,7 +209,7 @@ def test_rows_that_are_early_or_late_are_moved_to_the_mean():
     late_ns = np.random.default_rng(5).normal(0.0, sigma_s * 1e9, len(even_ns))
     stamps = np.sort(even_ns + np.round(late_ns).astype(np.int64))
     sent = replace(fine.odometer, stamp_ns=stamps)
-    true = late_rows.sampling_times(sent, (sent.stamp_ns - even_ns[0]) * 1e-9, fine.leg().form, [])
+    true, _ = late_rows.sampling_times(sent, (sent.stamp_ns - even_ns[0]) * 1e-9, fine.leg().form)
     off = true - (even_ns - even_ns[0]) * 1e-9
     # the interval is that of 80 times 5 s, and of each 20 s the middle one of 1000 rows
     interval_s, middle_s = (1.25 * sigma_s * x for x in (np.sqrt(2 / 80) / 5.0, 1 / np.sqrt(1000)))
@@ -238,7 +238,7 @@ def test_rows_that_arrive_together_are_distributed(made):
     late = replace(made.odometer, stamp_ns=stamps)
     usual = late_rows.intervals(since_first(late))[0]
     assert usual == pytest.approx(0.02, rel=1e-6)
-    true = late_rows.sampling_times(late, since_first(late), made.leg().form, [])
+    true, _ = late_rows.sampling_times(late, since_first(late), made.leg().form)
     # at rest times are not observable and have no effect
     speed = np.abs(np.gradient(made.odometer.value.astype(float), t)) * made.truth.scale
     off = true - t + (stamps[0] - made.odometer.stamp_ns[0]) * 1e-9

@@ -138,7 +138,7 @@ class _Signals:
     def __init__(self, problem: Problem, fit: Fit, at: Ints, s: Floats) -> None:
         state, motion = fit.state, fit.weighted[MotionRows].motion
         self.leg, self.s = problem.leg, s
-        self.fixed = np.array([not wheel.ahead for wheel in self.leg.wheels])
+        self.fixed = np.array([not wheel.distance_ahead for wheel in self.leg.wheels])
         self.mean = s[self.fixed].mean(axis=0)
         self.path = np.diff(self.mean)
         up = state.C_bv[:, 2]
@@ -176,9 +176,10 @@ class _Signals:
         t = np.arange(self.t[0], self.t[-1], STEER_GRID)
         turn = integral_at(t, leg.t_imu, map_rows(
             lambda w_b: (w_b - state.gyro_bias.mean(axis=0)) @ up, leg.w_b))
-        wheels = [wheel for wheel in leg.wheels if not wheel.ahead]
+        wheels = [wheel for wheel in leg.wheels if not wheel.distance_ahead]
         s = np.mean([as_rolled(wheel, state.constants)(t) for wheel in wheels], axis=0)
-        path = steering_path(t, turn, scale * s, scale * leg.wheels[i].ahead, self._left(i, 0.0))
+        path = steering_path(t, turn, scale * s, scale * leg.wheels[i].distance_ahead,
+                             self._left(i, 0.0))
         return np.diff(np.interp(self.t, t, path))
 
     def line(self, i: int, delay: float, drift: float, width: float) -> Line:
