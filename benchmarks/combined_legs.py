@@ -45,8 +45,8 @@ def driven(vehicle, legs, grade, fixes):
     from odocal_ros.sim.noise import make_rng
     seed = FIRST_SEED + 100 * vehicle
     rng, of_grade = make_rng(seed, 'what the vehicle is'), GRADES[grade]
-    drawn = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
-           'gyro_scale_error': float(of_grade.gyro_scale_error / 3 * rng.standard_normal()),
+    drawn = {'accel_scale_error': float(of_grade.accel_scale_sigma * rng.standard_normal()),
+           'gyro_scale_error': float(of_grade.gyro_scale_sigma / 3 * rng.standard_normal()),
            'scale': float(0.0213 * np.exp(0.01 * rng.standard_normal())),
            'yaw': float(np.deg2rad(2.0) * rng.standard_normal()),
            'pitch': float(np.deg2rad(1.0) * rng.standard_normal())}

@@ -83,7 +83,7 @@ def main():
         drive = simulate(SimOptions(
             scenario=args.scenario, duration=60 * args.minutes, seed=seed, imu_rate=50.0,
             odometer_rate=25.0, imu_grade=args.grade, slope=0.03, slip_walk=0.005, sway=0.02,
-            gyro_scale_error=float(_grade(args.grade).gyro_scale_error * rng.standard_normal())))
+            gyro_scale_error=float(_grade(args.grade).gyro_scale_sigma * rng.standard_normal())))
         config = with_settings(ApplyConfig(), {'imu.grade': args.grade, 'publish.rate': 2.0})
         odometry = Odometry(vehicle_of(calibration(drive.truth, rng), config), config)
         error, cov = error_of(drive, poses_of(drive, odometry))

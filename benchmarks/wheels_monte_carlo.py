@@ -66,7 +66,7 @@ def drive(seed: int) -> dict:
     made = simulate(SimOptions(
         seed=seed, fix_delay=float(LATENCY * draw[0]), odometer_delay=float(
             LATE_ODOMETER * draw[1]), antenna_lever_arm=tuple(map(float, ARM * draw[2:5])),
-        gyro_scale_error=float(grade.gyro_scale_error * draw[6]), **options))
+        gyro_scale_error=float(grade.gyro_scale_sigma * draw[6]), **options))
     settings = {'method': 'smoother', 'imu.grade': made.options.imu_grade,
                 'odometer.nominal_scale': float(made.options.nominal_scale)}
     if given:

@@ -73,7 +73,7 @@ class Errors:
         sigma = np.concatenate([
             np.zeros(3), [tilt_sigma, tilt_sigma, 0.0], np.broadcast_to(bias_sigma, 3),
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
-                                           vehicle.yaw_sigma, grade.gyro_scale_error]])
+                                           vehicle.yaw_sigma, grade.gyro_scale_sigma]])
         self.cov[ALL, ALL] = sigma**2
         self.shortening, self.changed = ZERO, True
         # x of odom is the vehicle's forward axis at the start: the attitude has the error of the

@@ -296,5 +296,5 @@ class Reckoning:
         return covariances(
             self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), by_delay,
             add_scaled(ZERO, forward_n, math.sqrt(travel_variance)),
-            [self.errors.grade.gyro_scale_error * component for component in twist_by_turn],
+            [self.errors.grade.gyro_scale_sigma * component for component in twist_by_turn],
             velocity_variances(self.vehicle, speed, T, increment_variance + self._travel_variance))

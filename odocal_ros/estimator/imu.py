@@ -177,7 +177,8 @@ def sensor_noise(grade: Grade) -> dict[str, float]:
 def without_accelerometer(grade: Grade) -> Grade:
     """Return a grade for an IMU without an accelerometer, whose specific force is gravity."""
     return replace(grade, accel_noise=NO_ACCEL_NOISE, accel_bias=TILT_SIGMA * G,
-                   accel_bias_walk=NO_ACCEL_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
+                   accel_bias_walk=NO_ACCEL_WALK, accel_scale_sigma=0.0,
+                   gyro_by_force_sigma=0.0)
 
 
 def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict[str, float]:

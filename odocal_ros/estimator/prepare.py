@@ -128,11 +128,12 @@ def imperfection_sigmas(grade: Grade) -> Floats:
     axle of a car slides by 0.3 deg per m/s^2, both with a delay of 0.1 s. Over a crest the body
     pitches about the middle of its wheelbase.
     """
-    axes = np.sqrt(2) * grade.misalignment     # two angles: a third one turns the whole frame
+    # two angles: a third one turns the whole frame
+    axes = np.sqrt(2) * grade.misalignment_sigma
     usual = {
-        'gyro_scale': grade.gyro_scale_error, 'gyro_axis': axes,
-        'gyro_by_force': grade.gyro_by_force,       # rad/s per m/s^2
-        'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
+        'gyro_scale': grade.gyro_scale_sigma, 'gyro_axis': axes,
+        'gyro_by_force': grade.gyro_by_force_sigma,       # rad/s per m/s^2
+        'accelerometer_scale': grade.accel_scale_sigma, 'accelerometer_axis': axes,
         'fix_lag_square': 1.0,                      # s^2
         'fix_error_by_motion': 1.4e-3,
         'clock_rate': 2e-5,
@@ -163,7 +164,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     if leg.origin.local_earth_rate:
         gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local_earth_rate.sigma_n)))
     # gravity times the scale error is a bias too
-    bias_up = np.hypot(accel_bias, grade.accel_scale_error * G)
+    bias_up = np.hypot(accel_bias, grade.accel_scale_sigma * G)
     accel_bias_sigma = np.maximum([accel_bias, accel_bias, bias_up], 1e-6)
     mean = np.zeros(layout.M)
     sigma[layout.LIFT], sigma[layout.MEAN_ROLL] = LIFT_SIGMA, MEAN_ROLL_SIGMA

@@ -176,7 +176,7 @@ def make_alignment(level: Level, yaw: float, yaw_sigma: float, source: str, shar
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
                      sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill,
-                     grade.gyro_scale_error, grade.axis_error)
+                     grade.gyro_scale_sigma, grade.axis_error)
 
 
 def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,

@@ -172,7 +172,7 @@ def known_values(run: planar.Run, config: settings.Config) -> planar.PriorKnowle
         offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
         offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,
         gyro_noise=max(grade.gyro_noise, MIN_GYRO_NOISE),
-        gyro_scale_sigma=max(grade.gyro_scale_error, 1e-6),
+        gyro_scale_sigma=max(grade.gyro_scale_sigma, 1e-6),
         gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
     if not config.gnss.correlation_time > 0:
         return known

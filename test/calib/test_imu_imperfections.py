@@ -138,7 +138,7 @@ def test_yaw_sigma_includes_the_misalignment_of_y_and_z_with_a_pitched_imu(skew)
     # with skew the size is that of the other axes; without skew two fifths of the usual sigma,
     # sqrt(2) times that of an axis; the yaw sigma includes it
     held = found.details['accelerometer_axis_yz']['sigma']
-    usual = np.sqrt(2) * GRADES['consumer'].misalignment
+    usual = np.sqrt(2) * GRADES['consumer'].misalignment_sigma
     # seeds 4 to 7 have 0.65 to 0.69, and 0.38 to 0.43 without skew (sizes are means): the limits
     # are their means plus three times their scatter
     assert 0.15 * usual < held < (0.72 if skew else 0.46) * usual

@@ -129,7 +129,7 @@ def test_width_is_no_better_than_the_turns_are_known():
     method = smoothed(made, gnss__max_sigma=100.0)
     assert off(method, made, 'track_width') < SIGMAS
     width = method.estimates['track_width']
-    sold = GRADES['consumer'].gyro_scale_error
+    sold = GRADES['consumer'].gyro_scale_sigma
     # the drive gives some information: heading at the ends to some degrees of 360 and more
     assert 0.2 * sold < width.sigma / width.value < 1.2 * sold
 

@@ -82,11 +82,11 @@ def test_an_imu_configured_with_a_better_grade_has_sigmas_of_its_noise():
     consumer, _ = Case(noisy, settings(imu__grade='consumer')).align()
     grade = GRADES['consumer']
     assert alignment.gyro_bias_walk == consumer.gyro_bias_walk == grade.gyro_bias_walk
-    assert alignment.gyro_scale_sigma == grade.gyro_scale_error
-    assert alignment.gyro_axes_sigma == pytest.approx(np.sqrt(2) * grade.misalignment)
+    assert alignment.gyro_scale_sigma == grade.gyro_scale_sigma
+    assert alignment.gyro_axes_sigma == pytest.approx(np.sqrt(2) * grade.misalignment_sigma)
     # sold with a bias of 25 mg
     assert consumer.level_sigma == pytest.approx(
-        np.hypot(25e-3, np.sqrt(2) * grade.misalignment), rel=0.01)
+        np.hypot(25e-3, np.sqrt(2) * grade.misalignment_sigma), rel=0.01)
 
 
 @pytest.mark.parametrize('rows', [2, 3])

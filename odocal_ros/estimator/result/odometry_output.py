@@ -113,8 +113,8 @@ def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -
         for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'))}
     if grade is not None:
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
-            out[f'{name}_mounting_angle_housing_sigma'] = _entry(
-                _housing_sigma(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
+            out[f'{name}_mounting_angle_housing_sigma'] = _entry(_housing_sigma(
+                value[axis], sigma[axis], sigma[angle], grade.misalignment_sigma), 'rad')
     next_drive = 1e-3       # physical: 1 sigma of the scale between drives, tyres warm or cold
     out['scale_ratio_next_drive_sigma'] = _entry(np.hypot(sigma[layout.LN_K], next_drive), '1')
     return out
