@@ -47,8 +47,8 @@ class BagJob:
     legs: tuple[str, ...]
     settings: str                 # hash of topics, legs and the settings that affect a leg
     folder: str                   # of the data set
-    seconds: float = 0.0          # limit; 0: none
-    memory: int = 0               # limit, bytes; 0: none
+    time_limit_s: float = 0.0     # 0: none
+    memory_limit: int = 0         # bytes; 0: none
 
     @property
     def failed_key(self) -> str:
@@ -62,8 +62,9 @@ class BagJob:
 
     def failed_row(self, reason: str, **fields: Any) -> rows.Row:
         """Return the row of the bag if it cannot be calibrated."""
-        longest = 500    # characters of a reason
-        return self.row(key=self.failed_key, status=rows.FAILED, reason=reason[:longest], **fields)
+        max_length = 500    # characters of a reason
+        return self.row(key=self.failed_key, status=rows.FAILED, reason=reason[:max_length],
+                        **fields)
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,11 @@ def calibrate_bag(job: BagJob) -> BagOutcome:
     with _resource_limits(job, lambda cause: store.put(job.failed_row(cause, seen=fingerprint))):
         try:
             fingerprint = bag_fingerprint(job.bag.bag, job.settings)
-            if found := _existing_row(store, job, fingerprint):
-                return BagOutcome(found.key, found.status, False)
+            if existing := _existing_row(store, job, fingerprint):
+                return BagOutcome(existing.key, existing.status, False)
             row, computed = _compute_row(job, store, fingerprint, started_s)
             store.put(row)
-            store.remember(fingerprint, row.key)
+            store.put_key(fingerprint, row.key)
             store.drop(job.failed_key)
             return BagOutcome(row.key, row.status, computed)
         except OdocalError as error:
@@ -95,8 +96,9 @@ def calibrate_bag(job: BagJob) -> BagOutcome:
         except Exception as error:     # noqa: BLE001 one bag must not stop others
             cause = (f'internal error ({type(error).__name__}: {error_text(error)}); '
                      'please report it')
-            if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
-                cause = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
+            if isinstance(error, MemoryError) or any(text in str(error) for text in NO_MEMORY):
+                cause = ('exceeds the memory limit --task-memory '
+                         f'({job.memory_limit / 2**20:g} MiB)')
     # outside the memory limit: the row needs memory
     row = job.failed_row(cause, seen=fingerprint, seconds=time.monotonic() - started_s)
     store.put(row)
@@ -115,7 +117,7 @@ def _load_libraries() -> None:
 
 def _existing_row(store: rows.RowStore, job: BagJob, fingerprint: str) -> rows.Row | None:
     """Return the existing row of an unchanged bag, None without one."""
-    if key := store.known(fingerprint):
+    if key := store.find_key(fingerprint):
         return store.get(key)
     failed = store.get(job.failed_key)
     # a bag that ended its worker may have no fingerprint: only its path is known
@@ -135,8 +137,8 @@ def _compute_row(job: BagJob, store: rows.RowStore, fingerprint: str,
             sha256 = bag_sha256(bag)
             size = sum(Path(file).stat().st_size for file in bag.files)
         key = rows.key_of(sha256, job.settings)
-        if (equal := store.get(key)) is not None:
-            return replace(equal, bag=job.bag.bag, seen=fingerprint), False
+        if (equal_row := store.get(key)) is not None:
+            return replace(equal_row, bag=job.bag.bag, seen=fingerprint), False
         calibration = calibrate(path, job.topics, job.config, job.legs)
     legs = calibration.result.legs
     return job.row(
@@ -172,18 +174,18 @@ def _resource_limits(job: BagJob, store_failure: Callable[[str], None]) -> Itera
 
     def end() -> None:
         with suppress(Exception):
-            store_failure(f'exceeded the time limit --task-timeout ({job.seconds:g} s)')
+            store_failure(f'exceeded the time limit --task-timeout ({job.time_limit_s:g} s)')
         os.kill(os.getpid(), signal.SIGKILL)
 
-    timer = threading.Timer(job.seconds, end)
+    timer = threading.Timer(job.time_limit_s, end)
     timer.daemon = True
-    if job.seconds:
+    if job.time_limit_s:
         timer.start()
         grace_s = 10.0    # then the process is ended even if the interpreter hangs
-        faulthandler.dump_traceback_later(job.seconds + grace_s, exit=True)
+        faulthandler.dump_traceback_later(job.time_limit_s + grace_s, exit=True)
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    if job.memory:
-        limit = _data_bytes() + job.memory
+    if job.memory_limit:
+        limit = _data_bytes() + job.memory_limit
         resource.setrlimit(resource.RLIMIT_DATA, (
             limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
     try:
@@ -202,13 +204,14 @@ def _data_bytes() -> int:
     return 0
 
 
-def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: float,
-             memory: int, config: Any = None) -> list[BagJob]:
+def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, time_limit_s: float,
+             memory_limit: int, config: Any = None) -> list[BagJob]:
     """
     Return a job for each bag.
 
-    args : parsed options of replay (``add_calibration_arguments``).   config : settings
-    that take precedence, in any form accepted by the library.
+    args : parsed options of replay (``add_calibration_arguments``).   time_limit_s, memory_limit :
+    for a bag, s and bytes.   config : settings, in any form accepted by the library; options and
+    settings files take precedence.
 
     Raises BadUsage, BadConfig: a setting or a settings file is wrong.
     """
@@ -228,8 +231,8 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
         key = rows.settings_key(config_of(settings), topics, legs)
         if is_local(bag.bag):      # valid for workers in any folder
             bag = replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
-        jobs.append(BagJob(bag, topics, settings, legs, key, str(folder.resolve()), seconds,
-                           memory))
+        jobs.append(BagJob(bag, topics, settings, legs, key, str(folder.resolve()), time_limit_s,
+                           memory_limit))
     return jobs
 
 
@@ -237,23 +240,23 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
                   again: bool = False) -> Iterator[tuple[int, BagOutcome]]:
     """Yield (index of the job, outcome) as jobs end; ``again``: retry failed bags."""
     store = rows.RowStore(jobs[0].folder)
-    open_jobs = []
+    missing = []      # indices of jobs without a row
     for i, job in enumerate(jobs):
         if (key := _existing_key(store, job)) is None:
-            open_jobs.append(i)
+            missing.append(i)
             if again:
                 store.drop(job.failed_key)
         else:
-            yield i, BagOutcome(key, 'done', False)
-    submitted = [jobs[i] for i in open_jobs]
+            yield i, BagOutcome(key, rows.DONE, False)
+    submitted = [jobs[i] for i in missing]
     keys = [f'{job.failed_key}-{os.urandom(4).hex()}' for job in submitted]
     for k, outcome, error in task_results(client, calibrate_bag, submitted, 'bag', keys):
-        job = jobs[open_jobs[k]]
         if error is not None:      # the worker was ended each time, or could not write
-            row = store.get(job.failed_key) or job.failed_row(_failure_text(error))
+            row = store.get(submitted[k].failed_key) or submitted[k].failed_row(
+                _failure_text(error))
             store.put(row)
             outcome = BagOutcome(row.key, rows.FAILED, True)
-        yield open_jobs[k], outcome
+        yield missing[k], outcome
 
 
 def _existing_key(store: rows.RowStore, job: BagJob) -> str | None:
@@ -261,7 +264,7 @@ def _existing_key(store: rows.RowStore, job: BagJob) -> str | None:
     if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
         return None
     try:
-        return store.known(bag_fingerprint(job.bag.bag, job.settings))
+        return store.find_key(bag_fingerprint(job.bag.bag, job.settings))
     except BadBag:
         return None
 

@@ -167,11 +167,15 @@ def _csv(table: Path) -> str:
 
 
 def _draw_reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[BagJob],
-                  output: Path, which: str) -> None:
-    """Draw reports of vehicles, each a task; store the cause of a failure, or '', in the row."""
+                  output: Path, selection: str) -> None:
+    """
+    Draw reports of vehicles, each a task; store the cause of a failure, or '', in their rows.
+
+    selection : flagged, all or none.
+    """
     job_of = {job.bag.bag: job for job in jobs}
     reported = [row for row in vehicles if row['current_bags'] and (
-        which == 'all' or which == 'flagged' and tables.needs_inspection(row))]
+        selection == 'all' or selection == 'flagged' and tables.needs_inspection(row))]
     report_jobs = [ReportJob(tuple(job_of[bag] for bag in row['current_bags']), str(
         (output / 'reports' / tables.folder_name(row['vehicle'])).resolve()))
         for row in reported]
@@ -187,7 +191,7 @@ def draw_report(job: ReportJob) -> str:
     errors: list[str] = []
     try:
         with ExitStack() as stack:
-            bags = [stack.enter_context(local_copy(one.bag.bag, None)) for one in job.jobs]
+            bags = [stack.enter_context(local_copy(bag_job.bag.bag, None)) for bag_job in job.jobs]
             calibration = calibrate_bag(bags, first.topics, first.config, first.legs)
             calibration.save(Path(job.output), True, errors.append)
     except OdocalError as error:
@@ -195,24 +199,24 @@ def draw_report(job: ReportJob) -> str:
     return '; '.join(errors)
 
 
-def summary_text(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
-    """Return the summary for the terminal, with remarks on at most ``most`` vehicles."""
+def summary_text(vehicles: Sequence[dict[str, Any]], output: Path, max_vehicles: int) -> str:
+    """Return the summary for the terminal, with remarks on at most ``max_vehicles``."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     failed = sum(row['bags_failed'] for row in vehicles)
     bags = sum(row['bags'] for row in vehicles)
     lines = [', '.join(f'{n} {decision}' for decision, n in sorted(counts.items()))
              + f'; {counted(bags, "bag")}, {failed} failed']
     flagged = [row for row in vehicles if tables.needs_inspection(row)]
-    lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in flagged[:most]]
-    if len(flagged) > most:
-        lines.append(f'  and {len(flagged) - most} more')
+    lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in flagged[:max_vehicles]]
+    if len(flagged) > max_vehicles:
+        lines.append(f'  and {len(flagged) - max_vehicles} more')
     return '\n'.join([*lines, f'written: {output}/ ({TABLE}, vehicles.parquet, legs.parquet)',
                       f'report:  {output / PAGE}'])
 
 
 def exit_code(vehicles: Sequence[dict[str, Any]], strict: bool) -> int:
     """Return 1 for failed bags, and for vehicles that are rejected or do not pass; else 0."""
-    bad = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
+    failing = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
         {Verdict.CAUTION.value} if strict else set())
-    return int(any(row['bags_failed'] or (row['decision'] or row['verdict']) in bad
+    return int(any(row['bags_failed'] or (row['decision'] or row['verdict']) in failing
                    for row in vehicles))

@@ -31,13 +31,14 @@ MIN_LEGS = 3                  # judgement: legs of a reference; a tested leg is 
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
 # rates of a row; recall and false reject refer to good vehicles, false accept to bad ones
 SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
-WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
+KPI_WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
 Limits = dict[str, tuple[float, float]]
 
 
-def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
+def _rates(counts: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
     """Return counts and rates of legs, by (good vehicle, decision); None if a denominator is 0."""
-    good, bad = ({d: counted[is_good, d] for d in Decision} for is_good in (True, False))
+    good, bad = ({decision: counts[is_good, decision] for decision in Decision}
+                 for is_good in (True, False))
     all_good, all_bad = sum(good.values()), sum(bad.values())
     passed = good[Decision.PASS]
     return {
@@ -49,8 +50,8 @@ def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
                             all_good + all_bad)}
 
 
-def _ratio(part: int, all_counts: int) -> float | None:
-    return part / all_counts if all_counts else None
+def _ratio(count: int, total: int) -> float | None:
+    return count / total if total else None
 
 
 def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
@@ -127,10 +128,11 @@ def _table_text(rates: dict[str, Any], output: Path) -> str:
     lines = ['', f'legs tested against the limits: {counts["good"]} good vehicles, '
              f'{counts["bad"]} bad, {counts["on_the_limit"]} left out (undecided, or fewer than '
              f'{MIN_LEGS} legs)',
-             table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)), WIDTHS)]
+             table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)),
+                       KPI_WIDTHS)]
     for row in [*rates['by_minutes'], {'up_to': 'all'} | rates['all']]:
         label = 'longer' if row['up_to'] is None else row['up_to'] if row['up_to'] == 'all' \
             else f'up to {row["up_to"]:g}'
         texts = ('-' if row[k] is None else f'{100 * row[k]:.1f} %' for k in SHARES)
-        lines.append(table_row((label, str(row['legs']), *texts), WIDTHS))
+        lines.append(table_row((label, str(row['legs']), *texts), KPI_WIDTHS))
     return '\n'.join([*lines, f'written: {output / KPI}'])

@@ -33,16 +33,16 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[style.Drawing]:
     """Return each figure that has data."""
-    drawn = []
+    figures = []
     with style.apply_style():
         for name in MAIN_VALUES:
             rows = [row for row in vehicles if row[name] is not None
                     and row[f'{MAIN_VALUES[name]}_deviate'] is not None]
             if rows:
-                drawn.append(_population_figure(name, rows))
-        if chart := _history_figure(vehicles, legs):
-            drawn.append(chart)
-    return drawn
+                figures.append(_population_figure(name, rows))
+        if history := _history_figure(vehicles, legs):
+            figures.append(history)
+    return figures
 
 
 def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
@@ -136,17 +136,12 @@ def _read_points(path: Path, known: set[str],
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
         stride = max(1, file.metadata.num_rows // MAX_POINTS)
-        points, k = [], 0
-        for batch in file.iter_batches(columns=columns, batch_size=10_000, use_threads=False):
-            for row in batch.to_pylist():
-                k += 1
-                vehicle = row['vehicle']
-                if row['scale_factor'] is None or row['verdict'] == 'rejected' \
-                        or vehicle not in known or vehicle not in shown and k % stride:
-                    continue
-                points.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
-                               row['scale_factor_sigma'] or 0.0))
-    return points
+        rows = (row for batch in file.iter_batches(columns=columns, batch_size=10_000,
+                                                   use_threads=False) for row in batch.to_pylist())
+        return [(row['vehicle'], row['start_ns'] / 1e9, row['scale_factor'],
+                 row['scale_factor_sigma'] or 0.0) for k, row in enumerate(rows, 1)
+                if row['scale_factor'] is not None and row['verdict'] != 'rejected'
+                and row['vehicle'] in known and (row['vehicle'] in shown or k % stride == 0)]
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
@@ -159,7 +154,7 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
             tables.group_by_model(row for row in vehicles if row['legs']).items())],
         figures=fleet_figures(vehicles, output / tables.LEGS),
         vehicles=[_vehicle_row(row) for row in vehicles[:max_rows]],
-        left=max(0, len(vehicles) - max_rows))
+        not_shown=max(0, len(vehicles) - max_rows))
 
 
 def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
@@ -219,6 +214,7 @@ def _vehicle_row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cell(row: dict[str, Any], name: str, factor: float) -> str:
+    """Return a value of a row with its sigma, times a factor, as text."""
     if row[name] is None:
         return '-'
     return with_sigma(row[name], row[f'{name}_sigma'], factor, signed=factor != 1.0)
@@ -230,10 +226,10 @@ def remarks(row: dict[str, Any]) -> list[str]:
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+z.2f} %' if change['value'] == 'scale_factor' else
                 f'{DEG * change["size"]:+z.2f} deg')
-        odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
+        too_large = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         texts.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                      f'{change["after"][:10]} and {change["by"][:10]}'
-                     + ', too large for tyres: check the odometer' * odometer)
+                     + ', too large for tyres: check the odometer' * too_large)
     if row['outlier']:
         texts.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
     if row['odd_legs']:

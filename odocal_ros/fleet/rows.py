@@ -47,7 +47,7 @@ class Row:
     odometer_km: float | None = None
     status: str = DONE
     reason: str = ''            # of a failure
-    seen: str = ''              # fingerprint of the bag
+    seen: str = ''              # fingerprint of the bag: file in ``seen``
     sha256: str = ''
     software: str = __version__
     settings: str = '{}'        # JSON, those that are not the default
@@ -112,31 +112,31 @@ class RowStore:
         """Remove the row of a key, if there is one."""
         self.path(key).unlink(missing_ok=True)
 
-    def remember(self, fingerprint: str, key: str) -> None:
+    def put_key(self, fingerprint: str, key: str) -> None:
         """Store the key of a bag's row under the fingerprint of the bag."""
-        path = self._seen(fingerprint)
+        path = self._key_file(fingerprint)
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path.parent):
             write_text(path, key)
 
-    def known(self, fingerprint: str) -> str | None:
+    def find_key(self, fingerprint: str) -> str | None:
         """Return the key of the existing row of a bag, None without one."""
         try:
-            key = self._seen(fingerprint).read_text()
+            key = self._key_file(fingerprint).read_text()
             exists = KEY.fullmatch(key) and _is_complete(self.path(key))
         except (OSError, UnicodeDecodeError):
             return None
         return key if exists else None
 
-    def _seen(self, fingerprint: str) -> Path:
+    def _key_file(self, fingerprint: str) -> Path:
         return self.folder / 'seen' / fingerprint[:2] / fingerprint
 
 
 def row_schema() -> Any:
     """Return the columns of the data set."""
     import pyarrow as pa
-    kinds: dict[Any, Any] = {str: pa.string(), int: pa.int64()}
-    return pa.schema([(f.name, kinds.get(f.type, pa.float64())) for f in fields(Row)])
+    types: dict[Any, Any] = {str: pa.string(), int: pa.int64()}      # others are numbers or None
+    return pa.schema([(field.name, types.get(field.type, pa.float64())) for field in fields(Row)])
 
 
 def _is_complete(path: Path) -> bool:
@@ -180,35 +180,36 @@ def legs_from_text(text: str) -> list[result.LegResult]:
     return legs
 
 
-def _to_json(x: Any) -> Any:
-    if is_dataclass(x):
-        return {TYPE_KEY: type(x).__name__,
-                **{f.name: _to_json(getattr(x, f.name)) for f in fields(x)}}
-    if isinstance(x, Code):
-        return {TYPE_KEY: 'Code', 'of': x.name}
-    if isinstance(x, np.ndarray):
-        return {TYPE_KEY: 'array', 'of': x.ravel().tolist(), 'shape': x.shape}
-    if isinstance(x, np.generic):
-        return x.item()
-    if isinstance(x, tuple):
-        return {TYPE_KEY: 'tuple', 'of': [_to_json(y) for y in x]}
-    if isinstance(x, dict):
-        if all(isinstance(key, str) and key != TYPE_KEY for key in x):
-            return {key: _to_json(y) for key, y in x.items()}
-        return {TYPE_KEY: 'dict', 'of': [[_to_json(key), _to_json(y)] for key, y in x.items()]}
-    return [_to_json(y) for y in x] if isinstance(x, list) else x
+def _to_json(value: Any) -> Any:
+    """Return a value in JSON types; other types are objects with their type at TYPE_KEY."""
+    if is_dataclass(value):
+        return {TYPE_KEY: type(value).__name__,
+                **{field.name: _to_json(getattr(value, field.name)) for field in fields(value)}}
+    if isinstance(value, Code):
+        return {TYPE_KEY: 'Code', 'of': value.name}
+    if isinstance(value, np.ndarray):
+        return {TYPE_KEY: 'array', 'of': value.ravel().tolist(), 'shape': value.shape}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple):
+        return {TYPE_KEY: 'tuple', 'of': [_to_json(item) for item in value]}
+    if isinstance(value, dict):
+        if all(isinstance(key, str) and key != TYPE_KEY for key in value):
+            return {key: _to_json(item) for key, item in value.items()}
+        return {TYPE_KEY: 'dict', 'of': [[_to_json(key), _to_json(item)]
+                                         for key, item in value.items()]}
+    return [_to_json(item) for item in value] if isinstance(value, list) else value
 
 
-def _from_json(x: dict[str, Any]) -> Any:
-    kind = x.get(TYPE_KEY)
+def _from_json(stored: dict[str, Any]) -> Any:
+    """Return the value of an object from ``_to_json``."""
+    kind = stored.get(TYPE_KEY)
     if kind is None:
-        return x
+        return stored
     if kind == 'array':
-        return np.array(x['of']).reshape(x['shape'])
-    if kind == 'tuple':
-        return tuple(x['of'])
-    if kind == 'dict':
-        return dict(x['of'])
+        return np.array(stored['of']).reshape(stored['shape'])
+    if kind in ('tuple', 'dict'):
+        return {'tuple': tuple, 'dict': dict}[kind](stored['of'])
     if kind == 'Code':
-        return Code[x['of']]
-    return STORED_TYPES[kind](**{name: y for name, y in x.items() if name != TYPE_KEY})
+        return Code[stored['of']]
+    return STORED_TYPES[kind](**{name: item for name, item in stored.items() if name != TYPE_KEY})

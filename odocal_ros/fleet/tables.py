@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from_text, Row
 from odocal_ros.fleet.statistics import MODEL_OUTLIER_SIGMAS, population
-from odocal_ros.output.value_text import MAIN_VALUES
+from odocal_ros.output.value_text import MAIN_VALUES, UNKNOWN
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file
 from odocal_ros.safe_io.text_formats import one_line
@@ -34,7 +35,8 @@ VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
 def all_reasons(leg: LegResult) -> list[Reason]:
     """Return the reasons of a leg and of its methods."""
-    return [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+    return [*leg.reasons, *(reason for method in leg.methods.values()
+                            for reason in method.reasons)]
 
 
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
@@ -52,9 +54,9 @@ def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
     """Return the cells of VALUE_COLUMNS, and the unit of the scale."""
     cells: dict[str, Any] = {}
     for name in VALUES:
-        e = estimates.get(name)
-        cells |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
-    return cells | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
+        estimate = estimates.get(name, UNKNOWN)
+        cells |= {name: estimate.value, f'{name}_sigma': estimate.sigma}
+    return cells | {'unit': estimates.get('scale_factor', UNKNOWN).unit}
 
 
 def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
@@ -125,9 +127,9 @@ def folder_name(vehicle: str) -> str:
     from urllib.parse import quote
     name = quote(vehicle, safe=' ')
     name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
-    longest = 120    # characters: a file system allows 255, and temporary files have longer names
-    if len(name) > longest:
-        name = f'{name[:longest]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
+    max_length = 120    # a file system allows 255, and temporary files have longer names
+    if len(name) > max_length:
+        name = f'{name[:max_length]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
     return name
 
 
@@ -149,7 +151,7 @@ def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             values = population(*(np.array([row[key] for row in same_model], float)
                                   for key in (name, f'{name}_sigma')))
             for row, deviate in zip(same_model, values.deviates.tolist(), strict=True):
-                row[f'{short}_deviate'] = None if deviate != deviate else deviate
+                row[f'{short}_deviate'] = None if math.isnan(deviate) else deviate
     for row in rows:
         row['outlier'] = ' '.join(short for short in MAIN_VALUES.values()
                                   if abs(row[f'{short}_deviate'] or 0.0) > MODEL_OUTLIER_SIGMAS)

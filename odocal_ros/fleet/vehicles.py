@@ -28,7 +28,7 @@ from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.stored import known_imu
-from odocal_ros.output.value_text import accept_line, iso, MAIN_VALUES
+from odocal_ros.output.value_text import accept_line, iso, MAIN_VALUES, UNKNOWN
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Reason, Verdict
@@ -52,7 +52,7 @@ class DrivenLeg:
         return leg_estimates(self.leg)
 
 
-def driven_legs(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
+def legs_by_time(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
     """Return the legs of rows by time, with unique bag names as in replay; bags : by path."""
     legs = [legs_from_text(row.legs) for row in rows]
     entries = [{'bag': next((leg.bag for leg in bag_legs), row.bag)}
@@ -60,7 +60,7 @@ def driven_legs(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLe
     with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
     km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
           for row, bag_legs in zip(rows, legs, strict=True) for _ in bag_legs]
-    return sorted(map(DrivenLeg, with_names, km), key=lambda entry: entry.leg.start_ns)
+    return sorted(map(DrivenLeg, with_names, km), key=lambda driven: driven.leg.start_ns)
 
 
 @dataclass(frozen=True)
@@ -82,25 +82,23 @@ class ValueHistory:
         return [self.legs[k] for k in self.by_date.outliers]
 
 
-def history_of(name: str, driven: Sequence[DrivenLeg], config: Config) -> ValueHistory:
+def history_of(name: str, legs: Sequence[DrivenLeg], config: Config) -> ValueHistory:
     """Return the history of a value; a scale is compared by its logarithm."""
-    usable = []
-    for k, entry in enumerate(driven):
-        e = entry.estimates.get(name)
-        if entry.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
-            usable.append((k, e.value, entry.leg.methods[e.method]))
-    if not usable:
+    estimates = [driven.estimates.get(name, UNKNOWN) for driven in legs]
+    numbers = [k for k, driven in enumerate(legs) if driven.leg.verdict is not Verdict.REJECTED
+               and estimates[k].value is not None]
+    if not numbers:
         return ValueHistory()
     is_scale = name == 'scale_factor'
-    numbers, values, methods = (list(column) for column in zip(*usable, strict=True))
-    value = np.array(values)
+    value = np.array([estimates[k].value for k in numbers])
     y = np.log(value / value[0]) if is_scale else np.asarray(wrap(value - value[0]))
-    independent, shared = _errors(name, methods)
-    days = np.array([driven[k].leg.driven_ns for k in numbers]) / DAY_NS
+    independent, shared = _errors(name, [legs[k].leg.methods[estimates[k].method]
+                                         for k in numbers])
+    days = np.array([legs[k].leg.driven_ns for k in numbers]) / DAY_NS
     days -= days[0]
     V = covariance(independent, shared, days,
                    config.verdict.scale_drift_per_day if is_scale else 0.0)
-    km = [driven[k].odometer_km for k in numbers]
+    km = [legs[k].odometer_km for k in numbers]
     by_distance = History() if not is_scale or None in km else history(y, V, np.array(km) / 1000)
     year = 365.25    # days
     return ValueHistory(tuple(numbers), history(y, V, days / year), by_distance)
@@ -111,7 +109,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
     independent = np.zeros(len(methods))
     shared: dict[tuple[Any, ...], np.ndarray] = {}
     for k, method in enumerate(methods):
-        i = method.parameters.index(name)
+        i = method.parameters.index(name)      # row of the effects
         for source in method.sources:
             if not source.shared or source.name in DIFFERING_SOURCES:
                 independent[k] += source.effects[i] @ source.effects[i]
@@ -124,12 +122,12 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 
 def rejecting_reasons(leg: LegResult) -> list[Reason]:
     """Return the reasons that reject a leg, empty if it is not rejected."""
-    return [r for r in all_reasons(leg)
-            if r.code.severity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
+    return [reason for reason in all_reasons(leg) if leg.verdict is Verdict.REJECTED
+            and reason.code.severity is Verdict.REJECTED]
 
 
 def rejected_state_reason(rejected: Sequence[DrivenLeg]) -> Reason:
-    """Return the reason for an unknown current state: the last legs are all rejected."""
+    """Return the reason for an unknown current state, if the last legs are all rejected."""
     last = rejecting_reasons(rejected[-1].leg)[0]
     since = f'{utc(rejected[0].leg.start_ns):%Y-%m-%d}'
     return replace(last, text=f'the last {len(rejected)} legs, since {since}, are all rejected: '
@@ -167,35 +165,36 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     rows = [row for row in read_rows(job.rows) if row.vehicle == job.vehicle]
     done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
     failed = [row for row in rows if row.status != DONE]
-    row = {'vehicle': job.vehicle, 'model': next((b.model for b in job.bags if b.model), ''),
-           'bags': len(rows), 'bags_failed': len(failed),
-           'failures': '; '.join(_failure(Path(r.bag).name, r.reason) for r in failed[:5])}
-    driven = driven_legs(done, {bag.bag: bag for bag in job.bags})
-    if not driven:
+    row = {'vehicle': job.vehicle, 'model': next((bag.model for bag in job.bags if bag.model), ''),
+           'bags': len(rows), 'bags_failed': len(failed), 'failures': '; '.join(
+               _failure(Path(bag_row.bag).name, bag_row.reason) for bag_row in failed[:5])}
+    legs = legs_by_time(done, {bag.bag: bag for bag in job.bags})
+    if not legs:
         limits = with_settings(Config(), job.settings).accept.limits
         return Vehicle(_row_without_legs(row, Decision.UNDECIDED.value if limits else ''), [])
     config = with_settings(done[-1].config(), job.settings)
-    histories = {name: history_of(name, driven, config) for name in MAIN_VALUES}
+    histories = {name: history_of(name, legs, config) for name in MAIN_VALUES}
     # first legs of the periods without changes
     starts = sorted({0}.union(*(values.first_after_change for values in histories.values())))
-    current = driven[starts[-1]:]
-    calibration = combine([entry.leg for entry in current], config, imu=known_imu(config))
-    rejected = driven[1 + max((k for k, entry in enumerate(driven)
-                               if entry.leg.verdict is not Verdict.REJECTED), default=-1):]
+    current = legs[starts[-1]:]
+    calibration = combine([driven.leg for driven in current], config, imu=known_imu(config))
+    rejected = legs[1 + max((k for k, driven in enumerate(legs)
+                             if driven.leg.verdict is not Verdict.REJECTED), default=-1):]
     if len(rejected) >= MIN_REJECTED_LEGS and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(
             calibration, reasons=(rejected_state_reason(rejected), *calibration.reasons))
-    row |= _current_state(calibration, config, driven, starts) | _changes(histories, driven) \
+    row |= _current_state(calibration, config, legs, starts) | _changes(histories, legs) \
         | {'rejected_for': ' '.join(dict.fromkeys(
-            r.code.name for entry in driven for r in rejecting_reasons(entry.leg))),
+            reason.code.name for driven in legs for reason in rejecting_reasons(driven.leg))),
            'rejected_since': utc(rejected[0].leg.start_ns) if rejected else None}
     since = current[0].leg.start_ns
-    row |= {'current_bags': [r.bag for r in done if r.start_ns >= since or r is done[-1]],
+    row |= {'current_bags': [bag_row.bag for bag_row in done
+                             if bag_row.start_ns >= since or bag_row is done[-1]],
             'report': None}
-    legs = [_leg_row(row, k, entry, starts, histories) for k, entry in enumerate(driven)]
-    inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
-                   for r in done)
-    return Vehicle(row, legs, calibration, config, inputs)
+    leg_rows = [_leg_row(row, k, driven, starts, histories) for k, driven in enumerate(legs)]
+    inputs = tuple({'bag': bag_row.bag, 'sha256': bag_row.sha256,
+                    'topics': json.loads(bag_row.topics)} for bag_row in done)
+    return Vehicle(row, leg_rows, calibration, config, inputs)
 
 
 def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
@@ -212,15 +211,15 @@ def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
-def _current_state(calibration: Calibration, config: Config, driven: Sequence[DrivenLeg],
+def _current_state(calibration: Calibration, config: Config, driven_legs: Sequence[DrivenLeg],
                    starts: Sequence[int]) -> dict[str, Any]:
-    """Return the calibration since the last change."""
-    legs = [entry.leg for entry in driven]
+    """Return columns: the calibration since the last change, and sums over all legs."""
+    legs = [driven.leg for driven in driven_legs]
     acceptance = accept(calibration, config)
     return value_cells(calibration.estimates) | {
-        'legs': len(legs), 'legs_good': sum(g.verdict is not Verdict.REJECTED for g in legs),
-        'distance_km': sum(g.distance for g in legs) / 1000,
-        'driven_h': sum(g.duration for g in legs) / 3600,
+        'legs': len(legs), 'legs_good': sum(leg.verdict is not Verdict.REJECTED for leg in legs),
+        'distance_km': sum(leg.distance for leg in legs) / 1000,
+        'driven_h': sum(leg.duration for leg in legs) / 3600,
         'first': utc(legs[0].start_ns), 'last': utc(legs[-1].start_ns),
         'since': utc(legs[starts[-1]].start_ns),
         'verdict': calibration.verdict.value,
@@ -231,12 +230,12 @@ def _current_state(calibration: Calibration, config: Config, driven: Sequence[Dr
         'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
 
 
-def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) -> dict[str, Any]:
-    """Return the changes of all values by date, and the drift of the scale."""
+def _changes(histories: dict[str, ValueHistory], legs: Sequence[DrivenLeg]) -> dict[str, Any]:
+    """Return columns: the changes of all values by date, and the drift of the scale."""
     changes = []
     for name, values in histories.items():
         for change in values.by_date.changes:
-            before, after = (driven[values.legs[k]].leg for k in (change.leg - 1, change.leg))
+            before, after = (legs[values.legs[k]].leg for k in (change.leg - 1, change.leg))
             changes.append({
                 'value': name, 'after': iso(before.start_ns), 'by': iso(after.start_ns),
                 'leg': values.legs[change.leg] + 1,
@@ -251,9 +250,9 @@ def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) ->
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
-def _leg_row(row: dict[str, Any], k: int, entry: DrivenLeg, starts: Sequence[int],
+def _leg_row(row: dict[str, Any], k: int, driven: DrivenLeg, starts: Sequence[int],
              histories: dict[str, ValueHistory]) -> dict[str, Any]:
     """Return the row of leg k of a vehicle; row : of the vehicle."""
-    return leg_row(row['vehicle'], row['model'], k + 1, entry.odometer_km, entry.leg) | {
+    return leg_row(row['vehicle'], row['model'], k + 1, driven.odometer_km, driven.leg) | {
         'period': sum(start <= k for start in starts),
         'odd': any(k in values.outlier_legs for values in histories.values())}

@@ -82,10 +82,12 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
 
 def _method(method: MethodResult) -> dict[str, Any]:
     """Return the entry of a method; arrays among its details are left out."""
-    details = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
+    details = {key: detail for key, detail in method.details.items()
+               if not isinstance(detail, np.ndarray)}
     return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
-            'estimates': {n: {'value': e.value, 'sigma': e.sigma, 'unit': e.unit}
-                          for n, e in method.estimates.items()},
+            'estimates': {name: {'value': estimate.value, 'sigma': estimate.sigma,
+                                 'unit': estimate.unit}
+                          for name, estimate in method.estimates.items()},
             'correlation': {}, 'budget': {}} | details
 
 
@@ -106,16 +108,16 @@ def _leg(leg: LegResult) -> dict[str, Any]:
 
 
 def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[str, Any]]:
-    return [{'length': x.length, 'before': x.before, 'after': x.after}
-            for x in pooled_per_distance(legs)]
+    return [{'length': error.length, 'before': error.before, 'after': error.after}
+            for error in pooled_per_distance(legs)]
 
 
 def plain(value: Any) -> Any:
     """Return a value in JSON types: no numpy, no tuples, None for non-finite numbers."""
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
+        return [plain(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
@@ -152,12 +154,13 @@ class Results:
         self.report = [self.directory / REPORT] * self.has_report
         self.folder = ResultFolder(self.directory, MAIN,
                                    frozenset(program_files.NAMES | {MAIN, REPORT}))
-        self._arguments = calibration, config, as_json(calibration, config, inputs, created)
+        self._calibration, self._config = calibration, config
+        self._content = as_json(calibration, config, inputs, created)
 
     def write(self, force: bool = False) -> list[Path]:
         """Write all but the report; return the paths."""
-        texts = {MAIN: json.dumps(self._arguments[2], indent=2, allow_nan=False) + '\n'}
-        texts |= program_files.texts(*self._arguments)
+        texts = {MAIN: json.dumps(self._content, indent=2, allow_nan=False) + '\n'}
+        texts |= program_files.texts(self._calibration, self._config, self._content)
         with self._bad_usage_for_disk():
             self.folder.put(texts, force)
         return [self.directory / name for name in texts]
@@ -166,7 +169,7 @@ class Results:
         """Add the report, if requested; return the cause if it cannot be drawn, else ''."""
         if not self.has_report:
             return ''
-        page, cause = report_or_error_page(*self._arguments)
+        page, cause = report_or_error_page(self._calibration, self._config, self._content)
         with self._bad_usage_for_disk():
             self.folder.add(REPORT, page)
         return cause

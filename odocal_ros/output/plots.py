@@ -16,6 +16,7 @@ from odocal_ros.output import plot_style as style
 from odocal_ros.output.scale_plots import by_speed, by_window
 
 GAP_COLOURS = {'no fix used': style.PINK, 'no IMU': style.RED, 'no odometer': style.GREEN}
+# NavSatStatus.status: label, marker, colour
 STATUS = {-1: ('no fix (-1)', 'x', style.GREY), 0: ('fix (0)', 'o', style.BLUE),
           1: ('satellite based aid, SBAS (1)', 's', style.GREEN),
           2: ('ground based aid, GBAS or RTK (2)', '^', style.PINK)}
@@ -59,7 +60,7 @@ def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
     """Draw on axes the track as configured and as calibrated over the fixes."""
     start = evidence.track_n[0]
     factor, unit = style.length_unit(np.ptp(evidence.track_n[:, :2], axis=0).max())
-    after, before, fixes = (factor * (x - start)[:, :2] for x in (
+    after, before, fixes = (factor * (points - start)[:, :2] for points in (
         evidence.track_n, evidence.track_before_n, evidence.fix_n))
     shown = style.even_rows(len(fixes))
     ax.plot(*fixes[shown].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
@@ -74,7 +75,7 @@ def draw_track(ax: Any, evidence: Evidence, before_word: str = 'as configured',
         ax.annotate(label, point, xytext=(7 * right, 6 * up), textcoords='offset points',
                     ha='right' if right < 0 else 'left', va='top' if up < 0 else 'bottom')
     _draw_marks(ax, evidence,
-                lambda t: np.stack([np.interp(t, evidence.t, x) for x in after.T]), slips)
+                lambda t: np.stack([np.interp(t, evidence.t, axis) for axis in after.T]), slips)
     is_local = (evidence.fix_status == LOCAL_STATUS).any()
     axes = ('x from', 'y from') if is_local else ('east of', 'north of')
     ax.set(xlabel=f'{axes[0]} the start, {unit}', ylabel=f'{axes[1]} the start, {unit}')
@@ -92,12 +93,13 @@ def _track(evidence: Evidence, name: str, before_word: str,
     return 'Track', text, style.svg(figure, f'{name}-track', text)
 
 
-def _draw_marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
+def _draw_marks(ax: Any, evidence: Evidence, position_at: Callable[..., Any],
                 slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
-    """Mark unused fixes, gaps, slips and the end of the fit; at: positions at times, s."""
+    """Mark unused fixes, gaps, slips and the end of the fit; position_at: of times, s."""
     unused = evidence.t_excluded[style.even_rows(len(evidence.t_excluded))]
     if len(unused):
-        ax.plot(*at(unused), '.', color=style.GREY, markersize=3, zorder=4, label='fix not used')
+        ax.plot(*position_at(unused), '.', color=style.GREY, markersize=3, zorder=4,
+                label='fix not used')
     step = np.diff(evidence.t_fix)
     min_gap = 5.0    # median intervals between fixes
     gaps = [('no fix used', evidence.t_fix[k], evidence.t_fix[k + 1]) for k in np.flatnonzero(
@@ -106,18 +108,19 @@ def _draw_marks(ax: Any, evidence: Evidence, at: Callable[..., Any],
     labelled = set()
     for label, begin, end in gaps:
         ends = np.clip((begin, end), evidence.t[0], evidence.t[-1])
-        ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=GAP_COLOURS[label], linewidth=4,
-                alpha=0.6, zorder=1, solid_capstyle='butt',
+        ax.plot(*position_at(np.linspace(ends[0], ends[1], 50)), '-', color=GAP_COLOURS[label],
+                linewidth=4, alpha=0.6, zorder=1, solid_capstyle='butt',
                 label=None if label in labelled else label)
         if label != 'no fix used':       # marks at the ends make short gaps visible
-            ax.plot(*at(ends), '|', color=GAP_COLOURS[label], markersize=12, markeredgewidth=2)
+            ax.plot(*position_at(ends), '|', color=GAP_COLOURS[label], markersize=12,
+                    markeredgewidth=2)
         labelled.add(label)
     if evidence.t_fit < evidence.t[-1]:
-        ax.plot(*at(np.array([evidence.t_fit])), 'D', color='black', markersize=6,
-                markerfacecolor=style.PINK, zorder=5, label='fitted to here')
+        ax.plot(*position_at(np.array([evidence.t_fit])), 'D', color='black',
+                markersize=6, markerfacecolor=style.PINK, zorder=5, label='fitted to here')
     if len(slips):
-        ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
-                markersize=6, markerfacecolor=style.GREEN, zorder=5, label='slip')
+        ax.plot(*position_at(np.array([slip['t'] + slip['duration'] / 2 for slip in slips])), '^',
+                color='black', markersize=6, markerfacecolor=style.GREEN, zorder=5, label='slip')
 
 
 def draw_residuals(ax: Any, evidence: Evidence) -> None:
@@ -195,9 +198,9 @@ def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style
 
 def _motion(evidence: Evidence, name: str) -> style.Drawing:
     figure, (upper, lower) = style.new_figure_column(3.6, 2)
-    for ax, x in ((upper, 3.6 * evidence.speed), (lower, np.rad2deg(evidence.yaw_rate))):
-        rows = style.peak_rows(x)
-        ax.plot(evidence.t[rows], x[rows], '-', color=style.BLUE, linewidth=1.0)
+    for ax, signal in ((upper, 3.6 * evidence.speed), (lower, np.rad2deg(evidence.yaw_rate))):
+        rows = style.peak_rows(signal)
+        ax.plot(evidence.t[rows], signal[rows], '-', color=style.BLUE, linewidth=1.0)
         ax.axhline(0.0, color=style.GREY, linewidth=0.8)
     upper.set_ylabel('speed, km/h')
     lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')
@@ -212,9 +215,9 @@ def _fixes(evidence: Evidence, name: str) -> style.Drawing:
     for status in np.unique(evidence.fix_status):
         rows = np.flatnonzero(evidence.fix_status == status)
         rows = rows[style.even_rows(len(rows), style.MAX_MARKS // 2)]
-        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', style.GREY))
-        ax.plot(evidence.t_fix[rows], evidence.fix_sigma[rows], shape, color=colour,
-                markersize=3.5, markeredgewidth=0 if shape != 'x' else 1, label=label)
+        label, marker, colour = STATUS.get(int(status), (f'status {status}', 'D', style.GREY))
+        ax.plot(evidence.t_fix[rows], evidence.fix_sigma[rows], marker, color=colour,
+                markersize=3.5, markeredgewidth=0 if marker != 'x' else 1, label=label)
     rows = style.even_rows(len(evidence.t_excluded))
     if len(rows):
         ax.plot(evidence.t_excluded[rows], np.zeros(len(rows)), '.', color=style.GREY,
@@ -230,16 +233,17 @@ def _fixes(evidence: Evidence, name: str) -> style.Drawing:
 
 def _biases(t: Floats, biases: Floats, name: str) -> style.Drawing:
     # without an accelerometer its bias is zero throughout
-    shown = [one for one in zip(biases, (np.rad2deg(3600.0), 1e3), (
-        'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True) if np.any(one[0])]
+    shown = [(columns, factor, label) for columns, factor, label in zip(
+        biases, (np.rad2deg(3600.0), 1e3), ('gyro bias, deg/h', 'accelerometer bias, mm/s²'),
+        strict=True) if np.any(columns)]
     figure, axes = style.new_figure_column(1.8 * len(shown), len(shown))
-    for ax, (columns, factor, word) in zip(axes, shown, strict=True):
+    for ax, (columns, factor, label) in zip(axes, shown, strict=True):
         for column, colour, dash, axis in zip(
                 columns.T, (style.BLUE, style.RED, style.GREEN), ('-', '--', ':'), 'xyz',
                 strict=True):
             rows = style.peak_rows(column)
             ax.plot(t[rows], factor * column[rows], dash, color=colour, linewidth=1.2, label=axis)
-        ax.set_ylabel(word)
+        ax.set_ylabel(label)
     axes[-1].set_xlabel('time since the start mark, s')
     style.add_legend(figure, axes[0])
     figure.align_ylabels(axes)

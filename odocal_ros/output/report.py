@@ -44,13 +44,13 @@ def report_html(calibration: result.Calibration, config: Config, content: dict[s
 
     Raises ImportError: matplotlib or jinja2 is missing.
     """
-    legs, compared, missing = _draw_figures(calibration)
+    legs, comparison, without_figures = _draw_figures(calibration)
     # the first track is shown next to the verdict instead
-    first = legs[0]['figures'][:1] if legs else []
-    if first:
+    first_track = legs[0]['figures'][:1] if legs else []
+    if first_track:
         legs[0]['figures'] = legs[0]['figures'][1:]
-    return render_page('output', NAME, legs=legs, compared=compared, missing=missing,
-                       first=first, **_context(calibration, config, content))
+    return render_page('output', NAME, legs=legs, comparison=comparison, first_track=first_track,
+                       without_figures=without_figures, **_context(calibration, config, content))
 
 
 def render_page(package: str, name: str, **content: Any) -> str:
@@ -91,7 +91,7 @@ def _context(calibration: result.Calibration, config: Config,
         'sentence': sentence(calibration).partition(': ')[2],
         'driven': driven_text(legs),
         'headline': tables.headline(calibration),
-        'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
+        'values': tables.value_rows(calibration), 'undetermined': tables.undetermined(calibration),
         'why': _main_reason(calibration.reasons), 'rotation': rotation_text(calibration),
         'reasons': grouped(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods, legs),
@@ -111,15 +111,18 @@ def _main_reason(reasons: tuple[Reason, ...]) -> Reason | None:
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
-    groups = [(v.value, title, [r for r in join_same_reasons(reasons) if r.code.severity is v])
-              for v, title in TITLES.items()]
+    joined = join_same_reasons(reasons)
+    groups = [(verdict.value, title, [reason for reason in joined
+                                      if reason.code.severity is verdict])
+              for verdict, title in TITLES.items()]
     return [group for group in groups if group[2]]
 
 
 def _by_number_of_values(methods: dict[str, result.MethodResult],
                          estimates: dict[str, result.Estimate]) -> dict[str, result.MethodResult]:
     """Return methods in order of the number of values that the result has from them."""
-    count = Counter(e.method for e in estimates.values() if e.value is not None)
+    count = Counter(estimate.method for estimate in estimates.values()
+                    if estimate.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -count[item[0]]))
 
 
@@ -127,8 +130,8 @@ def _budgets(methods: dict[str, result.MethodResult],
              legs: tuple[result.LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
     """Return (method, error budget) of the methods that have one."""
     local = result.has_local_positions(legs)
-    budgets = [(tables.label(name), tables.budget_table(m, local)) for name, m in methods.items()]
-    return [(name, table) for name, table in budgets if table]
+    return [(tables.label(name), table) for name, method in methods.items()
+            if (table := tables.budget_table(method, local))]
 
 
 def _draw_figures(
@@ -142,20 +145,21 @@ def _draw_figures(
     shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]
     with apply_style():
         comparison = comparison_figure(calibration, 'all')
-        for number, leg, evidence in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
+        for number, leg, evidence in sorted(shown, key=lambda entry: entry[1].start_ns,
+                                            reverse=True):
             if figures and size > MAX_BYTES:
                 break
-            drawn = leg_figures(evidence, f'leg{number}', _relative(leg),
-                                before_label([leg]), _smoothed(leg))
-            size += sum(len(drawing) for _, _, drawing in drawn)
+            drawn = leg_figures(evidence, f'leg{number}', _relative_scale_sigma(leg),
+                                before_label([leg]), _smoother_details(leg))
+            size += sum(len(svg) for _, _, svg in drawn)
             if not figures or size <= MAX_BYTES:
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
-    # also legs whose tracks were removed to save memory
-    with_track = [number for number, leg in numbered if leg.evidence is not None
-                  or leg.before is not None]
-    return legs, comparison, [number for number in with_track if number not in figures]
+    # also of legs whose tracks were removed to save memory
+    without_figures = [number for number, leg in numbered if number not in figures
+                       and (leg.evidence is not None or leg.before is not None)]
+    return legs, comparison, without_figures
 
 
 def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
@@ -174,17 +178,17 @@ def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
             'budgets': _budgets(methods, (leg,)) if several else [],
             'check': check_table((leg,)),
             'reasons': grouped(leg.reasons) if several else [],
-            'left_out': rows, 'findings': findings,
-            'normalised': _smoothed(leg).get('residuals', {}).get('normalised')}
+            'unused_data': rows, 'findings': findings,
+            'normalised': _smoother_details(leg).get('residuals', {}).get('normalised')}
 
 
-def _smoothed(leg: result.LegResult) -> dict[str, Any]:
+def _smoother_details(leg: result.LegResult) -> dict[str, Any]:
     """Return the details of the smoother for a leg, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
 
 
-def _relative(leg: result.LegResult) -> float | None:
+def _relative_scale_sigma(leg: result.LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
     scale = finite_estimate(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None

@@ -34,24 +34,24 @@ def label(name: str, local: bool = False) -> str:
     return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
-def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
-    """Return an estimate in its main unit, in another, and its relative sigma, as text."""
+def estimate_texts(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
+    """Return an estimate as text: in its main unit, in another one, and its relative sigma."""
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
         return UNDETERMINED, '', ''
-    native = texts.with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
+    in_si = texts.with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
     if unit == 'rad':
-        return f'{texts.with_sigma(value, sigma, DEG, signed=True)} deg', native, ''
+        return f'{texts.with_sigma(value, sigma, DEG, signed=True)} deg', in_si, ''
     if unit == 'rad/s':
-        return f'{texts.with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', native, ''
+        return f'{texts.with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', in_si, ''
     if unit == 's':
-        return f'{texts.with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
+        return f'{texts.with_sigma(value, sigma, 1e3, signed=True)} ms', in_si, ''
     if name.startswith('scale'):
         relative = texts.relative_text(sigma / abs(value)) if sigma and value else ''
         other = (texts.inverse_text(estimate) if unit in texts.COUNTS
                  else texts.deviation_text(value, sigma))
-        return native, other, relative
-    return native, '', ''
+        return in_si, other, relative
+    return in_si, '', ''
 
 
 def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
@@ -61,7 +61,7 @@ def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
         estimate = texts.finite_estimate(calibration.estimates, name)
         if estimate.value is None:
             continue
-        first, other, relative = in_units(name, estimate)
+        first, other, relative = estimate_texts(name, estimate)
         largest, share = tables.largest_source(calibration.methods.get(estimate.method), name)
         cause = f'{label(largest, local)} ({100 * share:.0f} %)' if largest else ''
         rows.append({'name': label(name, local), 'value': first, 'other': other,
@@ -74,7 +74,8 @@ def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     lines = []
     for name, text in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
                        ('pitch_mounting_angle', 'pitch mounting')):
-        first, other, relative = in_units(name, texts.finite_estimate(calibration.estimates, name))
+        first, other, relative = estimate_texts(
+            name, texts.finite_estimate(calibration.estimates, name))
         lines.append((text, first, f'± {relative}' if relative else other))
     for longest in tables.pooled_per_distance(calibration.legs)[-1:]:
         lines.append((f'track error in {texts.length_text(longest.length)}',
@@ -96,7 +97,7 @@ def undetermined(calibration: result.Calibration) -> list[str]:
             has_axis = axis in ('x', 'y', 'z')
             axes.setdefault(label(quantity if has_axis else name, local), []).extend(
                 [axis] * has_axis)
-    return [f'{text} {", ".join(letters)}'.rstrip() for text, letters in axes.items()]
+    return [f'{text} {", ".join(axis_names)}'.rstrip() for text, axis_names in axes.items()]
 
 
 def method_table(methods: dict[str, result.MethodResult],
@@ -104,18 +105,20 @@ def method_table(methods: dict[str, result.MethodResult],
     """Return a table of the methods of legs: heads, verdicts, rows (name, cells), reasons."""
     if not methods:
         return None
-    names = dict.fromkeys(n for m in methods.values() for n in m.estimates if n != 'scale_ratio'
-                          or texts.finite_estimate(m.estimates, n).value is not None)
+    names = dict.fromkeys(
+        name for method in methods.values() for name in method.estimates if name != 'scale_ratio'
+        or texts.finite_estimate(method.estimates, name).value is not None)
     rows = []
     for name in names:
         cells = []
         for method in methods.values():
-            first, other, _ = in_units(name, texts.finite_estimate(method.estimates, name))
+            first, other, _ = estimate_texts(name, texts.finite_estimate(method.estimates, name))
             cells.append(('-', '') if name not in method.estimates else (first, other))
         rows.append((label(name, result.has_local_positions(legs)), cells))
-    return {'heads': [label(m) for m in methods],
-            'verdicts': [tables.shown_verdict(m, legs) for m in methods.values()], 'rows': rows,
-            'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
+    return {'heads': [label(name) for name in methods], 'rows': rows,
+            'verdicts': [tables.shown_verdict(method, legs) for method in methods.values()],
+            'reasons': [(label(name), reason) for name, method in methods.items()
+                        for reason in method.reasons]}
 
 
 def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | None:
@@ -126,22 +129,23 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
     local : positions in a local frame.
     """
     table = method.details.get('budget') or {}
-    table = {s: row for s, row in table.items() if isinstance(row, dict)}
-    names = [n for n in dict.fromkeys(k for row in table.values() for k in row if k != 'shared')
-             if texts.finite_estimate(method.estimates, n).value is not None]
-    heads, factors = zip(*(_column(n, texts.finite_estimate(method.estimates, n)) for n in names),
+    table = {source: row for source, row in table.items() if isinstance(row, dict)}
+    estimates = {name: texts.finite_estimate(method.estimates, name)
+                 for row in table.values() for name in row if name != 'shared'}
+    names = [name for name, estimate in estimates.items() if estimate.value is not None]
+    heads, factors = zip(*(_column(name, estimates[name]) for name in names),
                          strict=True) if names else ((), ())
-    variances = [sum(_number(row, n)**2 for row in table.values()) for n in names]
+    variances = [sum(_number(row, name)**2 for row in table.values()) for name in names]
     rows, small = [], []
     min_share = 0.005    # of a variance
     for source, row in table.items():
-        shares = [_number(row, n)**2 / variance if variance else 0.0
-                  for n, variance in zip(names, variances, strict=True)]
+        shares = [_number(row, name)**2 / variance if variance else 0.0
+                  for name, variance in zip(names, variances, strict=True)]
         if max(shares, default=0.0) < min_share:
             small.append(label(source, local))
             continue
-        cells = [None if part < min_share else (significant(_number(row, n) * factor), part)
-                 for n, factor, part in zip(names, factors, shares, strict=True)]
+        cells = [None if share < min_share else (significant(_number(row, name) * factor), share)
+                 for name, factor, share in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
     totals = [significant(math.sqrt(variance) * factor)
               for variance, factor in zip(variances, factors, strict=True)]
@@ -171,10 +175,10 @@ def unused_data(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reas
         counts = Counter(leg.evidence.excluded_because)
         total = sum(counts.values())
         times = leg.evidence.t_excluded
-        for reason, n in counts.most_common():
+        for reason, listed in counts.most_common():
             t = [time for time, cause in zip(times, leg.evidence.excluded_because, strict=True)
                  if cause == reason]
-            count = round(n * leg.evidence.excluded / total)      # the list is thinned
+            count = round(listed * leg.evidence.excluded / total)      # the list is thinned
             rows.append((f'{count} of {leg.evidence.fixes + leg.evidence.excluded} fixes',
                          f'{reason}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
     elif leg.rejected_fixes:

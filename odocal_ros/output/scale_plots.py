@@ -4,7 +4,7 @@
 """Figures of the scale: against speed, by window, and legs and methods side by side."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,25 @@ from odocal_ros.output.value_text import ANGLES, finite_estimate, with_sigma
 STYLES = (('o', style.BLUE), ('s', style.RED), ('^', style.GREEN), ('D', style.PINK),
           ('v', 'black'), ('P', style.GREY))
 MAX_LEGS = 40    # judgement: bars that are distinguishable in a picture
-# title, (text, method, value, sigma) of each value, band of the result: middle and half width
-Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
+# text on the leg, name of the method, its estimates
+Row = tuple[str, str, dict[str, Estimate]]
+
+
+class Point(NamedTuple):
+    """A value with its sigma, in the unit of a panel."""
+
+    text: str
+    method: str
+    value: float
+    sigma: float
+
+
+class Panel(NamedTuple):
+    """Values of one quantity side by side."""
+
+    title: str
+    points: list[Point]
+    band: tuple[float, float] | None      # value and sigma of the result
 
 
 def draw_by_speed(ax: Any, scale: SpeedScale) -> None:
@@ -83,63 +100,66 @@ def by_window(windows: Floats, name: str) -> style.Drawing:
 
 def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:
     """Draw scale, yaw and pitch by method and leg; empty for single values."""
-    rows = [(f'all legs, {m.replace("_", " ")}', m, method.estimates)
-            for m, method in calibration.methods.items()] if len(calibration.legs) > 1 else []
+    rows = [(f'all legs, {name.replace("_", " ")}', name, method.estimates)
+            for name, method in calibration.methods.items()] if len(calibration.legs) > 1 else []
     for number, leg in list(enumerate(calibration.legs, 1))[-MAX_LEGS:]:
-        rows += [(f'leg {number}, {m.replace("_", " ")}', m, method.estimates)
-                 for m, method in leg.methods.items()]
-    panels = [(title, points, band) for title, points, band in (
+        rows += [(f'leg {number}, {name.replace("_", " ")}', name, method.estimates)
+                 for name, method in leg.methods.items()]
+    panels = [panel for panel in (
         _scale_panel(calibration, rows),
-        *(_angle_panel(calibration, rows, angle) for angle in ANGLES)) if len(points) > 1]
+        *(_angle_panel(calibration, rows, angle) for angle in ANGLES)) if len(panel.points) > 1]
     return [_draw_panels(panels, name, len(calibration.legs))] if panels else []
 
 
-def _scale_panel(calibration: Calibration,
-                 rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
-    """Return the panel of scales, rows of (text, method, estimates), relative to the result."""
+def _scale_panel(calibration: Calibration, rows: list[Row]) -> Panel:
+    """Return the panel of scales, relative to the result."""
     result = finite_estimate(calibration.estimates, 'scale_factor')
-    points = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
-              for text, method, e in ((text, method, finite_estimate(estimates, 'scale_factor'))
-                                      for text, method, estimates in rows)
-              if e.value is not None and result.value]
-    factor, unit = relative_unit(max((abs(x) + sigma for _, _, x, sigma in points), default=0.0))
+    points = []
+    for text, method, estimates in rows:
+        scale = finite_estimate(estimates, 'scale_factor')
+        if scale.value is not None and result.value:
+            points.append(Point(text, method, scale.value / result.value - 1,
+                                (scale.sigma or 0.0) / abs(result.value)))
+    factor, unit = relative_unit(max((abs(point.value) + point.sigma for point in points),
+                                     default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * factor) if result.value else None
-    return f'scale minus result, {unit}', [
-        (text, method, x * factor, sigma * factor) for text, method, x, sigma in points], band
+    return Panel(f'scale minus result, {unit}', [
+        point._replace(value=point.value * factor, sigma=point.sigma * factor)
+        for point in points], band)
 
 
-def _angle_panel(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]],
-                 name: str) -> Panel:
+def _angle_panel(calibration: Calibration, rows: list[Row], name: str) -> Panel:
     """Return the panel of a mounting angle, deg."""
     result = finite_estimate(calibration.estimates, name)
     points = []
     for text, method, estimates in rows:
-        e = finite_estimate(estimates, name)
-        if e.value is not None:
-            points.append((text, method, e.value * DEG, (e.sigma or 0.0) * DEG))
+        angle = finite_estimate(estimates, name)
+        if angle.value is not None:
+            points.append(Point(text, method, angle.value * DEG, (angle.sigma or 0.0) * DEG))
     band = None if result.value is None else (result.value * DEG, (result.sigma or 0.0) * DEG)
-    return f'{ANGLES[name]} mounting angle, deg', points, band
+    return Panel(f'{ANGLES[name]} mounting angle, deg', points, band)
 
 
 def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
-    heights = [0.24 * len(points) for _, points, _ in panels]
+    heights = [0.24 * len(panel.points) for panel in panels]
     height = sum(heights) + 0.75 * len(panels)
     figure, axes = style.new_figure_column(height, len(panels), sharex=False, heights=heights)
     figure.subplots_adjust(left=0.27, hspace=0.75 * len(panels) / sum(heights),
                            top=1 - 0.1 / height)
-    methods = dict.fromkeys(m for _, points, _ in panels for _, m, _, _ in points)
-    shapes = {m: STYLES[i % len(STYLES)] for i, m in enumerate(methods)}
-    for ax, (title, points, band) in zip(axes, panels, strict=True):
-        if band is not None and all(map(math.isfinite, band)):
-            ax.axvspan(band[0] - band[1], band[0] + band[1], color=style.BAND, linewidth=0)
-            ax.axvline(band[0], color=style.GREY, linewidth=0.8)
-        for row, (_, method, value, sigma) in enumerate(points):
-            shape, colour = shapes[method]
-            ax.errorbar(value, row, xerr=sigma, fmt=shape, color=colour, markersize=5,
+    methods = dict.fromkeys(point.method for panel in panels for point in panel.points)
+    styles = {method: STYLES[i % len(STYLES)] for i, method in enumerate(methods)}
+    for ax, panel in zip(axes, panels, strict=True):
+        if panel.band is not None and all(map(math.isfinite, panel.band)):
+            value, sigma = panel.band
+            ax.axvspan(value - sigma, value + sigma, color=style.BAND, linewidth=0)
+            ax.axvline(value, color=style.GREY, linewidth=0.8)
+        for row, point in enumerate(panel.points):
+            marker, colour = styles[point.method]
+            ax.errorbar(point.value, row, xerr=point.sigma, fmt=marker, color=colour, markersize=5,
                         capsize=3, linewidth=1.1)
-        ax.set_yticks(range(len(points)), [text for text, *_ in points])
-        ax.set_ylim(len(points) - 0.5, -0.5)
-        ax.set_xlabel(title)
+        ax.set_yticks(range(len(panel.points)), [point.text for point in panel.points])
+        ax.set_ylim(len(panel.points) - 0.5, -0.5)
+        ax.set_xlabel(panel.title)
     text = 'Bars: one sigma to each side; grey band: the result.' + (
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
         'random errors would.' if legs > 1 else '') + (

@@ -32,13 +32,13 @@ SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade'
 class Stored:
     """A calibration read from its file."""
 
-    name: str                           # of the file
+    name: str                           # path of the file or folder
     created: str                        # ISO 8601
     verdict: Verdict
     reasons: tuple[str, ...]            # codes
     estimates: dict[str, Estimate]
     legs: frozenset[tuple[int, int]]    # (start, stop) ns
-    bags: frozenset[str]                # sha256 of each known
+    bags: frozenset[str]                # sha256 of the bags, as far as known
     config: dict[str, Any]              # settings by dotted name
     # parameter -> source -> one-sigma effect in the unit of the parameter, True if all legs share
     # the error
@@ -87,21 +87,21 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
     schema = content.get('schema')
     if schema != SCHEMA or isinstance(schema, bool):
         raise ValueError(f'schema is {str(schema)[:20]}, this version reads {SCHEMA}')
-    verdict = _part(content, 'verdict', str)
-    if verdict not in [v.value for v in Verdict]:
+    verdict = _entry(content, 'verdict', str)
+    if verdict not in [known.value for known in Verdict]:
         raise ValueError(f'verdict is {verdict[:20]!r}')
-    result = _part(content, 'result', dict)
-    legs = [leg for leg in _part(content, 'legs', list) if isinstance(leg, dict)]
-    inputs = [i for i in _part(content, 'inputs', list) if isinstance(i, dict)]
-    methods = _part(content, 'methods', dict)
+    result = _entry(content, 'result', dict)
+    legs = [leg for leg in _entry(content, 'legs', list) if isinstance(leg, dict)]
+    inputs = [i for i in _entry(content, 'inputs', list) if isinstance(i, dict)]
+    methods = _entry(content, 'methods', dict)
     return Stored(
-        name, _part(content, 'created', str), Verdict(verdict),
-        tuple(str(r.get('code')) for r in _part(content, 'reasons', list) if isinstance(r, dict)),
+        name, _entry(content, 'created', str), Verdict(verdict),
+        tuple(str(r.get('code')) for r in _entry(content, 'reasons', list) if isinstance(r, dict)),
         {key: _estimate(entry, key) for key, entry in result.items() if key not in NOT_ESTIMATES},
         frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
                   if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
         frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
-        _part(content, 'config', dict),
+        _entry(content, 'config', dict),
         {key: _budget(methods, entry.get('method'), key) for key, entry in result.items()
          if key not in NOT_ESTIMATES},
         str(content.get('vehicle') or ''),
@@ -133,12 +133,12 @@ def known_imu(config: Config) -> CarriedInformation | None:
     return stored.imu
 
 
-def _part(content: dict[str, Any], key: str, kind: type[T]) -> T:
+def _entry(content: dict[str, Any], key: str, kind: type[T]) -> T:
     """Return an entry of a type, or raise ValueError."""
     if not isinstance(content.get(key), kind):
         raise ValueError(f'{key!r} is missing or has the wrong type')
-    part: T = content[key]
-    return part
+    entry: T = content[key]
+    return entry
 
 
 def _estimate(entry: dict[str, Any], key: str) -> Estimate:

@@ -20,7 +20,7 @@ ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
 LABEL_WIDTH = 19      # judgement: columns of the label of a value
-# contents of shorter and shorter summaries: small errors, notes, budget
+# shorter and shorter summaries: True if they contain small errors, notes, the budget
 SHORTER = ((True, True, True), (False, True, True), (False, False, True), (False, False, False))
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
            Verdict.REJECTED: 'do not use these values'}
@@ -37,14 +37,14 @@ def screen(calibration: result.Calibration, styled: bool = False, width: int = t
     order; verdict, values and actions are not.   brief : omit these, and tables of legs and
     methods that repeat the values.
     """
-    for small, notes, budget in SHORTER[-1:] if brief else SHORTER:
+    for small_errors, notes, budget in SHORTER[-1:] if brief else SHORTER:
         parts = [_head_lines(calibration, styled), _value_lines(calibration, width),
                  [] if brief and len(calibration.legs) == 1 else _leg_table(calibration.legs,
                                                                             width),
                  [] if brief else tables.method_lines(calibration),
                  tables.search_lines(calibration.legs),
                  tables.track_lines(calibration.legs, width),
-                 _budget_lines(calibration, width, small) if budget else [],
+                 _budget_lines(calibration, width, small_errors) if budget else [],
                  texts.reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
         if rows is None or text.count('\n') < rows:
@@ -91,9 +91,9 @@ def _head_lines(calibration: result.Calibration, styled: bool) -> list[str]:
 
 def driven_text(legs: tuple[result.LegResult, ...]) -> str:
     """Return the number of legs, their length and duration, as text."""
-    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
-    number = texts.counted(len(legs), 'leg')
-    return f'{number}, {texts.length_text(distance)} in {texts.duration_text(duration)}'
+    distance = texts.length_text(sum(leg.distance for leg in legs))
+    duration = texts.duration_text(sum(leg.duration for leg in legs))
+    return f'{texts.counted(len(legs), "leg")}, {distance} in {duration}'
 
 
 def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
@@ -195,7 +195,7 @@ def _path_ratio_line(calibration: result.Calibration, scale: result.Estimate,
         (scale, 'scale factor') if as_sent.value is None else (as_sent, 'factor of the raw speed'))
     if not factor.value or not path:
         return ''
-    ratio = sum(r * distance for r, distance in ratios) / path
+    ratio = sum(leg_ratio * distance for leg_ratio, distance in ratios) / path
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     four_digits = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'
     return _line('  path ratio', f'{four_digits}{unit}   fixes / odometer, '
@@ -231,13 +231,13 @@ def _lever_arm_line(estimates: dict[str, result.Estimate], arm: str, label: str,
 def _largest_error_lines(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
     largest = []
-    for name, short in texts.MAIN_VALUES.items():
+    for name, short_name in texts.MAIN_VALUES.items():
         estimate = texts.finite_estimate(calibration.estimates, name)
-        source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
+        source, share = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
             label = tables.source_label(source, result.has_local_positions(calibration.legs))
-            largest.append(f'{short}: {label} ({100 * part:.0f} %)')
+            largest.append(f'{short_name}: {label} ({100 * share:.0f} %)')
     # lines are broken between the values only
     lines = textwrap.wrap('; '.join(largest).replace(' ', '\xa0').replace(';\xa0', '; '),
                           width - 22)
@@ -288,7 +288,8 @@ def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
             '-' if yaw.value is None else texts.with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
-def _budget_lines(calibration: result.Calibration, width: int, small: bool) -> list[str]:
+def _budget_lines(calibration: result.Calibration, width: int, name_small: bool) -> list[str]:
+    """Return the lines of the error budget of the method that gives the scale."""
     estimates = calibration.estimates
     scale = texts.finite_estimate(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
@@ -297,4 +298,4 @@ def _budget_lines(calibration: result.Calibration, width: int, small: bool) -> l
     hidden = {name for name in estimates if texts.finite_estimate(estimates, name).value is None}
     min_share = 0.01    # of a variance: smaller sources have no line
     return tables.budget_lines(method.details.get('budget'), scale.value, min_share, hidden,
-                               width, small, result.has_local_positions(calibration.legs))
+                               width, name_small, result.has_local_positions(calibration.legs))

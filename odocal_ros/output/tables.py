@@ -21,15 +21,15 @@ from odocal_ros.safe_io.text_formats import for_table
 from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
-SCALES = {'scale_factor': '', 'scale_ratio': '1'}      # units; '': that of the calibration
+SCALE_UNITS = {'scale_factor': '', 'scale_ratio': '1'}      # '': that of the calibration
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
           'fix_latency': 'fix delay', 'gnss_delay': 'fix delay',
           'receiver_smoothing': 'fix smoothing'}
 BUDGET_HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
-WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
-CHECKS = 'before', 'after'      # the calibration: fields of LegResult
-LABEL, CELL = 22, 9      # judgement: columns
+BUDGET_WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
+CHECKS = 'before', 'after'      # fields of LegResult: before and after the calibration
+CHECK_LABEL_WIDTH, CHECK_CELL_WIDTH = 22, 9      # judgement: columns
 
 
 def leg_table(calibration: result.Calibration, config: Config,
@@ -52,9 +52,10 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
 
 def _row(number: int, leg: result.LegResult, calibration: result.Calibration) -> dict[str, Any]:
     """Return a row; missing values of a leg are empty cells."""
-    used = {e.method for e in calibration.estimates.values() if e.value is not None}
-    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
-                               if m.name in used or not used)]
+    used = {estimate.method for estimate in calibration.estimates.values()
+            if estimate.value is not None}
+    reasons = [*leg.reasons, *(reason for method in leg.methods.values()
+                               if method.name in used or not used for reason in method.reasons)]
     row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': texts.iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,
@@ -63,7 +64,7 @@ def _row(number: int, leg: result.LegResult, calibration: result.Calibration) ->
            'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
     wheels = dict.fromkeys(result.wheel_factors(calibration.estimates), '') | {
         name: 'm' for name in calibration.estimates if name.startswith('track_width')}
-    for name, unit in (SCALES | wheels | dict.fromkeys(texts.ANGLES, 'rad')).items():
+    for name, unit in (SCALE_UNITS | wheels | dict.fromkeys(texts.ANGLES, 'rad')).items():
         if name in calibration.estimates:
             unit = unit or calibration.estimates[name].unit
             estimate = _estimate(leg, calibration, name)
@@ -86,8 +87,8 @@ def search_lines(legs: tuple[result.LegResult, ...]) -> list[str]:
     """Return a table of each leg's search, empty without one."""
     lines = []
     for k, leg in enumerate(legs, 1):
-        search = next((m.details['search'] for m in leg.methods.values()
-                       if m.details.get('search')), None)
+        search = next((method.details['search'] for method in leg.methods.values()
+                       if method.details.get('search')), None)
         if not search:
             continue
         best, after = search['best_row'], search['after']
@@ -117,7 +118,7 @@ def shown_verdict(method: result.MethodResult, legs: tuple[result.LegResult, ...
     repeated = overlapping_legs([leg for leg in legs
                                  if verdict_of(leg.reasons) is not Verdict.REJECTED])
     leg_verdicts = [verdict_of(leg.reasons) for leg in legs if leg not in repeated]
-    used = [v for v in leg_verdicts if v is not Verdict.REJECTED] or leg_verdicts
+    used = [verdict for verdict in leg_verdicts if verdict is not Verdict.REJECTED] or leg_verdicts
     worst = Verdict.worst([method.verdict, *used])
     if worst is method.verdict:
         return worst.value
@@ -135,16 +136,17 @@ def method_lines(calibration: result.Calibration) -> list[str]:
                           for n in ('scale_factor', *texts.ANGLES))
         rows.append((name, '-' if scale.value is None
                      else texts.with_sigma(scale.value, scale.sigma),
-                     *('-' if a.value is None else
-                       texts.with_sigma(a.value, a.sigma, math.degrees(1.0), signed=True)
-                       for a in angles),
-                     shown_verdict(method, calibration.legs) + _refused(method)))
+                     *('-' if angle.value is None else
+                       texts.with_sigma(angle.value, angle.sigma, math.degrees(1.0), signed=True)
+                       for angle in angles),
+                     shown_verdict(method, calibration.legs) + _rejection_text(method)))
     return texts.table_lines(rows)
 
 
-def _refused(method: result.MethodResult) -> str:
-    """Return the first code for which a method is rejected, '' if it is not."""
-    codes = [r.code.name for r in method.reasons if r.code.severity is Verdict.REJECTED]
+def _rejection_text(method: result.MethodResult) -> str:
+    """Return ': CODE', the first code for which a method is rejected, '' if it is not."""
+    codes = [reason.code.name for reason in method.reasons
+             if reason.code.severity is Verdict.REJECTED]
     return f': {codes[0]}' if codes else ''
 
 
@@ -183,8 +185,8 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_shar
     if not table:
         return []
     factor = {PARAMETERS[0]: 1e6 / scale}
-    variances = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in PARAMETERS]
-    lines = [texts.table_row(BUDGET_HEAD, WIDTHS)]
+    variances = [sum(row.get(name, 0.0)**2 for row in table.values()) for name in PARAMETERS]
+    lines = [texts.table_row(BUDGET_HEAD, BUDGET_WIDTHS)]
     small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
@@ -196,7 +198,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_shar
         cells = ['-' if share < min_share else
                  f'{significant(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(PARAMETERS, shares, strict=True)]
-        lines.append(texts.table_row([source_label(name, local), *cells], WIDTHS)
+        lines.append(texts.table_row([source_label(name, local), *cells], BUDGET_WIDTHS)
                      + (shared if row.get('shared') else ''))
     if not (small and name_small):
         return lines
@@ -222,28 +224,31 @@ def pooled_check(checks: list[tuple[result.TrackCheck | None, int]]) -> result.T
 def pooled_per_distance(legs: Sequence[result.LegResult]) -> list[result.PerDistance]:
     """Return the error per distance driven of all legs, pooled over sections."""
     by_distance: dict[float, list[result.PerDistance]] = {}
-    for error in (x for leg in legs for x in leg.per_distance):
-        by_distance.setdefault(error.length, []).append(error)
+    for leg in legs:
+        for error in leg.per_distance:
+            by_distance.setdefault(error.length, []).append(error)
     pooled = []
     for distance, errors in sorted(by_distance.items()):
-        count = sum(x.pieces for x in errors)
-        before, after = (math.sqrt(sum(x.pieces * getattr(x, name)**2 for x in errors) / count)
-                         for name in CHECKS)
+        count = sum(error.pieces for error in errors)
+        before, after = (
+            math.sqrt(sum(error.pieces * getattr(error, name)**2 for error in errors) / count)
+            for name in CHECKS)
         pooled.append(result.PerDistance(distance, before, after, count))
     return pooled
 
 
 def before_label(legs: Sequence[result.LegResult]) -> str:
     """Return the label of the track before calibration."""
-    configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
-                     for leg in legs for m in leg.methods.values())
+    configured = any(
+        method.estimates.get('scale_ratio', texts.UNKNOWN).value is not None
+        for leg in legs for method in leg.methods.values())
     return 'as configured' if configured else 'uncalibrated'
 
 
 def check_table(
         legs: tuple[result.LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
-    pieces = pooled_per_distance(legs)
+    per_distance = pooled_per_distance(legs)
     rows = []
     for label, name in zip((before_label(legs), 'as calibrated'), CHECKS, strict=True):
         check = pooled_check([(getattr(leg, name), leg.fixes) for leg in legs])
@@ -251,11 +256,11 @@ def check_table(
             share = check.percent_of_distance
             rows.append((label, [
                 *(texts.length_text(distance) for distance in (
-                    *(getattr(x, name) for x in pieces),
+                    *(getattr(error, name) for error in per_distance),
                     check.rms, check.max, check.mean, check.end)),
                 f'{share:.{3 if share < 100 else 0}f} %']))
-    heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
-             for x in pieces]
+    heads = [f'in {error.length:g} m' if error.length < 1000 else f'in {error.length / 1000:g} km'
+             for error in per_distance]
     return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows
 
 
@@ -264,7 +269,7 @@ def track_lines(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     heads, rows = check_table(legs)
     if not rows:
         return []
-    column_count = (width - LABEL) // CELL
-    return [texts.table_row([label, *cells[:column_count]],
-                            [LABEL - 2, *[CELL] * len(cells[:column_count])])
+    column_count = (width - CHECK_LABEL_WIDTH) // CHECK_CELL_WIDTH
+    return [texts.table_row([label, *cells[:column_count]], [
+        CHECK_LABEL_WIDTH - 2, *[CHECK_CELL_WIDTH] * len(cells[:column_count])])
             for label, cells in (('track against fixes', heads), *rows)]

@@ -169,14 +169,14 @@ def _legs_text(numbers: list[str]) -> str:
     """Return increasing leg numbers as text."""
     if len(numbers) == 1:
         return f'leg {numbers[0]}'
-    runs: list[list[str]] = []
+    consecutive: list[list[str]] = []
     for number in numbers:
-        if runs and int(number) == int(runs[-1][-1]) + 1:
-            runs[-1].append(number)
+        if consecutive and int(number) == int(consecutive[-1][-1]) + 1:
+            consecutive[-1].append(number)
         else:
-            runs.append([number])
-    ranges = [word for run in runs
-              for word in (run if len(run) < 3 else [f'{run[0]} to {run[-1]}'])]
+            consecutive.append([number])
+    ranges = [word for group in consecutive
+              for word in (group if len(group) < 3 else [f'{group[0]} to {group[-1]}'])]
     if len(ranges) == 1:
         return f'legs {ranges[0]}'
     return f'legs {", ".join(ranges[:-1])} and {ranges[-1]}'
@@ -231,12 +231,12 @@ def accept_words(acceptance: Acceptance) -> list[str]:
 
 
 def _decision_text(entry: ValueDecision) -> str:
-    e, angle = entry.estimate, entry.estimate.unit == 'rad'
-    factor = math.degrees(1.0) if angle else 1.0
-    unit = ' deg' if angle else f' {e.unit}' * (e.unit not in ('', '1'))
+    estimate, is_angle = entry.estimate, entry.estimate.unit == 'rad'
+    factor = math.degrees(1.0) if is_angle else 1.0
+    unit = ' deg' if is_angle else f' {estimate.unit}' * (estimate.unit not in ('', '1'))
     name = entry.name.replace('_', ' ')
-    limits = ' to '.join('any' if math.isinf(x) else f'{x * factor:g}'
-                         for x in (entry.low, entry.high))
-    shown = 'not determined' if e.value is None else (
-        f'{with_sigma(e.value, e.sigma, factor)}{unit}')
+    limits = ' to '.join('any' if math.isinf(limit) else f'{limit * factor:g}'
+                         for limit in (entry.low, entry.high))
+    shown = 'not determined' if estimate.value is None else (
+        f'{with_sigma(estimate.value, estimate.sigma, factor)}{unit}')
     return f'{entry.decision.value:9} {name} {shown}, limits {limits}{unit}'

@@ -115,8 +115,8 @@ def test_a_truncated_row_is_computed_again(tmp_path, spoil):
     store, key = RowStore(tmp_path), key_of('a bag')
     row = Row(key=key, bag='drive', vehicle='7')
     store.put(row)
-    store.remember('ab' * 20, key)
-    assert store.known('ab' * 20) == key
+    store.put_key('ab' * 20, key)
+    assert store.find_key('ab' * 20) == key
     assert store.get(key) == row
     store.path(key).write_bytes(spoil(store.path(key).read_bytes()))
     assert store.get(key) is None
@@ -124,7 +124,7 @@ def test_a_truncated_row_is_computed_again(tmp_path, spoil):
         list(read_rows([store.path(key)]))
     for odd in (b'../../x', b'\xff\xfe', b''):
         (tmp_path / 'seen' / 'ab' / ('ab' * 20)).write_bytes(odd)
-        assert store.known('ab' * 20) is None
+        assert store.find_key('ab' * 20) is None
 
 
 def test_legs_from_text_combine_to_the_same_digits():

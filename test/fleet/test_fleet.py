@@ -199,7 +199,7 @@ def test_a_bag_that_hangs_and_an_invalid_one_do_not_stop_others(fleet, client, t
     with silent_server() as url:
         bags = [replace(good[0], bag=url), replace(good[0], bag=str(tmp_path / 'no.mcap')), *good]
         jobs = fleet.jobs(tmp_path / 'out', bags=bags, seconds=0)
-        jobs[0] = replace(jobs[0], seconds=6.0)
+        jobs[0] = replace(jobs[0], time_limit_s=6.0)
         assert sorted(computed(client, jobs)[1]) == [DONE] * 3 + [FAILED] * 2
     rows = stored(tmp_path / 'out')
     assert rows[url].reason == 'exceeded the time limit --task-timeout (6 s)'
