@@ -9,20 +9,10 @@ from drives import cached, settings
 import numpy as np
 
 from odocal_ros.data.samples import VelocitySamples
-from odocal_ros.estimator import make_smoother_leg, smooth
+from odocal_ros.estimator import make_smoother_leg, smooth, state as layout
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.state import (
-    GNSS_DELAY,
-    LN_K,
-    M,
-    ODO_DELAY,
-    PITCH,
-    SIZE_WITHOUT_SLOW,
-    State,
-    YAW,
-)
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -81,7 +71,7 @@ def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
         stamp, stamp, v, np.full(v.shape, stated)))
 
 
-def truth(drive, config, leg) -> State:
+def truth(drive, config, leg) -> layout.State:
     """Return the true state at the keyframes of a leg, on level ground."""
     o = drive.options
     imu = make_problem(leg, config).imu
@@ -99,11 +89,11 @@ def truth(drive, config, leg) -> State:
     C_nb = C_nb @ C_vb
     v_n = np.einsum('kij,kj->ki', to_n, motion.velocity_n(state))
     p_n = leg.origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
-    constants = np.zeros(M)
-    constants[[LN_K, YAW, PITCH, ODO_DELAY, GNSS_DELAY]] = (
+    constants = np.zeros(layout.M)
+    constants[[layout.LN_K, layout.YAW, layout.PITCH, layout.ODO_DELAY, layout.GNSS_DELAY]] = (
         np.log(o.scale), *mounting_from_forward(C_vb[0]), o.odometer_delay, o.fix_delay)
     v_n = v_n + np.cross(turning, arm_n)
-    return State(t, p_n + arm_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
+    return layout.State(t, p_n + arm_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
                  np.zeros((len(t), 3)), constants).with_mean_up()
 
 
@@ -129,4 +119,4 @@ def along_axis(problem, state, axis, constants):
     part = Equations(problem, state).factors['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     return ((C_vn @ part.raw[:, D, None])[:, axis, 0],
-            (C_vn @ part.jacobians(SIZE_WITHOUT_SLOW)[2][:, D, constants])[:, axis])
+            (C_vn @ part.jacobians(layout.SIZE_WITHOUT_SLOW)[2][:, D, constants])[:, axis])

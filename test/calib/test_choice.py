@@ -8,13 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.choice import (
-    choose,
-    deciding_methods,
-    disagreements,
-    rejected_method_reasons,
-    relevant_reasons,
-)
+from odocal_ros.calib import choice
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
 from odocal_ros.pipeline.combination import combine, inconsistent_legs
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -44,7 +38,7 @@ def several(*methods):
 
 def chosen(methods, setting, name='scale_factor'):
     """Return the chosen value and the methods that determine it."""
-    estimates, giving = choose(methods, setting)
+    estimates, giving = choice.choose(methods, setting)
     return estimates[name].value, giving
 
 
@@ -52,14 +46,14 @@ def test_each_value_comes_from_the_first_method_that_is_not_rejected():
     ends, refused = method('two_point'), method('two_point', None, None, [REFUSED])
     methods = several(ends, method('smoother', 2.1, None, [NO_YAW]))
     assert chosen(methods, 'all') == (2.1, ('smoother', 'two_point'))
-    assert choose(methods, 'all')[0]['yaw_mounting_angle'].method == 'two_point'
+    assert choice.choose(methods, 'all')[0]['yaw_mounting_angle'].method == 'two_point'
     fell = method('smoother', 2.1, reasons=[REFUSED])
     assert chosen(several(fell, ends), 'auto')[0] == 2.0
     # all methods are rejected; only one is required
     assert chosen(several(fell, refused), 'auto') == (2.1, ('smoother',))
     assert chosen(several(method('smoother', 2.1), refused), 'two_point') == (
         None, ('two_point',))
-    assert choose(several(ends), 'wheels') == ({}, ())
+    assert choice.choose(several(ends), 'wheels') == ({}, ())
 
 
 def test_end_points_do_not_give_a_pitch_that_the_smoother_cannot_determine():
@@ -75,32 +69,33 @@ def test_end_points_do_not_give_a_pitch_that_the_smoother_cannot_determine():
     ('patent', ('smoother', 'two_point')), ('auto', ('smoother', 'two_point')),
     ('all', ('smoother', 'two_point'))])
 def test_two_point_is_always_computed_for_marks_of_the_operator(setting, run):
-    assert deciding_methods(setting, shown=True) == run
+    assert choice.deciding_methods(setting, shown=True) == run
 
 
 def test_reasons_about_a_value_from_another_method_are_not_reported():
-    both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'all')
-    alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'all')
-    assert relevant_reasons([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
-    assert relevant_reasons([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
+    fell = method('smoother', 2.1, None, [NO_YAW])
+    both, _ = choice.choose(several(fell, method('two_point')), 'all')
+    alone, _ = choice.choose(several(fell), 'all')
+    assert choice.relevant_reasons([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
+    assert choice.relevant_reasons([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
 
 
 def test_rejected_method_is_named_if_a_later_method_gives_the_value():
     fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
-    found, = rejected_method_reasons(several(method('two_point'), fell), 'auto')
+    found, = choice.rejected_method_reasons(several(method('two_point'), fell), 'auto')
     assert found.code is Code.METHOD_REJECTED
     assert found.remedy.endswith('which may not detect this problem.')
     assert found.text == 'smoother is not used, because of CHORD_TOO_SHORT: a loop'
     # reported by the leg; after the method that gives the value; no method gives it; not required
-    assert rejected_method_reasons(several(method('two_point'), fell), 'auto',
-                                   {REFUSED.code}) == []
+    assert choice.rejected_method_reasons(several(method('two_point'), fell), 'auto',
+                                          {REFUSED.code}) == []
     loop = method('two_point', reasons=[REFUSED])
-    assert rejected_method_reasons(several(loop, method('smoother')), 'auto') == []
-    assert rejected_method_reasons(several(loop, fell), 'auto') == []
-    assert rejected_method_reasons(several(method('two_point'), fell), 'two_point') == []
+    assert choice.rejected_method_reasons(several(loop, method('smoother')), 'auto') == []
+    assert choice.rejected_method_reasons(several(loop, fell), 'auto') == []
+    assert choice.rejected_method_reasons(several(method('two_point'), fell), 'two_point') == []
     # a missing second wheel is not a fault of the drive
     none = method('smoother', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
-    assert rejected_method_reasons(several(none, method('two_point')), 'all') == []
+    assert choice.rejected_method_reasons(several(none, method('two_point')), 'all') == []
 
 
 @pytest.mark.parametrize(('other', 'text', 'cause'), [
@@ -109,7 +104,7 @@ def test_rejected_method_is_named_if_a_later_method_gives_the_value():
     ({'scale': 1.9}, 'by -5 %, ', 'marks'), ({'yaw': 0.01 + 5e-3}, '+0.286 deg', 'heading'),
     ({'scale': 2.0 + 0.99 * LIMIT}, None, ''), ({'scale': 3.0, 'reasons': [REFUSED]}, None, '')])
 def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause(other, text, cause):
-    found = disagreements(several(method('smoother'), method('two_point', **other)))
+    found = choice.disagreements(several(method('smoother'), method('two_point', **other)))
     assert [r.code for r in found] == [Code.METHODS_DISAGREE] * bool(text)
     assert all(text in r.text and cause in r.text for r in found)
 
@@ -163,7 +158,7 @@ def test_rejection_of_a_leg_is_reported_once():
 def test_method_missing_in_one_leg_of_two_is_reported_once():
     fell = method('smoother', reasons=[REFUSED])
     one = leg(1, fell, method('two_point'),
-              reasons=rejected_method_reasons(several(fell, method('two_point')), 'all'))
+              reasons=choice.rejected_method_reasons(several(fell, method('two_point')), 'all'))
     combined = combine([one, leg(2, method('smoother'), method('two_point'))], ALL).reasons
     assert [r.code for r in combined if 'a loop' in r.text] == [Code.LEG_REJECTED]
     combined = combine([one], ALL)

@@ -9,19 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.odometer import as_rolled, STENCIL_REACH
 from odocal_ros.estimator.imu import ImuSteps, STEP
 from odocal_ros.estimator.preintegrate import preintegrate
-from odocal_ros.estimator.state import (
-    ACCEL,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-    M,
-    ODO_CLOCK,
-    ODO_DELAY,
-    ODO_LAG2,
-)
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import exp_so3, skew
 
@@ -86,9 +77,9 @@ def test_constant_turn_equals_its_closed_form(rate):
 
 def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
     """Otherwise a scale error of 1 explains bias drift, and the random walk becomes small."""
-    t, constants = np.arange(0.0, 5.001, 0.01), np.zeros(M)
-    by_rate = np.array(GYRO_SIGNAL) < 3        # not multiplied by the force, which has a bias
-    constants[GYRO], constants[ACCEL] = 0.2 * by_rate, 0.1
+    t, constants = np.arange(0.0, 5.001, 0.01), np.zeros(layout.M)
+    by_rate = np.array(layout.GYRO_SIGNAL) < 3     # not multiplied by the force, which has a bias
+    constants[layout.GYRO], constants[layout.ACCEL] = 0.2 * by_rate, 0.1
     one = np.ones((len(t), 1))
     _, sums, points = summed(samples(t, one * BIAS, one * FORCE_BIAS), [1.23, 3.91], constants)
     # second order in the turn by the bias within a step
@@ -101,7 +92,7 @@ def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
             np.testing.assert_allclose(zero, 0.0, atol=tolerance)
     # an error of the bias is also an error of the signal
     by_bias = np.eye(3, 6)
-    by_bias[GYRO_AXIS, GYRO_SIGNAL] -= 0.2 * by_rate
+    by_bias[layout.GYRO_AXIS, layout.GYRO_SIGNAL] -= 0.2 * by_rate
     np.testing.assert_allclose(sums.R_by_gyro[0, :, :3], by_bias[:, :3], atol=1e-9)
 
 
@@ -182,8 +173,8 @@ def travel(t, answer=1.0, delay=0.0):
 
 
 def rolled(readings, delay, square):
-    constants = np.zeros(M)
-    constants[ODO_DELAY], constants[ODO_LAG2] = delay, square
+    constants = np.zeros(layout.M)
+    constants[layout.ODO_DELAY], constants[layout.ODO_LAG2] = delay, square
     return as_rolled(Travel(FINE, readings, 0.0), constants)(AT)
 
 
@@ -217,8 +208,8 @@ def test_derivative_by_the_squared_lag_is_half_the_acceleration(square):
 def test_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
     """A drive that starts in motion has that of its first second; no readings exist beyond."""
     push = 2.0                                  # m/s^2
-    constants = np.zeros(M)
-    constants[ODO_LAG2] = T**2
+    constants = np.zeros(layout.M)
+    constants[layout.ODO_LAG2] = T**2
     readings = Travel(AT, push * AT**2 / 2, 0.0)
     expected = push * (AT**2 - T**2) / 2
     np.testing.assert_allclose(as_rolled(readings, constants)(AT), expected, atol=1e-9)
@@ -226,8 +217,8 @@ def test_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
 
 def test_fast_clock_is_corrected():
     """The delay is defined at t = 0, where the clocks differ only by it."""
-    fast, constants = 1e-3, np.zeros(M)
-    constants[ODO_DELAY], constants[ODO_CLOCK] = T, fast
+    fast, constants = 1e-3, np.zeros(layout.M)
+    constants[layout.ODO_DELAY], constants[layout.ODO_CLOCK] = T, fast
     readings = Travel(FINE * (1 + fast) + T, travel(FINE), 0.0)
     # readings are interpolated linearly between samples
     loose = SWING * BEAT**2 * (FINE[1] - FINE[0])**2 / 8 + 1e-9

@@ -7,12 +7,7 @@ import math
 
 import pytest
 
-from odocal_ros.calib.number_text import (
-    format_change,
-    relative_with_limit,
-    significant,
-    with_limit,
-)
+from odocal_ros.calib import number_text
 
 pytestmark = pytest.mark.core
 
@@ -21,7 +16,7 @@ pytestmark = pytest.mark.core
     (0.0, '0'), (1205.3, '1200'), (0.0266, '0.027'), (-3.04, '-3.0'), (2e-6, '2e-06'),
     (math.inf, 'unknown')])
 def test_number_has_two_significant_digits(x, text):
-    assert significant(x) == text
+    assert number_text.significant(x) == text
 
 
 @pytest.mark.parametrize(('sigma', 'limit', 'text'), [
@@ -30,14 +25,14 @@ def test_number_has_two_significant_digits(x, text):
     (18828e-6, 1e-3, '1.9 %; the limit is 0.1 %'),
     (0.025, 0.02, '2.5 %; the limit is 2 %')])
 def test_sigma_and_its_limit_have_one_unit_and_differ(sigma, limit, text):
-    assert relative_with_limit(sigma, limit) == text
+    assert number_text.relative_with_limit(sigma, limit) == text
 
 
 def test_value_just_beyond_its_limit_gets_more_digits():
-    assert with_limit(0.49861, 0.49847, 'deg') == '0.499 deg; the limit is 0.498 deg'
+    assert number_text.with_limit(0.49861, 0.49847, 'deg') == '0.499 deg; the limit is 0.498 deg'
 
 
 @pytest.mark.parametrize(('change', 'text'), [
     (2143e-6, '+0.214 %'), (-0.9018, '-90.2 %'), (-1e-8, '+0 %')])
 def test_change_is_in_per_cent(change, text):
-    assert format_change(change) == text
+    assert number_text.format_change(change) == text

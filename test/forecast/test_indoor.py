@@ -11,12 +11,7 @@ import pytest
 
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.forecast.forecast import Abandoned
-from odocal_ros.forecast.planned_indoor import (
-    pattern_motion,
-    PATTERNS,
-    predict_robot,
-    Robot,
-)
+from odocal_ros.forecast.planned_indoor import pattern_motion, PATTERNS, predict_robot, Robot
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, ratio_sigma, robot_of
 from odocal_ros.pipeline.calibrate import calibrate

@@ -8,16 +8,7 @@ import resource
 import time
 
 from bench import wait_for
-from kills import (
-    check_replay,
-    drive,
-    killed,
-    remains,
-    replayed,
-    same_result,
-    stamps_of,
-    wrong,
-)
+from kills import check_replay, drive, killed, remains, replayed, same_result, stamps_of, wrong
 import numpy as np
 from player import by_now, ends_of, light, messages_of, moved, playing_to, straight
 import pytest

@@ -3,6 +3,7 @@
 
 """The worker, the answer of ~/save, and ``latest``: a worse result does not replace it."""
 
+import json
 import os
 from pathlib import Path
 import threading
@@ -84,7 +85,8 @@ def test_neither_the_answer_nor_a_leg_waits_for_the_report(saving, tmp_path, mon
     monkeypatch.setattr('odocal_ros.output.files.report_or_error_page', lambda *_: (
         gate.wait(20), ('<html></html>', ''))[1])
     saving.save(GOOD, tmp_path)
-    assert (tmp_path / 'latest' / 'calibration.json').exists()
+    content = json.loads((tmp_path / 'latest' / 'calibration.json').read_text())
+    assert content['inputs'][0]['node'] == '/calibrator'
     assert not (tmp_path / 'latest' / 'report.html').exists()
     worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
     wait_for(lambda: worker.poll() or done, 'the leg')

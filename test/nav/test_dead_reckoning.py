@@ -20,11 +20,7 @@ from odocal_ros.nav.dead_reckoning import (
 )
 from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import (
-    matrix_from_rpy,
-    quat_from_matrix,
-    quat_from_rotvec,
-)
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, quat_from_rotvec
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.screening.screen import screen
 

@@ -12,14 +12,8 @@ import pytest
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, BadUsage
+from odocal_ros.library import find_legs
 from odocal_ros.library.arguments import LegSpan, parse_leg
-from odocal_ros.library.find_legs import (
-    _marked_spans,
-    coverage_reasons,
-    find_legs,
-    marked_legs,
-    missing_stop_reasons,
-)
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -79,12 +73,13 @@ def test_marks_of_each_run_are_found_and_cancelled_legs_are_not():
         ('2', 20 * S, 0, 'started'), ('2', 20 * S, 0, 'cancelled'), ('2', 20 * S, 0, ''),
         ('3', 30 * S, 0, 'started'), ('3', 30 * S, 40 * S, 'stopped'),
         ('3', 30 * S, 40 * S, 'undone'), ('4', 50 * S, 0, 'started')])
-    assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
-    ended, broken_off = missing_stop_reasons([(5 * S, 9 * S), (50 * S, 70 * S)], marked_legs(bag))
+    marked = find_legs.marked_legs(bag)
+    assert marked == [(5 * S, 9 * S), (50 * S, 0)]
+    ended, broken_off = find_legs.missing_stop_reasons([(5 * S, 9 * S), (50 * S, 70 * S)], marked)
     assert (ended, [r.code for r in broken_off]) == ((), [Code.STOP_MARK_MISSING])
     bag = StatusBag([('1', 5 * S, 9 * S, 'stopped'), ('1', 20 * S, 0, 'started'),
                      ('1', 20 * S, 30 * S, 'stopped')])
-    assert marked_legs(bag) == [(5 * S, 9 * S), (20 * S, 30 * S)]
+    assert find_legs.marked_legs(bag) == [(5 * S, 9 * S), (20 * S, 30 * S)]
 
 
 def recorded(drive):
@@ -109,7 +104,7 @@ def moving(drive, stamp):
 
 def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
     recorder, bag = recorded(out_and_back)
-    (leg,) = find_legs(recorder, bag, [], [], Config())
+    (leg,) = find_legs.find_legs(recorder, bag, [], [], Config())
     # the opening standstill ends, and the closing one begins, within the detector's window
     assert abs(leg[0] - out_and_back.truth.start_ns) < S
     assert leg[1] >= out_and_back.truth.stop_ns - 2 * S
@@ -124,15 +119,15 @@ def test_stamps_without_common_time_are_refused(out_and_back):
         rows = recorder.rows(slot)
         late.feed(slot, replace(rows, stamp_ns=rows.stamp_ns + 8 * 3600 * S * (slot == 'fix')))
     with pytest.raises(BadData, match='no time in common: IMU .* fix .*; stamp all sensors with'):
-        find_legs(late, bag, [], [], Config())
+        find_legs.find_legs(late, bag, [], [], Config())
     mark = int(out_and_back.truth.start_ns), int(out_and_back.truth.stop_ns)
-    assert find_legs(late, bag, [], [mark], Config()) == [mark]
+    assert find_legs.find_legs(late, bag, [], [mark], Config()) == [mark]
 
 
 @pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
 def test_a_topic_that_covers_half_of_the_recording_is_reported(out_and_back, slot):
     whole, _ = recorded(out_and_back)
-    assert coverage_reasons(whole) == ()
+    assert find_legs.coverage_reasons(whole) == ()
     begin, end = out_and_back.imu.stamp_ns[[0, -1]]
     half_s = (end - begin) / 2 / S
     for early in (True, False):
@@ -141,7 +136,7 @@ def test_a_topic_that_covers_half_of_the_recording_is_reported(out_and_back, slo
             rows = whole.rows(name)
             kept = (rows.stamp_ns < (begin + end) // 2) == early
             recorder.feed(name, take(rows, kept | (name != slot)))
-        (reason,) = coverage_reasons(recorder)
+        (reason,) = find_legs.coverage_reasons(recorder)
         assert reason.code is Code.TOPIC_GAP
         missing = float(reason.text.split(' s ')[0].split()[-1])
         assert missing == pytest.approx(half_s, abs=2.0)      # fixes come each second
@@ -150,7 +145,7 @@ def test_a_topic_that_covers_half_of_the_recording_is_reported(out_and_back, slo
 
 def test_each_stop_splits_the_recording_at_standstills(out_and_back):
     recorder, bag = recorded(out_and_back)
-    legs = find_legs(recorder, bag, ['each-stop'], [], Config())
+    legs = find_legs.find_legs(recorder, bag, ['each-stop'], [], Config())
     assert len(legs) == 2
     assert legs[0][1] == legs[1][0]
     for edge in (e for leg in legs for e in leg):
@@ -160,11 +155,11 @@ def test_each_stop_splits_the_recording_at_standstills(out_and_back):
 def test_marks_take_precedence_over_standstills_and_options_over_marks(out_and_back):
     recorder, bag = recorded(out_and_back)
     mark = (bag.start_ns + 100 * S, bag.start_ns + 200 * S)
-    assert find_legs(recorder, bag, [], [mark], Config()) == [mark]
+    assert find_legs.find_legs(recorder, bag, [], [mark], Config()) == [mark]
     requested = parse_leg('120:150')
-    assert find_legs(recorder, bag, [requested], [mark], Config()) == [
+    assert find_legs.find_legs(recorder, bag, [requested], [mark], Config()) == [
         (bag.start_ns + 120 * S, bag.start_ns + 150 * S)]
-    still_open = find_legs(recorder, bag, [], [(mark[0], 0)], Config())
+    still_open = find_legs.find_legs(recorder, bag, [], [(mark[0], 0)], Config())
     assert still_open[0][1] == min(out_and_back.imu.stamp_ns[-1],
                                    np.median(out_and_back.imu.stamp_ns[-5:]),
                                    np.median(out_and_back.odometer.stamp_ns[-5:]),
@@ -174,11 +169,11 @@ def test_marks_take_precedence_over_standstills_and_options_over_marks(out_and_b
 def test_a_leg_outside_the_bag_is_refused_with_the_span_of_the_bag(out_and_back):
     recorder, bag = recorded(out_and_back)
     with pytest.raises(BadUsage, match=r'runs from 0 to \d+\.\d s'):
-        find_legs(recorder, bag, [parse_leg('5000:6000')], [], Config())
+        find_legs.find_legs(recorder, bag, [parse_leg('5000:6000')], [], Config())
 
 
 def test_a_recording_that_ends_at_its_start_mark_is_reported():
     bag = SimpleNamespace(name='2026-01-02T03-04-05Z_leg_1')
     with pytest.raises(BadData, match='ended at the start mark.* drive it again'):
-        _marked_spans([(10, 0)], 10, bag)
-    assert _marked_spans([(10, 0)], 11, bag) == [(10, 11)]
+        find_legs._marked_spans([(10, 0)], 10, bag)
+    assert find_legs._marked_spans([(10, 0)], 11, bag) == [(10, 11)]

@@ -10,12 +10,7 @@ from drives import kept, shifted
 import numpy as np
 
 from odocal_ros.nav.geodesy import C_en
-from odocal_ros.nav.rotations import (
-    heading_from_yaw,
-    matrix_from_rpy,
-    rpy_from_matrix,
-    transpose,
-)
+from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_rpy, rpy_from_matrix, transpose
 from odocal_ros.pipeline.align import align
 from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen

@@ -56,7 +56,7 @@ def test_a_frame_that_ros_refuses_is_replaced_and_reported(frame):
     assert written == texts('imu_link')[1]
 
 
-def test_valid_frames_are_kept_and_a_leading_slash_is_removed():
+def test_valid_and_empty_frames_are_kept_and_configured_ones_take_precedence():
     for frame in ('imu_link', 'car/imu-top.1', '3dm_gx5'):
         made, written = texts(frame)
         assert made.reasons == ()
@@ -65,13 +65,12 @@ def test_valid_frames_are_kept_and_a_leading_slash_is_removed():
     assert [r.code for r in made.reasons] == [Code.FRAME_REPLACED]
     assert '--child-frame-id imu\n' in written['imu_transform.txt']
     assert texts('')[0].reasons == ()
-
-
-def test_a_configured_frame_takes_precedence_over_the_received_one():
     config = with_settings(Config(), {'frames.imu': 'top'})
     made, written = texts('$(command x)', config=config)
     assert made.reasons == ()
     assert '--child-frame-id top\n' in written['imu_transform.txt']
+    made = calibration()
+    assert with_imu_frame(made, Config(), '') == (made, Config())
 
 
 @pytest.mark.parametrize('frame', [*ATTACKS, '/base_link'])
@@ -111,15 +110,12 @@ def test_the_name_of_a_bag_stays_within_its_comment(bag):
             assert shlex.split(text, comments=True) == shlex.split(plain[name], comments=True)
 
 
-def test_arguments_reach_a_shell_command_unchanged():
+def test_arguments_reach_shell_and_launch_unchanged():
     words = ['a b', "it's", '$(touch x)', '`x`', '', '-', 'ü']
     script = f'printf "%s\\0" {text_formats.for_shell(words)}'
     out = subprocess.run(['bash', '-c', script], text=True, stdout=subprocess.PIPE,
                          check=True).stdout
     assert out.split('\0')[:-1] == words
-
-
-def test_launch_does_not_substitute_escaped_text():
     text = text_formats.for_launch(["$(command 'x')", '"', '\\'])
     # launch's grammar: $( begins a substitution unless a backslash stands before it
     assert '$(' not in text.replace('\\$(', '')
@@ -135,10 +131,16 @@ def test_text_in_yaml_is_read_back_as_text(text):
         '/**': {'ros__parameters': {'a': {'b': text}}}}
 
 
-def test_a_terminal_shows_control_characters_and_keeps_the_style_of_the_verdict():
+def test_text_for_a_terminal_is_escaped_and_cut():
     assert text_formats.for_terminal('\x1b[1;32mACCEPTED\x1b[0m\na\x1b[2Jb\rc\x9b') == (
         '\x1b[1;32mACCEPTED\x1b[0m\na\\x1b[2Jb\\rc\\x9b')
     assert text_formats.one_line('a\nb\udcff') == 'a\\nb\\udcff'
+    colours = '\x1b[1;31mstd_msgs/msg/Int64\x1b[0m'
+    assert '\x1b' not in text_formats.for_terminal(colours)
+    for text in ('x' * 2_000_000, '\x1b' * 2_000_000, '\n' * 2_000_000):
+        assert len(text_formats.brief_line(text)) <= text_formats.LONGEST_LINE + 4
+        assert len(text_formats.error_text(ValueError(text))) <= text_formats.LONGEST_LINE + 4
+    assert text_formats.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
 
 
 def test_only_cli_py_calls_print():
@@ -153,20 +155,6 @@ def test_no_cell_of_a_spreadsheet_is_a_formula():
     rows = leg_table(replace(made, legs=legs), Config(), {})[LEGS].splitlines()
     assert rows[1].startswith("1,'=cmd")
     assert rows[2].startswith('2,drive,')
-
-
-def test_an_empty_frame_changes_nothing():
-    made = calibration()
-    assert with_imu_frame(made, Config(), '') == (made, Config())
-
-
-def test_foreign_colours_are_escaped_and_long_lines_are_cut():
-    colours = '\x1b[1;31mstd_msgs/msg/Int64\x1b[0m'
-    assert '\x1b' not in text_formats.for_terminal(colours)
-    for text in ('x' * 2_000_000, '\x1b' * 2_000_000, '\n' * 2_000_000):
-        assert len(text_formats.brief_line(text)) <= text_formats.LONGEST_LINE + 4
-        assert len(text_formats.error_text(ValueError(text))) <= text_formats.LONGEST_LINE + 4
-    assert text_formats.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
 
 
 def test_folders_of_one_name_are_numbered_up_to_a_limit(tmp_path, monkeypatch):

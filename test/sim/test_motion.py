@@ -7,14 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.geodesy import (
-    C_en,
-    E2,
-    ecef_from_geodetic,
-    gravity,
-    OMEGA,
-    SEMI_MAJOR_AXIS,
-)
+from odocal_ros.nav.geodesy import C_en, E2, ecef_from_geodetic, gravity, OMEGA, SEMI_MAJOR_AXIS
 from odocal_ros.nav.rotations import exp_so3, skew
 from odocal_ros.sim import motion as true_motion
 from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
