@@ -11,7 +11,6 @@ time or many at a time.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 import heapq
 from operator import itemgetter
 import os
@@ -24,8 +23,8 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import RawMessages
 from odocal_ros.safe_io.limits import Allowance, LATEST_NS, LimitReached
 
-PREALLOCATED_BYTES = 2**23      # judgement: bytes
-BATCH_MESSAGES = 20_000         # judgement: most messages of a batch
+PREALLOCATED_BYTES = 2**23      # judgement: larger than a block of a file that is read at once
+BATCH_MESSAGES, BATCH_BYTES = 20_000, 2**24      # judgement: limits of a batch
 ZSTD = b'\x28\xb5\x2f\xfd'      # format: first bytes of compressed data
 # language of a message definition, by its name in a bag
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
@@ -80,7 +79,7 @@ class BagFile:
     A file of a bag: its channels by number, their counts, first and last time.
 
     ``path`` is the file that is read, ``recorded_path`` that of the user, which may be compressed.
-    ``damage`` describes the damage found so far, empty if none; complete only after reading.
+    ``damage`` describes the first damage found so far, empty if none.
     """
 
     def __init__(self, path: Path, allowance: Allowance) -> None:
@@ -96,11 +95,11 @@ class BagFile:
         for batch in self._fast_batches(topics) or in_batches(self.messages(topics)):
             if is_compressed is None:
                 is_compressed = any(raws[0][:4] == ZSTD for _, raws in batch.values())
-            yield {topic: (times, RawMessages.of([self._decompressed(raw) for raw in raws]))
+            yield {topic: (times, RawMessages.joined([self._decompressed(raw) for raw in raws]))
                    for topic, (times, raws) in batch.items()} if is_compressed else batch
 
     def stream(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
-        """Yield the same one by one in order of time, for merging; slower."""
+        """Yield channel, time, ns, and bytes of each message by time, to merge files; slower."""
         channels = {c.topic: c for c in self.channels}
         for batch in self.batches(topics):
             lists = ([(channels[topic], time_ns, raw) for time_ns, raw in zip(
@@ -151,7 +150,8 @@ class BagFile:
         return list(self._channels.values())
 
     def _channels_of(self, topics: Mapping[str, str]) -> dict[int, Channel]:
-        return {k: c for k, c in self._channels.items() if topics.get(c.topic) == c.msgtype}
+        return {number: channel for number, channel in self._channels.items()
+                if topics.get(channel.topic) == channel.msgtype}
 
 
 def is_valid_time(time_ns: int) -> bool:
@@ -160,7 +160,8 @@ def is_valid_time(time_ns: int) -> bool:
 
 def in_batches(stream: Iterator[tuple[Any, ...]]) -> Iterator[Batch]:
     """Yield the messages of a stream as of ``BagFile.messages``, many at a time, by topic."""
-    return iter(partial(_next_batch, stream), {})
+    while batch := _next_batch(stream):
+        yield batch
 
 
 def _next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
@@ -168,7 +169,7 @@ def _next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
     # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
     # tuples takes as long as the reading itself)
     lists: dict[str, tuple[list[int], list[bytes]]] = {}
-    messages_left, bytes_left = BATCH_MESSAGES, 2**24
+    messages_left, bytes_left = BATCH_MESSAGES, BATCH_BYTES
     for channel, time_ns, raw in stream:
         try:
             times, raws = lists[channel.topic]
@@ -180,7 +181,7 @@ def _next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
         bytes_left -= len(raw)
         if messages_left <= 0 or bytes_left <= 0:
             break
-    return {topic: (np.array(times, np.int64), RawMessages.of(raws))
+    return {topic: (np.array(times, np.int64), RawMessages.joined(raws))
             for topic, (times, raws) in lists.items()}
 
 

@@ -42,21 +42,23 @@ class Topic:
     pack: Callable[[slice], np.ndarray]
 
 
-def _message_template(msgtype: str, parts: Mapping[str, Any]
+def _message_template(msgtype: str, variable_parts: Mapping[str, Any]
                       ) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
     """
     Return a message of zeros, and (type, shape), offset of each number by path.
 
-    parts : texts, lists of texts and lengths of lists by path.
+    variable_parts : texts, lists of texts, and lengths of lists of numbers, by path; default ''
+    and 0.
     """
-    raw, places = bytearray((0, 1, 0, 0)), {}      # little-endian
+    raw, places = bytearray((0, 1, 0, 0)), {}      # XCDR1, little-endian
 
-    def add(align: int, content: bytes) -> int:
-        raw.extend(bytes((4 - len(raw)) % align) + content)
+    def add(alignment: int, content: bytes) -> int:
+        """Add content, aligned relative to byte 4; return its offset."""
+        raw.extend(bytes((4 - len(raw)) % alignment) + content)
         return len(raw) - len(content)
     for kind, path in map(str.split, SCHEMAS[msgtype]):
         base, _, size = kind.partition('[')
-        part = parts.get(path, '' if base == 'string' else 0)
+        part = variable_parts.get(path, '' if base == 'string' else 0)
         if size == ']':
             add(4, struct.pack('<I', part if base in cdr.NUMPY_TYPES else len(part)))
         if base == 'string':
@@ -72,17 +74,18 @@ def _message_template(msgtype: str, parts: Mapping[str, Any]
 
 
 def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
-           parts: Mapping[str, Any]) -> Topic:
+           variable_parts: Mapping[str, Any]) -> Topic:
     """Return a topic; x, y, z (and w) together have the path of their parent in ``values``."""
-    raw, places = _message_template(msgtype, parts)
-    kinds, offsets = [], []
+    raw, places = _message_template(msgtype, variable_parts)
+    formats, offsets = [], []
     for path in values:
-        found = [one for known, one in places.items() if f'{known}.'.startswith(f'{path}.')]
-        (kind, shape), offset = found[0]
-        kinds.append((kind, shape if len(found) == 1 else (len(found),)))
+        numbers = [place for number_path, place in places.items()
+                   if f'{number_path}.'.startswith(f'{path}.')]
+        (number_type, shape), offset = numbers[0]
+        formats.append((number_type, shape if len(numbers) == 1 else (len(numbers),)))
         offsets.append(offset)
     # the field of all bytes is copied with the others, so that bytes without a value are, too
-    dtype = np.dtype({'names': [*values, 'message'], 'formats': [*kinds, f'V{len(raw)}'],
+    dtype = np.dtype({'names': [*values, 'message'], 'formats': [*formats, f'V{len(raw)}'],
                       'offsets': [*offsets, 0]})
 
     def pack(rows: slice) -> NDArray[Any]:
@@ -96,11 +99,12 @@ def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
 
 
 def _stamped_topic(name: str, msgtype: str, samples: data.Samples, frame: str, values: Values,
-                   parts: Mapping[str, Any] | None = None) -> Topic:
+                   variable_parts: Mapping[str, Any] | None = None) -> Topic:
+    """Return a topic of samples whose messages have a header."""
     stamps = {'header.stamp.sec': lambda rows: samples.stamp_ns[rows] // 10**9,
               'header.stamp.nanosec': lambda rows: samples.stamp_ns[rows] % 10**9}
     return _topic(name, msgtype, samples.received_ns, {**stamps, **values},
-                  {'header.frame_id': frame, **(parts or {})})
+                  {'header.frame_id': frame, **(variable_parts or {})})
 
 
 def _diagonal(variance: Floats, size: int = 3) -> Callable[[slice], Floats]:
@@ -119,12 +123,12 @@ def imu(name: str, samples: data.ImuSamples, frame: str = 'imu_link',
 
     w_variance, f_variance : (n, 3), optional, of turn rates and forces; default zeros: unknown.
     """
-    known = {f'{field}_covariance': _diagonal(variance) for field, variance in (
+    covariances = {f'{field}_covariance': _diagonal(variance) for field, variance in (
         ('angular_velocity', w_variance), ('linear_acceleration', f_variance))
         if variance is not None}
     return _stamped_topic(name, 'sensor_msgs/msg/Imu', samples, frame, {
         **_orientation(samples), 'angular_velocity': samples.w_i,
-        'linear_acceleration': samples.f_i, **known})
+        'linear_acceleration': samples.f_i, **covariances})
 
 
 def heading(name: str, samples: data.HeadingSamples) -> Topic:
@@ -140,12 +144,12 @@ def _not_sent(_rows: slice) -> Floats:
 
 
 def _orientation(samples: data.ImuSamples | data.HeadingSamples) -> Values:
-    none = np.isnan(samples.yaw_variance)
-    known = _diagonal(np.where(none, 0.0, samples.yaw_variance)[:, None])
+    not_sent = np.isnan(samples.yaw_variance)
+    diagonal = _diagonal(np.where(not_sent, 0.0, samples.yaw_variance)[:, None])
 
     def covariance(rows: slice) -> Floats:
-        out = known(rows)
-        out[none[rows], 0] = -1.0
+        out = diagonal(rows)
+        out[not_sent[rows], 0] = -1.0      # REP-145
         return out
     return {'orientation': samples.q_ni, 'orientation_covariance': covariance}
 
@@ -168,7 +172,7 @@ def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '',
     quantity = 'velocity' if rates else 'position'
     return _stamped_topic(
         name, 'sensor_msgs/msg/JointState', first, frame,
-        {quantity: lambda rows: np.column_stack([one.value[rows] for one in columns])},
+        {quantity: lambda rows: np.column_stack([wheel.value[rows] for wheel in columns])},
         {'name': list(wheels), quantity: len(columns)})
 
 
@@ -188,7 +192,7 @@ def point(name: str, samples: data.FixSamples, position: Floats) -> Topic:
 
 
 def pose(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
-    """Return geometry_msgs/PoseStamped of such positions, without a rotation."""
+    """Return geometry_msgs/PoseStamped of positions, (n, 3) m, without a rotation."""
     return _stamped_topic(name, 'geometry_msgs/msg/PoseStamped', samples, frame, {
         'pose.position': position, 'pose.orientation.w': lambda rows: 1.0})
 

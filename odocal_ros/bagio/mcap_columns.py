@@ -23,9 +23,11 @@ from odocal_ros.messages.raws import RawMessages, Rows
 from odocal_ros.safe_io.limits import Damaged, LATEST_NS
 
 BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
+# format: of a message record, before the message: mcap.dev/spec
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
                  ('time_ns', '<i8'), ('published_ns', '<i8')])
-BODY = 22              # format: bytes of HEAD that a record's size includes: mcap.dev/spec
+# format: bytes of HEAD that the size of a record includes: all after the opcode and the size
+COUNTED_HEAD = HEAD.itemsize - RECORD.size
 
 
 class Columns(NamedTuple):
@@ -55,7 +57,7 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
     index : chunks in order of their stated times.   known_channels : all channels of the file.
     scan : returns the messages of a chunk one by one.   report_damage : called with each damage.
     """
-    is_requested, is_known = _table(channels), _table(known_channels)
+    is_requested, is_known = _channel_mask(channels), _channel_mask(known_channels)
     later: Columns | None = None         # messages that may be later than those of the next chunk
     number, size = 0, 1           # the first block is one chunk, which is often sufficient
     while number < len(index):
@@ -74,23 +76,29 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
 
 def _read_block(index: Sequence[ChunkIndex], number: int, size: int,
                 read_chunks: ReadChunks) -> tuple[Block, int]:
-    """Return chunks from a number on, of ``size`` bytes or more, and the number after them."""
+    """
+    Return chunks from a number on, of ``size`` bytes or more, and the number after them.
+
+    Chunks that overlap these in time are added, up to BLOCK more bytes.
+    """
     block: Block = []
-    end_ns, first, adjacent = 0, number, 0
-    while number < len(index) and (size > 0 or index[number].start_ns < end_ns and size > -BLOCK):
+    remaining, end_ns = size, 0
+    first, range_end = number, 0      # of a range of chunks that are adjacent in the file
+    while number < len(index) and (
+            remaining > 0 or index[number].start_ns < end_ns and remaining > -BLOCK):
         entry = index[number]
-        if entry.offset != adjacent:
+        if entry.offset != range_end:
             block += read_chunks(index[first:number]) if number > first else []
             first = number
-        adjacent = entry.offset + entry.size + entry.index_size
-        size -= max(entry.size, entry.unpacked_size)
+        range_end = entry.offset + entry.size + entry.index_size
+        remaining -= max(entry.size, entry.unpacked_size)
         end_ns, number = max(end_ns, entry.end_ns), number + 1
     return block + read_chunks(index[first:number]), number
 
 
 def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
              report_damage: ReportDamage) -> Columns:
-    """Return the messages of chunks; of one with an unexpected layout by a sequential scan."""
+    """Return the messages of chunks; where the index is unexpected by a sequential scan."""
     chunks = [chunk for chunk in block if isinstance(chunk, Chunk)]
     columns = _columns_by_index(chunks, known_channels)
     parts = []
@@ -106,11 +114,11 @@ def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
     return columns or _join(*parts)
 
 
-def _table(channel_numbers: Collection[int]) -> Bools:
-    """Return a table of all possible channel numbers, True for the given ones."""
-    table = np.zeros(2**16, bool)
-    table[list(channel_numbers)] = True
-    return table
+def _channel_mask(channel_numbers: Collection[int]) -> Bools:
+    """Return a mask of all possible channel numbers, True for the given ones: (65536,)."""
+    mask = np.zeros(2**16, bool)
+    mask[list(channel_numbers)] = True
+    return mask
 
 
 def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns | None:
@@ -125,58 +133,59 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
     if start[0] < 0 or start[-1] > len(data) - HEAD.itemsize:
         return None
     # a view with a head at every offset of the buffer; only those of records are read
-    head = np.ndarray((len(data) - HEAD.itemsize + 1,), f'V{HEAD.itemsize}', data, 0, (1,))[
-        start].view(HEAD)
+    offset_count = len(data) - HEAD.itemsize + 1
+    head = np.ndarray((offset_count,), f'V{HEAD.itemsize}', data, 0, (1,))[start].view(HEAD)
     end = counts.cumsum()       # row after the last message of each chunk
     first = end - counts
     stop = np.append(start[1:], 0)
     stop[end - 1] = [chunk.stop for chunk in chunks]
     size = stop - start - RECORD.size
-    is_chain = (
-        (head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
+    is_adjacent = (      # each record begins where the one before it ends
+        (head['op'] == MESSAGE).all() and (head['size'] == size).all()
+        and size.min() >= COUNTED_HEAD
         and start[first].tolist() == [chunk.begin for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
-    if not is_chain or not known_channels[channel].all():
+    if not is_adjacent or not known_channels[channel].all():
         return None
     earliest, latest = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
     for chunk, low, high in zip(chunks, earliest.tolist(), latest.tolist(), strict=True):
         if high >= LATEST_NS or not (
                 chunk.start_ns <= low <= high <= max(chunk.end_ns, chunk.start_ns)):
             return None
-    return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - BODY))
+    return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - COUNTED_HEAD))
 
 
 def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
     """Return the chunks with their records in one buffer."""
     if len({id(chunk.data) for chunk in chunks}) <= 1:
         return chunks
-    data, begin, found = b''.join([chunk.records for chunk in chunks]), 0, []
+    data, begin, moved = b''.join([chunk.records for chunk in chunks]), 0, []
     for chunk in chunks:
         stop = begin + chunk.stop - chunk.begin
-        found.append(chunk._replace(data=data, begin=begin, stop=stop))
+        moved.append(chunk._replace(data=data, begin=begin, stop=stop))
         begin = stop
-    return found
+    return moved
 
 
 def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
-    found, offset, index = [np.empty(0, np.int64)], 0, chunk.message_index
+    offsets, position, index = [np.empty(0, np.int64)], 0, chunk.message_index
     head = struct.Struct('<BQHI')      # opcode, size, channel, bytes of (time, offset) pairs
-    while offset + head.size <= len(index):
-        op, size, _, length = head.unpack_from(index, offset)
-        pairs = offset + head.size
+    while position + head.size <= len(index):
+        op, size, _, length = head.unpack_from(index, position)
+        pairs = position + head.size
         if op != MESSAGE_INDEX or size != length + 6 or length % 16 or (
                 pairs + length > len(index)):
             break
-        found.append(np.frombuffer(index, '<i8', length // 8, pairs)[1::2])
-        offset = pairs + length
-    return np.concatenate(found) + chunk.begin
+        offsets.append(np.frombuffer(index, '<i8', length // 8, pairs)[1::2])
+        position = pairs + length
+    return np.concatenate(offsets) + chunk.begin
 
 
 def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
-                   RawMessages.of([entry[2] for entry in entries]))
+                   RawMessages.joined([entry[2] for entry in entries]))
 
 
 def _join(*parts: Columns) -> Columns:
@@ -189,8 +198,8 @@ def _join(*parts: Columns) -> Columns:
         np.concatenate([part.time_ns for part in parts]),
         np.concatenate([part.channel for part in parts]),
         RawMessages(b''.join([raws.data for raws in packed]),
-                    np.concatenate([raws.start + offset for raws,
-                                    offset in zip(packed, base, strict=False)]),
+                    np.concatenate([raws.start + offset
+                                    for raws, offset in zip(packed, base, strict=False)]),
                     np.concatenate([raws.size for raws in packed])))
 
 

@@ -60,9 +60,9 @@ class McapFile(BagFile):
         data = self._file
         footer = data[-mcap.FOOTER_SIZE:]
         if footer[-len(mcap.MAGIC):] != mcap.MAGIC or (
-                footer[:9] != mcap.RECORD.pack(mcap.FOOTER, 20)):
+                footer[:mcap.RECORD.size] != mcap.RECORD.pack(mcap.FOOTER, 20)):
             raise Damaged('cut off')
-        start, _, crc = struct.unpack('<QQI', footer[9:-len(mcap.MAGIC)])
+        start, _, crc = struct.unpack('<QQI', footer[mcap.RECORD.size:-len(mcap.MAGIC)])
         if not start:
             return False
         if not len(mcap.MAGIC) <= start <= len(data) - mcap.FOOTER_SIZE:
@@ -100,9 +100,10 @@ class McapFile(BagFile):
         """Return the messages in batches; None if the index is missing or of other chunks."""
         channels = self._channels_of(topics)
         chunks = self._chunks_with(channels)
+        times_begin, times_end = mcap.RECORD.size, mcap.RECORD.size + mcap.TIMES.size
         if not self._chunks or any(
-                self._file[chunk.offset + 9:chunk.offset + 25] != mcap.TIMES.pack(
-                    chunk.start_ns, chunk.end_ns) for chunk in chunks):
+                self._file[chunk.offset + times_begin:chunk.offset + times_end]
+                != mcap.TIMES.pack(chunk.start_ns, chunk.end_ns) for chunk in chunks):
             return None
         return self._indexed_batches(chunks, channels)
 
@@ -122,18 +123,18 @@ class McapFile(BagFile):
         """Return adjacent chunks of the index, each with its message index."""
         begin, end = chunks[0].offset, chunks[-1].offset + chunks[-1].size + chunks[-1].index_size
         data = self._file[begin:end]
-        found: list[mcap.Chunk | Damaged] = []
+        unpacked: list[mcap.Chunk | Damaged] = []
         for chunk in chunks:
             offset = chunk.offset - begin
-            stop = offset + chunk.size
+            content, stop = offset + mcap.RECORD.size, offset + chunk.size
             try:
-                if data[offset:offset + 9] != mcap.RECORD.pack(mcap.CHUNK, chunk.size - 9):
+                if data[offset:content] != mcap.RECORD.pack(mcap.CHUNK, stop - content):
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append(mcap.unpack_chunk(data, offset + 9, stop, self._allowance)._replace(
+                unpacked.append(mcap.unpack_chunk(data, content, stop, self._allowance)._replace(
                     message_index=memoryview(data)[stop:stop + chunk.index_size]))
             except Damaged as error:
-                found.append(error)
-        return found
+                unpacked.append(error)
+        return unpacked
 
     def _report_damage(self, damage: Damaged) -> None:
         self.damage = self.damage or str(damage)
@@ -145,16 +146,18 @@ class McapFile(BagFile):
             self._counted_damage = self.damage
 
     def _by_time(self, channels: Mapping[int, Channel]) -> Iterator[Entry]:
-        """Yield messages in order of time, with the chunks that overlap unpacked at once."""
+        """Yield messages in order of time; chunks that overlap in time are merged."""
         for group in bag_file.group_overlapping(self._chunks_with(channels)):
             yield from self._merged(group, channels)
 
     def _merged(self, chunks: list[mcap.ChunkIndex],
                 channels: Mapping[int, Channel]) -> Iterator[Entry]:
-        def lazily(chunk: mcap.ChunkIndex) -> Iterator[Entry | tuple[int]]:
-            yield (chunk.start_ns,)        # the chunk is unpacked at its start time
+        def entries(chunk: mcap.ChunkIndex) -> Iterator[Entry | tuple[int]]:
+            # heapq.merge takes a first entry of every chunk before it yields any: this one, so
+            # that a chunk is not unpacked before its start time
+            yield (chunk.start_ns,)
             yield from self._messages_of(chunk, channels)
-        return (entry for entry in heapq.merge(*map(lazily, chunks), key=itemgetter(0))
+        return (entry for entry in heapq.merge(*map(entries, chunks), key=itemgetter(0))
                 if len(entry) > 1)
 
     def _messages_of(self, index: mcap.ChunkIndex, channels: Mapping[int, Channel]) -> list[Entry]:
@@ -163,11 +166,11 @@ class McapFile(BagFile):
             (chunk,) = self._read_chunks([index])
             if isinstance(chunk, Damaged):
                 raise chunk
-            found = self._messages_by_scan(chunk)
+            messages = self._messages_by_scan(chunk)
         except Damaged as error:
             self._report_damage(error)
             return []
-        return [entry for entry in found if entry[1] in channels]
+        return [entry for entry in messages if entry[1] in channels]
 
     def _scan(self) -> Iterator[tuple[int, int]]:
         self._allowance.restart()
@@ -197,32 +200,32 @@ class McapFile(BagFile):
 
     def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
-        found = self._entries(bytes(chunk.records), is_truncated)
-        found.sort(key=itemgetter(0))
-        if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
-                chunk.end_ns, chunk.start_ns):
-            raise Damaged(mcap.CHUNK_DAMAGED)
-        return found
+        messages = self._entries(bytes(chunk.records), is_truncated)
+        messages.sort(key=itemgetter(0))
+        if messages:
+            first_ns, last_ns = messages[0][0], messages[-1][0]
+            if not chunk.start_ns <= first_ns <= last_ns <= max(chunk.end_ns, chunk.start_ns):
+                raise Damaged(mcap.CHUNK_DAMAGED)
+        return messages
 
     def _entries(self, records: bytes, is_truncated: bool) -> list[Entry]:
         """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
-        found = []
-        channels, head, offset, end = self._channels, mcap.RECORD.unpack_from, 0, len(records)
-        while offset + 9 <= end:
-            op, size = head(records, offset)
-            stop = offset + 9 + size
+        messages, offset, end = [], 0, len(records)
+        while (content := offset + mcap.RECORD.size) <= end:
+            op, size = mcap.RECORD.unpack_from(records, offset)
+            stop = content + size
             if stop > end:
                 break
             if op == mcap.MESSAGE:
                 if size < mcap.MESSAGE_HEAD.size:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, offset + 9)
-                if number not in channels or time_ns >= LATEST_NS:
+                number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, content)
+                if number not in self._channels or time_ns >= LATEST_NS:
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append((time_ns, number, records[offset + 31:stop]))
+                messages.append((time_ns, number, records[content + mcap.MESSAGE_HEAD.size:stop]))
             elif op in (mcap.SCHEMA, mcap.CHANNEL):
                 try:
-                    self._add_definition(op, records[offset + 9:stop])
+                    self._add_definition(op, records[content:stop])
                 except (struct.error, UnicodeDecodeError):
                     raise Damaged(mcap.CHUNK_DAMAGED) from None
             else:       # not allowed in a chunk
@@ -230,9 +233,10 @@ class McapFile(BagFile):
             offset = stop
         if offset != end and not is_truncated:
             raise Damaged(mcap.CHUNK_DAMAGED)
-        return found
+        return messages
 
     def _add_definition(self, op: int, body: bytes) -> None:
+        """Store the schema or the channel in the content of a record."""
         (number,) = struct.unpack_from('<H', body)
         if op == mcap.SCHEMA:
             name, offset = mcap.text_at(body, 2)

@@ -25,11 +25,14 @@ USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
 CHUNK_DAMAGED = 'a damaged chunk'
 MAX_TRUNCATED = 2**26    # judgement: bytes used of a chunk that the end of the file truncates
-# first fields of the records: opcode and size of each record; channel, sequence and times of a
-# message; times, size and checksum of a chunk; times, offset and size of a chunk in the index
-RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
-INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
-FOOTER_SIZE = 9 + 20 + len(MAGIC)      # format: bytes of the footer record and the magic
+RECORD = struct.Struct('<BQ')               # before each record: opcode, size of its content
+# first fields of the content of records
+MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence number, bag time, publish time
+CHUNK_HEAD = struct.Struct('<QQQI')         # start, end, unpacked size, checksum
+INDEX_HEAD = struct.Struct('<QQQQ')         # of a chunk: start, end, offset, size of its record
+STATISTICS_HEAD = struct.Struct('<QHIIIIQQI')   # messages, ..., start, end, bytes of the counts
+TIMES = struct.Struct('<QQ')                # start and end of a chunk
+FOOTER_SIZE = RECORD.size + 20 + len(MAGIC)     # format: bytes of the footer record and the magic
 
 
 class ChunkIndex(NamedTuple):
@@ -51,16 +54,15 @@ class ChunkIndex(NamedTuple):
 
 def records_of(data: bytes | FileBytes, offset: int = 0) -> Iterator[tuple[int, bytes, bool]]:
     """Yield the records of a section, up to the footer: op, content, True if complete."""
-    while offset + 9 <= len(data):
-        op, size = RECORD.unpack(data[offset:offset + 9])
+    while (begin := offset + RECORD.size) <= len(data):      # of the content
+        op, size = RECORD.unpack(data[offset:begin])
         if op == FOOTER:
             return
-        stop = offset + 9 + size
-        complete = stop <= len(data)
+        offset = begin + size
+        complete = offset <= len(data)
         if op in USED and complete or op == CHUNK:      # also a truncated last chunk
-            end = stop if complete else min(stop, offset + 9 + MAX_TRUNCATED)
-            yield op, data[offset + 9:end], complete
-        offset = stop
+            end = offset if complete else min(offset, begin + MAX_TRUNCATED)
+            yield op, data[begin:end], complete
 
 
 def chunk_index_of(body: bytes) -> ChunkIndex:
@@ -81,19 +83,22 @@ def ordered_chunks(chunks: Sequence[ChunkIndex], end: int) -> list[ChunkIndex]:
 
     Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
-    chunks, ordered, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
-    for chunk, after in zip(chunks, [*(c.offset for c in chunks[1:]), end], strict=True):
-        if chunk.offset < offset or chunk.size < 9 or chunk.offset + chunk.size > end:
+    chunks, checked, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
+    for chunk, next_offset in zip(chunks, [*(c.offset for c in chunks[1:]), end], strict=True):
+        if (chunk.offset < offset or chunk.size < RECORD.size
+                or chunk.offset + chunk.size > end):
             raise Damaged(INDEX_DAMAGED)
         offset = chunk.offset + chunk.size
-        ordered.append(chunk._replace(index_size=min(chunk.index_size, max(after - offset, 0))))
-    return sorted(ordered)
+        space = max(next_offset - offset, 0)
+        checked.append(chunk._replace(index_size=min(chunk.index_size, space)))
+    return sorted(checked)      # by the first field, the start time
 
 
 def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
     """Return the number of messages, their first and last time, and the number by channel."""
-    count, *_, start_ns, end_ns, length = struct.unpack_from('<QHIIIIQQI', body)
-    return count, start_ns, end_ns, dict(struct.iter_unpack('<HQ', body[46:46 + length]))
+    count, *_, start_ns, end_ns, length = STATISTICS_HEAD.unpack_from(body)
+    pairs = body[STATISTICS_HEAD.size:STATISTICS_HEAD.size + length]
+    return count, start_ns, end_ns, dict(struct.iter_unpack('<HQ', pairs))
 
 
 def text_at(body: Bytes, offset: int) -> tuple[str, int]:
@@ -133,10 +138,10 @@ def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
     body = memoryview(data)[begin:stop]
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
-        packing, offset = text_at(body, CHUNK_HEAD.size)
+        compression, offset = text_at(body, CHUNK_HEAD.size)
         (length,) = struct.unpack_from('<Q', body, offset)
         packed = body[offset + 8:offset + 8 + length]
-        records = allowance.unpack(packing, packed, size)
+        records = allowance.unpack(compression, packed, size)
     except (LimitReached, MemoryError):
         raise
     except Exception:    # each compression has its own error
@@ -144,6 +149,6 @@ def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
     if not is_truncated and (
             len(records) != size or crc and zlib.crc32(records) != crc):
         raise Damaged(CHUNK_DAMAGED)
-    if packing:
+    if compression:
         return Chunk(records, 0, len(records), start_ns, end_ns)
     return Chunk(data, begin + offset + 8, begin + offset + 8 + len(records), start_ns, end_ns)

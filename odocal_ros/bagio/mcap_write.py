@@ -24,7 +24,8 @@ from odocal_ros.safe_io.atomic_files import whole_file, WholeFile
 from odocal_ros.safe_io.limits import zstd_module
 
 HEADER, DATA_END = 1, 15      # format: opcodes not in mcap_records: mcap.dev/spec
-MESSAGE_HEAD = struct.Struct('<BQHIQQ')     # opcode, size, channel, sequence, times
+# a message record up to the message: opcode, size, channel, sequence number, bag and publish time
+MESSAGE_RECORD = struct.Struct('<BQHIQQ')
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,20 +47,19 @@ class PackedChunk:
 def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes],
          sequence: int = 0) -> PackedChunk:
     """Return messages of a channel (one or more) as a chunk, numbered from ``sequence``."""
-    head = MESSAGE_HEAD.pack
     parts: list[bytes] = []
     for number, (time_ns, raw) in enumerate(zip(times_ns, raws, strict=True), sequence):
-        parts += (head(mcap.MESSAGE, len(raw) + 22, channel, number & 0xFFFFFFFF, time_ns,
-                       time_ns), raw)
+        parts += (MESSAGE_RECORD.pack(mcap.MESSAGE, mcap.MESSAGE_HEAD.size + len(raw), channel,
+                                      number & 0xFFFFFFFF, time_ns, time_ns), raw)
     records = b''.join(parts)
-    lengths = np.array([len(raw) for raw in raws]) + MESSAGE_HEAD.size
+    lengths = np.array([len(raw) for raw in raws]) + MESSAGE_RECORD.size
     entries = np.empty((len(raws), 2), '<u8')
     entries[:, 0] = times_ns
     entries[:, 1] = np.cumsum(lengths) - lengths
-    form, packed = _packed(records)
+    compression, packed = _packed(records)
     start_ns, end_ns = min(times_ns), max(times_ns)
-    body = (mcap.CHUNK_HEAD.pack(start_ns, end_ns, len(records), zlib.crc32(records)) + _text(form)
-            + struct.pack('<Q', len(packed)) + packed)
+    body = (mcap.CHUNK_HEAD.pack(start_ns, end_ns, len(records), zlib.crc32(records))
+            + _text(compression) + struct.pack('<Q', len(packed)) + packed)
     index = struct.pack('<HI', channel, entries.nbytes) + entries.tobytes()
     return PackedChunk(channel, start_ns, end_ns, len(raws), _record(mcap.CHUNK, body),
                        _record(mcap.MESSAGE_INDEX, index))
@@ -101,13 +101,14 @@ def write_file(path: Path, channels: Mapping[int, Channel],
 
 def _fill(file: WholeFile, channels: Mapping[int, Channel],
           chunks: Iterable[PackedChunk]) -> Written:
-    described = b''.join(
-        _record(mcap.SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
-                + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
-        + _record(mcap.CHANNEL, struct.pack('<HH', key, key) + _text(c.topic)
-                  + _text(c.serialization) + struct.pack('<I', 0)) for key, c in channels.items())
+    definitions = b''.join(      # a schema and a channel of the same number for each topic
+        _record(mcap.SCHEMA, struct.pack('<H', number) + _text(channel.msgtype)
+                + _text('ros2msg' if channel.definition[0] else '') + _text(channel.definition[1]))
+        + _record(mcap.CHANNEL, struct.pack('<HH', number, number) + _text(channel.topic)
+                  + _text(channel.serialization) + struct.pack('<I', 0))
+        for number, channel in channels.items())
     header = _record(HEADER, _text('ros2') + _text('odocal_ros'))
-    offset = file.write(mcap.MAGIC + header + described)
+    offset = file.write(mcap.MAGIC + header + definitions)
     indexes, counts, start_ns, end_ns = [], Counter(dict.fromkeys(channels, 0)), 2**63 - 1, 0
     for chunk in chunks:
         indexes.append(_chunk_index(chunk, offset))
@@ -116,10 +117,11 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
         counts[chunk.channel] += chunk.count
         start_ns, end_ns = min(start_ns, chunk.start_ns), max(end_ns, chunk.end_ns)
     end = _record(DATA_END, struct.pack('<I', 0))
-    tallies = b''.join(struct.pack('<HQ', *item) for item in counts.items())
-    statistics = struct.pack('<QHIIIIQQI', counts.total(), len(channels), len(channels), 0, 0,
-                             len(indexes), start_ns, end_ns, len(tallies)) + tallies
-    summary = described + _record(mcap.STATISTICS, statistics) + b''.join(indexes)
+    by_channel = b''.join(struct.pack('<HQ', *item) for item in counts.items())
+    statistics = mcap.STATISTICS_HEAD.pack(
+        counts.total(), len(channels), len(channels), 0, 0, len(indexes), start_ns, end_ns,
+        len(by_channel)) + by_channel
+    summary = definitions + _record(mcap.STATISTICS, statistics) + b''.join(indexes)
     footer = struct.pack('<QQI', offset + len(end), 0, 0)
     offset += file.write(end + summary + _record(mcap.FOOTER, footer) + mcap.MAGIC)
     return Written(offset, start_ns, end_ns, counts)
@@ -127,41 +129,41 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
 
 def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
     """Return the index record of a chunk at an offset of the file."""
-    _, _, size, _, form, packed = _chunk_body(chunk.record)
+    _, _, size, _, compression, packed_size = _chunk_body(chunk.record)
     return _record(mcap.CHUNK_INDEX, struct.pack(
         '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, offset, len(chunk.record), 10, chunk.channel,
-        offset + len(chunk.record), len(chunk.index)) + _text(form)
-        + struct.pack('<QQ', packed, size))
+        offset + len(chunk.record), len(chunk.index)) + _text(compression)
+        + struct.pack('<QQ', packed_size, size))
 
 
 def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
     """Return start, end, unpacked size, CRC, compression and packed size of a chunk record."""
-    start_ns, end_ns, size, crc = mcap.CHUNK_HEAD.unpack_from(record, 9)
-    form, offset = mcap.text_at(record, 9 + mcap.CHUNK_HEAD.size)
-    (packed,) = struct.unpack_from('<Q', record, offset)
-    return start_ns, end_ns, size, crc, form, packed
+    start_ns, end_ns, size, crc = mcap.CHUNK_HEAD.unpack_from(record, mcap.RECORD.size)
+    compression, offset = mcap.text_at(record, mcap.RECORD.size + mcap.CHUNK_HEAD.size)
+    (packed_size,) = struct.unpack_from('<Q', record, offset)
+    return start_ns, end_ns, size, crc, compression, packed_size
 
 
 def read_chunks(path: Path) -> Iterator[PackedChunk]:
     """Yield the chunks of a file that ``write_file`` wrote, one at a time."""
     with path.open('rb') as file:
         file.seek(len(mcap.MAGIC))
-        record = b''
-        while head := file.read(9):
-            op, size = struct.unpack('<BQ', head)
+        chunk = b''
+        while head := file.read(mcap.RECORD.size):
+            op, size = mcap.RECORD.unpack(head)
             if op == DATA_END:
                 return
-            body = head + file.read(size)
+            record = head + file.read(size)
             if op == mcap.CHUNK:
-                record = body
-            elif op == mcap.MESSAGE_INDEX:
-                channel, nbytes = struct.unpack_from('<HI', body, 9)
-                start_ns, end_ns, *_ = _chunk_body(record)
-                yield PackedChunk(channel, start_ns, end_ns, nbytes // 16, record, body)
+                chunk = record
+            elif op == mcap.MESSAGE_INDEX:      # it follows its chunk
+                channel, index_bytes = struct.unpack_from('<HI', record, mcap.RECORD.size)
+                start_ns, end_ns, *_ = _chunk_body(chunk)
+                yield PackedChunk(channel, start_ns, end_ns, index_bytes // 16, chunk, record)
 
 
 def _record(op: int, body: bytes) -> bytes:
-    return struct.pack('<BQ', op, len(body)) + body
+    return mcap.RECORD.pack(op, len(body)) + body
 
 
 def _text(text: str) -> bytes:

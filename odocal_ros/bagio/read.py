@@ -30,7 +30,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io.limits import Allowance, Damaged, is_file
 from odocal_ros.safe_io.text_formats import indented_list, one_line
 
-MIN_LOSS = 0.5   # s, judgement: shorter losses are not reported
+MIN_LOSS_S = 0.5   # judgement: shorter losses are not reported
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class Bag:
         self._parts = sorted((p for p in parts if p.count), key=lambda p: p.start_ns)
         self._reader_notes: list[Reason] = []
         self._sentences = list(source.notes)
-        self.topics = self._collect()
+        self.topics = self._find_topics()
         self.start_ns = min(p.start_ns for p in self._parts)
         self.end_ns = max(p.end_ns for p in self._parts)
 
-    def _collect(self) -> dict[str, TopicInfo]:
+    def _find_topics(self) -> dict[str, TopicInfo]:
         """Return the topics of all files, each with its most frequent type."""
         counts: dict[str, dict[str, int]] = {}
         for part in self._parts:
@@ -83,35 +83,35 @@ class Bag:
 
     def _missing_data_notes(self) -> list[Reason | str]:
         """Return notes on missing data, with its duration if metadata or the next file give it."""
-        reasons: list[Reason | str] = []
+        notes: list[Reason | str] = []
         metadata = self._source.metadata
-        for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
+        for part, next_part in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
             span = metadata.file_spans.get(part.recorded_path.name) or (
                 metadata.bag_span if len(self._parts) == 1 else None)
-            note = f'{part.recorded_path.name} is damaged ({part.damage})'
+            damage = f'{part.recorded_path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
-                reasons.append(f'{note}, but all {span.count} messages were read')
+                notes.append(f'{damage}, but all {span.count} messages were read')
                 continue
             if not part.count:
-                reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
-                                      'read'))
+                notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: none of its messages can be '
+                                    'read'))
                 continue
-            span = span or (metadata.bag_span if after is None else None)
-            end_ns = span.end_ns if span else after.start_ns if after else None
+            span = span or (metadata.bag_span if next_part is None else None)
+            end_ns = span.end_ns if span else next_part.start_ns if next_part else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
-            lost = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
-            missing = ('without metadata.yaml the lost time is unknown' if end_ns is None else
-                       f'{lost:.1f} s at the end are missing' if lost > MIN_LOSS else
-                       'the end is there, messages before it are missing')
-            reasons.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
-                                  f'{seconds:.1f} s were read; {missing}'))
-        lost = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
-        if not reasons and lost > MIN_LOSS:
-            reasons.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
-                                  'listed in metadata.yaml, are missing'))
-        return reasons
+            lost_s = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
+            loss = ('without metadata.yaml the lost time is unknown' if end_ns is None else
+                    f'{lost_s:.1f} s at the end are missing' if lost_s > MIN_LOSS_S else
+                    'the end is there, messages before it are missing')
+            notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: {part.count} messages in '
+                                f'{seconds:.1f} s were read; {loss}'))
+        lost_s = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
+        if not notes and lost_s > MIN_LOSS_S:
+            notes.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost_s:.1f} s at the end, '
+                                'listed in metadata.yaml, are missing'))
+        return notes
 
     def read(self, readers: Mapping[str, RowReader], feed: Feed,
              progress: Callable[[float], None] | None = None) -> None:
@@ -156,7 +156,7 @@ class Bag:
     def messages(self, topic: str) -> Iterator[tuple[int, object]]:
         """Yield (bag time ns, deserialised message) of a topic; empty without that topic."""
         if topic in self.topics:
-            yield from self._each(topic, self._types.deserializer(self.topics[topic].msgtype))
+            yield from self._converted(topic, self._types.deserializer(self.topics[topic].msgtype))
 
     def frame(self, topic: str) -> str:
         """Return the frame_id of the first readable message of a topic; '' if there is none."""
@@ -166,15 +166,16 @@ class Bag:
         def frame_of(raw: bytes) -> str:
             frame = cdr.frame_of(msgtype, raw)
             return deserialize(raw).header.frame_id if frame is None else frame
-        return next((frame for _, frame in self._each(topic, frame_of)), '')
+        return next((frame for _, frame in self._converted(topic, frame_of)), '')
 
-    def _each(self, topic: str, read: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:
-        """Yield bag time and the result of ``read`` for each message that it can read."""
+    def _converted(self, topic: str,
+                   convert: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:
+        """Yield bag time, ns, and result of ``convert`` for each message that it can convert."""
         for batch in self._batches({topic}):
             times, raws = batch[topic]
             for time_ns, raw in zip(times.tolist(), raws, strict=True):
                 try:
-                    message = read(raw)
+                    message = convert(raw)
                 except (OdocalError, MemoryError):
                     raise
                 except Exception:   # a damaged message is skipped
@@ -273,10 +274,11 @@ def bag_sha256(bag: Bag) -> str:
 
     For one file it is that of sha256sum; for several files that of sha256sum's output for them.
     """
-    sums = []
+    digests = []
     for path in bag.files:
         with path.open('rb') as file:
-            sums.append((hashlib.file_digest(file, 'sha256').hexdigest(), path.name))
-    if len(sums) == 1:
-        return sums[0][0]
-    return hashlib.sha256(''.join(f'{d}  {name}\n' for d, name in sums).encode()).hexdigest()
+            digests.append((hashlib.file_digest(file, 'sha256').hexdigest(), path.name))
+    if len(digests) == 1:
+        return digests[0][0]
+    lines = ''.join(f'{digest}  {name}\n' for digest, name in digests)
+    return hashlib.sha256(lines.encode()).hexdigest()

@@ -27,7 +27,8 @@ IDL_SEPARATOR = '=' * 80 + '\n'
 # of IDL: string, comments, annotation, bracket, other text
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
-PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
+# names of compressions in ``Allowance.unpack``, by those of rosbags
+COMPRESSIONS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 
 
 @contextmanager
@@ -46,11 +47,12 @@ def parse_definition(msgtype: str, form: str, text: str) -> dict[str, Any]:
         from rosbags.typesys import get_types_from_idl, get_types_from_msg
     if form == 'msg':
         return get_types_from_msg(text, msgtype)
-    parts = [part.split('\n', 1)[1] for part in text.split(IDL_SEPARATOR)[1:]] if text.startswith(
-        f'{IDL_SEPARATOR}IDL: ') else [text]
+    definitions = [text]
+    if text.startswith(f'{IDL_SEPARATOR}IDL: '):      # several, each after a line with its name
+        definitions = [part.split('\n', 1)[1] for part in text.split(IDL_SEPARATOR)[1:]]
     types: dict[str, Any] = {}
-    for part in parts:
-        types.update(get_types_from_idl(strip_idl(part)))
+    for definition in definitions:
+        types.update(get_types_from_idl(strip_idl(definition)))
     return types
 
 
@@ -146,12 +148,12 @@ class Types:
                      f'{msgtype}: its definition in the bag', 'characters')
         try:
             with time_limit(limits.PARSE_SECONDS * limit_factor()):
-                known = self._store.fielddefs
-                parsed = parse_definition(msgtype, form, text)
-                new = {name: fields for name, fields in parsed.items() if name not in known}
-                limits.check(_count_elements(msgtype, known | new), limits.MESSAGE_VALUES,
-                             f'{msgtype}: a message', 'values')
-                self._store.register(new)
+                known_types = self._store.fielddefs
+                new_types = {name: fields for name, fields in parse_definition(
+                    msgtype, form, text).items() if name not in known_types}
+                limits.check(_count_elements(msgtype, known_types | new_types),
+                             limits.MESSAGE_VALUES, f'{msgtype}: a message', 'values')
+                self._store.register(new_types)
         except (MemoryError, LimitReached):
             raise
         except Exception as error:   # a parser's errors
@@ -161,19 +163,26 @@ class Types:
 
 
 def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
-    """Return the minimum number of values in the fixed arrays of a message."""
-    deepest = 50    # largest nesting of messages
-    if depth > deepest:
+    """
+    Return the smallest number of values in a message: its arrays of fixed length.
+
+    fielddefs : definitions of rosbags, by type: name, and pairs of a field and its type.
+    """
+    max_depth = 50    # of messages in messages
+    if depth > max_depth:
         raise ValueError('it contains itself')
 
-    def count_of(field: tuple[Any, Any]) -> int:
-        kind, details = field
-        if kind.name == 'NAME':
+    def count_of(field_type: tuple[Any, Any]) -> int:
+        kind, details = field_type
+        if kind.name == 'NAME':      # another message type
             return _count_elements(details, fielddefs, depth + 1)
-        return count_of(details[0]) * int(details[1]) if kind.name == 'ARRAY' else 1
+        if kind.name == 'ARRAY':
+            element_type, length = details
+            return count_of(element_type) * int(length)
+        return 1
     total = 0
-    for _, field in fielddefs[msgtype][1]:
-        total += count_of(field)
+    for _, field_type in fielddefs[msgtype][1]:
+        total += count_of(field_type)
         if total > limits.MESSAGE_VALUES * limit_factor():
             break
     return total
@@ -191,7 +200,7 @@ class Rosbag1File(BagFile):
         super().__init__(path, allowance)
         self._convert = convert
         try:
-            self._reader = self._opened(path)
+            self._reader = self._open(path)
         except (PermissionError, MemoryError, BadBag):
             raise
         except Exception as error:   # rosbags and its dependencies raise many exceptions
@@ -204,14 +213,15 @@ class Rosbag1File(BagFile):
         if self.count and not 0 <= self.start_ns <= self.end_ns < LATEST_NS:
             raise self._unreadable(ValueError('invalid start or end time'))
 
-    def _opened(self, path: Path) -> Any:
-        reader = _reader(path)
+    def _open(self, path: Path) -> Any:
+        """Return the opened reader of rosbags, with limited decompressors."""
+        reader = _limited_reader(path)
         reader.open()
         from rosbags.rosbag1.reader import decompressors
         names = {function: name for name, function in decompressors.items()}
         for position, chunk in reader.chunks.items():
             reader.chunks[position] = chunk._replace(decompressor=partial(
-                self._allowance.unpack, PACKINGS[names[chunk.decompressor]]))
+                self._allowance.unpack, COMPRESSIONS[names[chunk.decompressor]]))
         return reader
 
     def _unreadable(self, error: Exception) -> BadBag:
@@ -248,25 +258,25 @@ class Rosbag1File(BagFile):
         self._reader.close()
 
 
-def _reader(path: Path) -> Any:
+def _limited_reader(path: Path) -> Any:
     """Return a reader of rosbags whose index is limited to the size of the file."""
     with require_rosbags('a rosbag1 file'):
         from rosbags.rosbag1 import Reader
     file_size = path.stat().st_size
 
-    class Bounded(io.BufferedReader):
+    class LimitedFile(io.BufferedReader):
         """File whose reads are limited to the size of the file."""
 
         def read(self, size: int | None = -1) -> bytes:
             return super().read(min(size, file_size) if size and size > 0 else size)
 
-    class File(type(Path())):     # type: ignore[misc]
-        """A path that opens a Bounded file."""
+    class LimitedPath(type(Path())):     # type: ignore[misc]
+        """A path that opens a LimitedFile."""
 
         def open(self, *_: str) -> io.BufferedReader:
-            return Bounded(io.FileIO(self))
+            return LimitedFile(io.FileIO(self))
 
-    class Counted(Reader):
+    class LimitedReader(Reader):
         """Reader that limits the bytes read for the index."""
 
         bytes_left = file_size
@@ -278,4 +288,4 @@ def _reader(path: Path) -> Any:
             self.bytes_left -= self.bio.tell() - begin
             if self.bytes_left < 0:
                 raise ValueError('its index contains a cycle')
-    return Counted(File(path))
+    return LimitedReader(LimitedPath(path))

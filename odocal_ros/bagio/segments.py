@@ -41,13 +41,13 @@ def joined_name(folder: Path, number: int = 0) -> str:
 
 def without_joined(files: Sequence[Path]) -> list[Path]:
     """Return the files of a journal without those whose messages are also in another file."""
-    numbers = {path: NUMBERED.fullmatch(path.name) for path in files}
-    others = [path for path, match in numbers.items() if match is None]
-    if any(path.name.endswith('_0.mcap') for path in others):
-        return others      # all are joined, and metadata.yaml was not yet written
-    spans = [(int(m[1]), int(m[2])) for m in numbers.values() if m and m[2]]
-    return [path for path, match in numbers.items() if not match or match[2] or not any(
-        first <= int(match[1]) <= last for first, last in spans)]
+    matches = {path: NUMBERED.fullmatch(path.name) for path in files}
+    without_number = [path for path, match in matches.items() if match is None]
+    if any(path.name.endswith('_0.mcap') for path in without_number):
+        return without_number      # all are joined, and metadata.yaml was not yet written
+    joined = [(int(match[1]), int(match[2])) for match in matches.values() if match and match[2]]
+    return [path for path, match in matches.items() if not match or match[2] or not any(
+        first <= int(match[1]) <= last for first, last in joined)]
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class SegmentedBag:
         self.folder = folder
         self.channels: dict[int, Channel] = {}   # by number, as in chunks
         self.segments: list[Segment] = []
-        self.added: list[Segment] = []           # files added to the finished bag
+        self.later_files: list[Segment] = []     # added to the finished bag
 
     @property
     def size(self) -> int:
-        return _size((*self.segments, *self.added))
+        return _size((*self.segments, *self.later_files))
 
     @property
     def unjoined_size(self) -> int:
@@ -117,8 +117,8 @@ class SegmentedBag:
 
     def add(self, chunks: Sequence[PackedChunk]) -> None:
         """Add messages to the finished bag, as a file of its own."""
-        number = len(self.added) + 1
-        self.added.append(self._write(joined_name(self.folder, number), 0, 0, chunks))
+        number = len(self.later_files) + 1
+        self.later_files.append(self._write(joined_name(self.folder, number), 0, 0, chunks))
         self._write_metadata()
 
     def _join(self, segments: list[Segment]) -> None:
@@ -135,7 +135,7 @@ class SegmentedBag:
 
     def _write_metadata(self) -> None:
         path = self.folder / 'metadata.yaml'
-        write_text(path, _metadata([*self.segments, *self.added], self.channels))
+        write_text(path, _metadata([*self.segments, *self.later_files], self.channels))
 
 
 def _size(segments: Iterable[Segment]) -> int:
@@ -149,7 +149,7 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[PackedChunk]:
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
     import yaml
-    written = [f.written for f in files]
+    written = [file.written for file in files]
     counts: Counter[int] = sum((file.counts for file in written), Counter())
     text: str = yaml.safe_dump({'rosbag2_bagfile_information': {
         'version': 9, 'storage_identifier': 'mcap',
@@ -160,8 +160,9 @@ def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
                                 'offered_qos_profiles': [], 'type_description_hash': ''},
              'message_count': counts[number]} for number, c in channels.items()],
         'compression_format': '', 'compression_mode': '',
-        'relative_file_paths': [f.path.name for f in files],
-        'files': [{'path': f.path.name, **_span(*f.written[1:])} for f in files],
+        'relative_file_paths': [file.path.name for file in files],
+        'files': [{'path': file.path.name, **_span(
+            file.written.start_ns, file.written.end_ns, file.written.counts)} for file in files],
         'custom_data': None, 'ros_distro': 'jazzy'}}, sort_keys=False)
     return text
 

@@ -25,7 +25,7 @@ from odocal_ros.safe_io.text_formats import safe_loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
-# judgement: bytes read at a time. The rest of them is copied after each frame, which may be short
+# judgement: bytes read at a time. A frame may be short, and the bytes after it are copied
 READ_BYTES = 2**13
 ENDINGS = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 
@@ -91,7 +91,7 @@ def _source_of_folder(path: Path) -> Source:
     metadata = _read_metadata(metadata_path) if metadata_path.exists() else None
     listed = metadata.file_names if metadata else ()
     notes: list[Reason | str] = [metadata.fault] if metadata and metadata.fault else []
-    files = _distinct([path / file for file in listed if limits.is_file(path / file)])
+    files = _without_links([path / file for file in listed if limits.is_file(path / file)])
     missing = [file for file in listed if not limits.is_file(path / file)]
     if missing and files:
         missing_text = ', '.join(missing[:10]) + ' ...' * (len(missing) > 10)
@@ -100,9 +100,9 @@ def _source_of_folder(path: Path) -> Source:
             f'named in metadata.yaml are missing ({missing_text}); the others are read',
             'Copy the missing files into the folder.'))
     if not files:
-        files = _distinct(sorted((f for f in path.iterdir()
-                                  if f.name.endswith(ENDINGS) and limits.is_file(f)),
-                                 key=_number_key))
+        files = _without_links(sorted((f for f in path.iterdir()
+                                       if f.name.endswith(ENDINGS) and limits.is_file(f)),
+                                      key=_number_key))
         if (path / JOURNAL).exists():
             files = without_joined(files)
         if not files:
@@ -114,7 +114,7 @@ def _source_of_folder(path: Path) -> Source:
     return Source(path.resolve().name, tuple(files), tuple(notes), metadata or BagMetadata())
 
 
-def _distinct(files: list[Path]) -> list[Path]:
+def _without_links(files: list[Path]) -> list[Path]:
     """Return the files without links to an earlier one, so that each is read once."""
     by_inode: dict[tuple[int, int], Path] = {}
     for file in files:
@@ -125,9 +125,9 @@ def _distinct(files: list[Path]) -> list[Path]:
 
 def _hint_on_subfolders(path: Path) -> str:
     """Return a hint with the bags one folder below, or an empty text."""
-    below = [sub for sub in sorted(path.iterdir()) if sub.is_dir()
-             and any(file.name.endswith(ENDINGS) for file in sub.iterdir())]
-    return f'; did you mean {" or ".join(map(str, below[:3]))}?' if below else ''
+    bags = [folder for folder in sorted(path.iterdir()) if folder.is_dir()
+            and any(file.name.endswith(ENDINGS) for file in folder.iterdir())]
+    return f'; did you mean {" or ".join(map(str, bags[:3]))}?' if bags else ''
 
 
 def _number_key(path: Path) -> list[tuple[int, str]]:
@@ -165,7 +165,7 @@ def _parse_metadata(content: dict[str, dict[str, Any]]) -> BagMetadata:
     spans = ((Path(file['path']).name, _span(file)) for file in metadata.get('files') or ())
     formats = {topic['topic_metadata'].get('serialization_format', 'cdr')
                for topic in metadata.get('topics_with_message_count') or ()}
-    if not all(isinstance(form, str) for form in formats):
+    if not all(isinstance(name, str) for name in formats):
         raise ValueError('a serialization format that is not text')
     paths = [Path(path).name for path in metadata.get('relative_file_paths') or ()]
     return BagMetadata(
@@ -228,6 +228,7 @@ def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path
     with path.open('rb') as packed, target.open('wb') as out:
         frames = 1
         frame, data = zstd.ZstdDecompressor(), b''   # also decompresses a truncated file
+        # until neither data that were read, nor the frame, nor the file have more
         while data or not (frame.needs_input or frame.eof) or (data := packed.read(READ_BYTES)):
             if frame.eof:
                 frames += 1

@@ -23,7 +23,7 @@ from odocal_ros.errors import BadUsage
 
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
 COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
-BLOCK = 20_000         # judgement: messages packed at a time, to bound memory
+BLOCK_MESSAGES, BLOCK_BYTES = 20_000, 2**26      # judgement: packed at a time, to bound memory
 
 
 def drive_topics(drive: Any) -> list[Topic]:
@@ -65,20 +65,20 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     check_target(path, storage, compression, force)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix='.odocal_', dir=path.parent))
+        temporary = Path(tempfile.mkdtemp(prefix='.odocal_', dir=path.parent))
     except OSError as error:
         raise BadUsage(f'{path}: cannot be written ({error.strerror}); choose another '
                        '--out') from None
     try:
-        part = work / path.name      # rosbag2 names its files after the folder
-        _write(part, topics, storage, compression, progress)
+        bag = temporary / path.name      # rosbag2 names its files after the folder
+        _write(bag, topics, storage, compression, progress)
         if force and path.is_dir():
             shutil.rmtree(path)
-        part.replace(path)
+        bag.replace(path)
     except OSError as error:
         raise BadUsage(f'{path}: writing failed ({error.strerror}); nothing was kept') from None
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     return path
 
 
@@ -88,8 +88,8 @@ def check_target(path: Path, storage: str, compression: str, force: bool) -> Non
         raise BadUsage(f'--storage {storage}: required: one of {", ".join(STORAGES)}')
     if compression not in COMPRESSIONS:
         raise BadUsage(f'--compression {compression}: required: one of {", ".join(COMPRESSIONS)}')
-    lacking = {'sqlite3': ('storage',), 'mcap': (), 'rosbag1': ('message', 'file', 'storage')}
-    if compression in lacking[storage]:
+    unavailable = {'sqlite3': ('storage',), 'mcap': (), 'rosbag1': ('message', 'file', 'storage')}
+    if compression in unavailable[storage]:
         raise BadUsage(f'--compression {compression} is not available for --storage {storage}')
     if path.exists() and not force:
         raise BadUsage(f'{path} already exists; give --force to replace it, or another --out')
@@ -122,9 +122,9 @@ def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
         if storage == 'mcap':
             _with_checksums(writer.storage)
         connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
-        for which, time_ns, raw in _merged(topics, progress):
-            writer.write(connections[which], time_ns, ros2.cdr_to_ros1(
-                raw, topics[which].msgtype) if storage == 'rosbag1' else raw)
+        for topic, time_ns, raw in _merged(topics, progress):
+            writer.write(connections[topic], time_ns, ros2.cdr_to_ros1(
+                raw, topics[topic].msgtype) if storage == 'rosbag1' else raw)
 
 
 def _with_checksums(storage: Any) -> None:
@@ -135,7 +135,8 @@ def _with_checksums(storage: Any) -> None:
         crc, begin = zlib.crc32(storage.chunk.bio.getbuffer()), storage.bio.tell()
         close_chunk()
         end = storage.bio.tell()
-        storage.bio.seek(begin + 9 + 24)     # of the checksum in a chunk record of mcap
+        # in a chunk record of mcap: after opcode and size, start, end and unpacked size
+        storage.bio.seek(begin + 9 + 24)
         storage.bio.write(crc.to_bytes(4, 'little'))
         storage.bio.seek(end)
     storage.close_chunk = close_with_checksum
@@ -144,27 +145,28 @@ def _with_checksums(storage: Any) -> None:
 def _merged(topics: Sequence[Topic],
             progress: Callable[[float], None] | None) -> Iterator[tuple[int, int, bytes]]:
     """Yield (index of the topic, bag time, message) in order of time, packed in blocks."""
-    which = np.concatenate([np.full(len(t.time_ns), i) for i, t in enumerate(topics)])
     order = np.argsort(np.concatenate([t.time_ns for t in topics]), kind='stable')
-    which = which[order]
-    widest = max((t.pack(slice(0, 1)).itemsize for t in topics if len(t.time_ns)), default=1)
-    block = int(np.clip(2**26 // widest, 1, BLOCK))      # bytes, where messages are large
-    done = [0] * len(topics)
-    for first in range(0, len(which), block):
-        in_block = which[first:first + block]
+    # index of the topic of each message
+    by_time = np.concatenate([np.full(len(t.time_ns), i) for i, t in enumerate(topics)])[order]
+    largest = max((t.pack(slice(0, 1)).itemsize for t in topics if len(t.time_ns)), default=1)
+    block = int(np.clip(BLOCK_BYTES // largest, 1, BLOCK_MESSAGES))
+    rows_done = [0] * len(topics)
+    for first in range(0, len(by_time), block):
+        in_block = by_time[first:first + block]
         queues = []
         for i, topic in enumerate(topics):
-            rows = slice(done[i], done[i] + int(np.count_nonzero(in_block == i)))
-            done[i] = rows.stop
+            rows = slice(rows_done[i], rows_done[i] + int(np.count_nonzero(in_block == i)))
+            rows_done[i] = rows.stop
             queues.append(_messages(topic, rows))
         for i in in_block.tolist():
             yield (i, *next(queues[i]))
         if progress:
-            progress(min(1.0, (first + block) / len(which)))
+            progress(min(1.0, (first + block) / len(by_time)))
 
 
 def _messages(topic: Topic, rows: slice) -> Iterator[tuple[int, bytes]]:
     packed = topic.pack(rows)
     raw, size = packed.tobytes(), packed.itemsize
-    for k, time_ns in enumerate(topic.time_ns[rows].tolist()):
-        yield time_ns, raw[k * size:(k + 1) * size]
+    for offset, time_ns in zip(range(0, len(raw), size), topic.time_ns[rows].tolist(),
+                               strict=True):
+        yield time_ns, raw[offset:offset + size]

@@ -30,7 +30,13 @@ from odocal_ros.messages.message_fields import (
     View,
 )
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, RawMessages, Table, tables
+from odocal_ros.messages.raws import (
+    FrameFilter,
+    MAX_SINGLE_READS,
+    RawMessages,
+    Table,
+    tables,
+)
 from odocal_ros.settings.config import Config
 
 # judgement: unreadable messages after which messages without a layout are skipped
@@ -65,7 +71,8 @@ class Reader:
         self.frames: FrameFilter | None = None      # of an IMU
         self.by_arrival = False      # the stamps of the messages are not used
         self._plan = plan
-        self._layout: cdr.Layout | None = None      # the last one of ``_read_few``
+        # of the last block that ``_read_small_block`` has read
+        self._layout: cdr.Layout | None = None
         self._record: np.dtype[Any] | None = None      # structured type of its messages
         self._unpackers: list[cdr.Unpacker] = []       # functions that read its plain numbers
 
@@ -95,16 +102,16 @@ class Reader:
         Returns (slot, block) pairs, one for each wheel of a message, none without a row. Raises
         BadData: the message type cannot have the value: no such field, not a number.
         """
-        other, raws = None, raws if len(raws) <= FEW_ROWS else RawMessages.of(raws)
+        other_imu, raws = None, raws if len(raws) <= MAX_SINGLE_READS else RawMessages.joined(raws)
         if self.frames is not None and len(raws):
-            keep, other = self.frames.sort(raws, received_ns, deserialize)
-            if other is not None:
-                raws = RawMessages.of(raws).take(keep)
+            keep, other_imu = self.frames.separate(raws, received_ns, deserialize)
+            if other_imu is not None:
+                raws = RawMessages.joined(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         pairs = self._rows(raws, received_ns, deserialize)
         if self.by_arrival:
             pairs = [(slot, replace(block, stamp_ns=block.received_ns)) for slot, block in pairs]
-        return pairs if other is None else [*pairs, ('imu_other', other)]
+        return pairs if other_imu is None else [*pairs, ('imu_other', other_imu)]
 
     def readings(self, raws: Sequence[bytes], received_ns: Sequence[int],
                  deserialize: Deserialize) -> list[tuple[str, list[Reading]]]:
@@ -127,23 +134,26 @@ class Reader:
         first = 0 if plan.columns else self._complete_plan(raws, deserialize)
         if first:
             raws, received_ns = raws[first:], received_ns[first:]
-        n = len(raws)
-        if not n:
+        if not len(raws):
             return []
-        if columns := self._read_few(raws):
+        if columns := self._read_small_block(raws):
             return plan.build(np.array(received_ns, np.int64), columns)
         arrays: list[NDArray[Any]] = []
-        has_row = np.ones(n, bool)
+        has_row = np.ones(len(raws), bool)
         for layout, rows, table in tables(self.msgtype, raws):
             values = self._columns_of(layout, table) if layout else None
             if values and isinstance(rows, slice):       # all of them: no copy
                 arrays = values
                 break
-            arrays = arrays or [np.empty((n, column.width), column.dtype)
+            arrays = arrays or [np.empty((len(raws), column.width), column.dtype)
                                 for column in plan.columns]
             if layout is None:
-                for i in np.arange(n)[rows].tolist():
-                    has_row[i] = self._read_into_row(arrays, i, raws[i], deserialize)
+                for i in np.arange(len(raws))[rows].tolist():
+                    if not (row := self._read_row(raws[i], deserialize)):
+                        has_row[i] = False
+                        continue
+                    for target, value in zip(arrays, row, strict=True):
+                        target[i] = value
             elif values is None:
                 has_row[rows] = False
             else:
@@ -154,10 +164,10 @@ class Reader:
             arrays, received = [values[has_row] for values in arrays], received[has_row]
         return plan.build(received, arrays) if len(received) else []
 
-    def _read_few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
+    def _read_small_block(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
         """Return the columns of a few messages of one layout; [] if they have several or none."""
         layout = cdr.layout_of(self.msgtype, raws[0])
-        if len(raws) > FEW_ROWS or layout is None or not all(map(layout.fits, raws)):
+        if len(raws) > MAX_SINGLE_READS or layout is None or not all(map(layout.fits, raws)):
             return []
         columns = self._plan.columns
         if layout is not self._layout:
@@ -212,26 +222,21 @@ class Reader:
                           f'{reason}')
             return None
 
-    def _read_into_row(self, arrays: list[NDArray[Any]], i: int, raw: bytes,
-                       deserialize: Deserialize) -> bool:
-        """Read one message into row i; False: it has no row."""
-        if self.unreadable > UNREADABLE_LIMIT:      # deserialising takes a hundred times as long
-            self.unreadable += 1
-            return False
-        view = self._message_view(raw, deserialize)
+    def _read_row(self, raw: bytes, deserialize: Deserialize) -> list[Any]:
+        """Return the values of one message by column; [] if it has no row."""
+        # deserialising takes a hundred times as long as a layout
+        view = None if self.unreadable > UNREADABLE_LIMIT else self._message_view(raw, deserialize)
         if view is None:
             self.unreadable += 1
-            return False
+            return []
         try:
             values = [column.of_message(view) for column in self._plan.columns]
         except (AttributeError, LookupError, TypeError, ValueError):
             values = [None]
         if any(value is None for value in values):
             self._count_unreadable(1, self._plan.missing_reason(view))
-            return False
-        for target, value in zip(arrays, values, strict=True):
-            target[i] = value
-        return True
+            return []
+        return values
 
     def _count_unreadable(self, count: int, reason: str) -> None:
         self.unreadable += count

@@ -54,8 +54,8 @@ class MessageView:
         Raises AttributeError, LookupError: it is missing.
         """
         value: Any = self.message
-        owner = value
-        for name, key in parts(path):
+        owner = value      # of the list that ``value`` is
+        for name, key in path_parts(path):
             if name:
                 value, owner = getattr(value, name), value
             else:
@@ -64,6 +64,7 @@ class MessageView:
 
     @staticmethod
     def _index(owner: object, key: str) -> int:
+        """Return the index in a list of ``owner``: by its list ``name``, or a number as text."""
         names = list(getattr(owner, 'name', ()))
         if key in names:
             return names.index(key)
@@ -83,7 +84,7 @@ View = Layout | MessageView
 
 
 @lru_cache
-def parts(path: str) -> tuple[tuple[str, str], ...]:
+def path_parts(path: str) -> tuple[tuple[str, str], ...]:
     """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
     pairs = tuple(PATH_PART.findall(path))
     rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in pairs)

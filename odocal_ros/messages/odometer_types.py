@@ -21,7 +21,14 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import from_columns, OdometerForm, OdometerSamples, Reading, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
-from odocal_ros.messages.message_fields import Column, MessageView, parts, STAMP, stamp_ns, View
+from odocal_ros.messages.message_fields import (
+    Column,
+    MessageView,
+    path_parts,
+    STAMP,
+    stamp_ns,
+    View,
+)
 from odocal_ros.messages.wheel_choice import key_on_side, select_wheels
 from odocal_ros.settings.config import Config
 
@@ -82,7 +89,7 @@ class OdometerPlan:
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
                 f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
                 f'lists its fields), or use a topic of type {", ".join(TYPES)}')
-        if self.field and not parts(self.field):
+        if self.field and not path_parts(self.field):
             raise BadConfig(f'odometer.field: {self.field!r} is not a path such as '
                             'twist.linear.x, data[0] or position[joint]')
         if not self.is_known_type:

@@ -24,19 +24,20 @@ Rows = Ints | Bools | slice      # selected messages: numbers, mask or slice
 Table = NDArray[np.uint8]      # (n, size): a message in each row
 # judgement: layouts per message length; messages of further ones are read one by one
 MAX_LAYOUTS = 16
-FEW_ROWS = 8      # judgement: messages up to selection single reads take less time than a table
+# judgement: up to this number of messages, reading each one takes less time than a table
+MAX_SINGLE_READS = 8
 FRAME_MESSAGES = 3     # judgement: messages that determine the frame; one may be damaged
 TEXT_OFFSET = cdr.FRAME_OFFSET - 4      # format: offset of the length of the frame_id
 
 
 class RawMessages(Sequence[bytes]):
-    """Messages: ``data``, and offset and length of each message in it."""
+    """Messages: ``data``, and offset and length of each message in it: (n,) bytes."""
 
     def __init__(self, data: Bytes, start: Ints, size: Ints) -> None:
         self.data, self.start, self.size = data, start, size
 
     @classmethod
-    def of(cls, raws: Sequence[bytes]) -> 'RawMessages':
+    def joined(cls, raws: Sequence[bytes]) -> 'RawMessages':
         """Return RawMessages of separate messages, copied to one buffer."""
         if isinstance(raws, RawMessages):
             return raws
@@ -97,7 +98,7 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | N
 
     Rows without a layout are last, with None and no messages.
     """
-    raws = RawMessages.of(raws)
+    raws = RawMessages.joined(raws)
     without_layout: list[Ints] = []
     for rows in raws.by_size():
         table = raws.table(rows)
@@ -143,15 +144,15 @@ class FrameFilter:
 
     def __init__(self, msgtype: str, configured_frame: str) -> None:
         self.frame = configured_frame
-        self.other = ''         # the last frame that was not used
+        self.other_frame = ''      # the last frame that was not used
         self._is_determined = bool(configured_frame)
         self._prefix = self._frame_prefix()
         self._msgtype = msgtype
         self._frame_counts: dict[str, int] = {}
 
-    def sort(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
-             deserialize: Callable[[bytes], Any]) -> tuple[Bools, OtherImuSamples | None]:
-        """Return a mask of the messages to use, and the samples of the others."""
+    def separate(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
+                 deserialize: Callable[[bytes], Any]) -> tuple[Bools, OtherImuSamples | None]:
+        """Return a mask of the messages to use, and the samples of other IMUs, None if none."""
         keep = np.ones(len(raws), bool)
         first = 0
         while not self._is_determined and first < len(raws):
@@ -160,20 +161,20 @@ class FrameFilter:
         keep[first:] = self._with_frame(raws[first:])
         if keep.all():
             return keep, None
-        other, stamps = [], []
+        other_frames, stamps = [], []
         for i in np.flatnonzero(~keep).tolist():
             frame = self._frame(raws[i], deserialize)
             if frame is None or frame == self.frame:        # damaged, or of another layout
                 keep[i] = True
             else:
-                other.append(frame.encode()[:FRAME_BYTES])
+                other_frames.append(frame.encode()[:FRAME_BYTES])
                 stamps.append(_stamp_ns(raws[i]))
-        if not other:
+        if not other_frames:
             return keep, None
-        self.other = other[-1].decode(errors='replace')
+        self.other_frame = other_frames[-1].decode(errors='replace')
         received = np.asarray(received_ns, np.int64)[~keep]
-        return keep, OtherImuSamples(np.array(stamps), received, np.array(other),
-                                     np.full(len(other), self.frame.encode()[:FRAME_BYTES]))
+        return keep, OtherImuSamples(np.array(stamps), received, np.array(other_frames),
+                                     np.full(len(other_frames), self.frame.encode()[:FRAME_BYTES]))
 
     def is_used(self, raw: bytes) -> bool:
         """Return True if the frame is determined and that of a message."""
@@ -198,14 +199,15 @@ class FrameFilter:
 
     def _with_frame(self, raws: Sequence[bytes]) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
-        if len(raws) <= FEW_ROWS:
+        if len(raws) <= MAX_SINGLE_READS:
             return np.array([self._has_frame(raw) for raw in raws], bool)
-        pattern = self._prefix
-        packed = RawMessages.of(raws)
-        offsets = np.concatenate([[0, 1], TEXT_OFFSET + np.arange(len(pattern) - 2)])
-        matches: Bools = packed.size > offsets[-1]
-        data, expected = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
-        matches[matches] = (data[packed.start[matches][:, None] + offsets] == expected).all(axis=1)
+        joined = RawMessages.joined(raws)
+        # bytes of the encoding, then length and text of the frame_id
+        offsets = np.concatenate([[0, 1], TEXT_OFFSET + np.arange(len(self._prefix) - 2)])
+        data = np.frombuffer(joined.data, np.uint8)
+        expected = np.frombuffer(self._prefix, np.uint8)
+        matches: Bools = joined.size > offsets[-1]
+        matches[matches] = (data[joined.start[matches][:, None] + offsets] == expected).all(axis=1)
         return matches
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:

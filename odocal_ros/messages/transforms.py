@@ -33,21 +33,22 @@ def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Trans
     Raises an exception if the message is damaged.
     """
     if raw[:2] != b'\0\1':      # XCDR1, little endian
-        return [(_name(one.child_frame_id), _name(one.header.frame_id),
-                 one.header.stamp.sec * 10**9 + one.header.stamp.nanosec,
+        return [(_name(message.child_frame_id), _name(message.header.frame_id),
+                 message.header.stamp.sec * 10**9 + message.header.stamp.nanosec,
                  tuple(float(getattr(part, axis)) for part, axes in (
-                     (one.transform.translation, 'xyz'), (one.transform.rotation, 'xyzw'))
-                     for axis in axes)) for one in deserialize(raw).transforms]
-    found, offset = [], 8
+                     (message.transform.translation, 'xyz'),
+                     (message.transform.rotation, 'xyzw')) for axis in axes))
+                for message in deserialize(raw).transforms]
+    transforms, offset = [], 8
     for _ in range(struct.unpack_from('<I', raw, 4)[0]):
         second, nanosecond = struct.unpack_from('<iI', raw, offset)
         parent, offset = _text(raw, offset + 8)
         child, offset = _text(raw, offset)
         offset += (4 - offset) % 8      # counted from after the four bytes
-        found.append((child, parent, second * 10**9 + nanosecond,
-                      struct.unpack_from('<7d', raw, offset)))
-        offset += 56
-    return found
+        transforms.append((child, parent, second * 10**9 + nanosecond,
+                           struct.unpack_from('<7d', raw, offset)))
+        offset += 7 * 8
+    return transforms
 
 
 def _text(raw: bytes, offset: int) -> tuple[str, int]:

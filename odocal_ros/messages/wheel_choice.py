@@ -90,28 +90,31 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
                         if not set(_words(name)) & set(EXCLUDED_WHOLE_WORDS)]
         candidates = [name for name in not_excluded
                       if _contains(name, DRIVE_WORDS_IN_NAME)] or not_excluded
-    split = {name: _side_and_rest(name) for name in candidates}
-    left, right = ([name for name in candidates if split[name][0] == side]
+    sides = {name: _side_and_rest(name)[0] for name in candidates}
+    rests = {name: _side_and_rest(name)[1] for name in candidates}      # equal in a pair
+    left, right = ([name for name in candidates if sides[name] == side]
                    for side in ('left', 'right'))
-    pairs = [(a, b) for a in left for b in right if split[a][1] == split[b][1]]
+    pairs = [(a, b) for a in left for b in right if rests[a] == rests[b]]
     if len(left) == len(right) == 1:
         pairs = [(left[0], right[0])]
-    if len(pairs) != len({name for pair in pairs for name in pair}) / 2:
+    if 2 * len(pairs) != len({name for pair in pairs for name in pair}):
         return tuple(candidates)                      # one wheel in two pairs
     if len(pairs) == 1:
         return Choice(pairs[0], True, _selection_text(names, pairs[0], ''))
-    steered = {_axle(_side_and_rest(name)[1]) for name in names
-               if _contains(name, STEERING_WORDS)} - {''}
-    fixed = [pair for pair in pairs if steered and _axle(split[pair[0]][1]) not in steered]
-    rear = [pair for pair in pairs if _axle(split[pair[0]][1]) == 'rear']
-    for axle_pairs, reason in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
+    steered_axles = {_axle(_side_and_rest(name)[1]) for name in names
+                     if _contains(name, STEERING_WORDS)} - {''}
+    not_steered = [pair for pair in pairs
+                   if steered_axles and _axle(rests[pair[0]]) not in steered_axles]
+    rear = [pair for pair in pairs if _axle(rests[pair[0]]) == 'rear']
+    for axle_pairs, reason in ((not_steered, ', axle that does not steer'), (rear, ', rear axle')):
         if len(axle_pairs) == 1:
             all_names = ', '.join(name for pair in pairs for name in pair)
             explanation = _selection_text(names, axle_pairs[0], reason)
             return Choice(axle_pairs[0], True,
                           f'{explanation}; for all wheels set odometer.wheels to [{all_names}]')
-    single = [name for name in candidates if _axle(split[name][1]) == 'rear']
-    return tuple(single) if len(candidates) == 2 and len(single) == 1 else tuple(candidates)
+    # a bicycle: of two wheels in line the front one steers
+    rear_wheels = [name for name in candidates if _axle(rests[name]) == 'rear']
+    return tuple(rear_wheels if len(candidates) == 2 and len(rear_wheels) == 1 else candidates)
 
 
 def _selection_text(names: Sequence[str], pair: tuple[str, str], reason: str) -> str:

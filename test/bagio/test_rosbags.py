@@ -36,7 +36,7 @@ def test_the_installed_version_is_one_that_was_checked():
 
 
 def test_the_reader_of_rosbag1_has_the_expected_internals(tmp_path):
-    assert set(reader.decompressors) == set(rosbags_readers.PACKINGS)
+    assert set(reader.decompressors) == set(rosbags_readers.COMPRESSIONS)
     assert set(reader.Chunk._fields) == {'datasize', 'datapos', 'decompressor'}
     assert list(inspect.signature(rosbag1.Reader.read_index_data).parameters) == [
         'self', 'pos', 'indexes']

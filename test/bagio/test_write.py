@@ -131,7 +131,7 @@ def test_two_wheels_have_two_counters_or_two_joints(tmp_path, odometer, topics):
 
 def test_the_block_size_does_not_change_the_bag(tmp_path, drive, monkeypatch):
     whole = messages(write_bag(tmp_path / 'whole', drive_topics(drive), 'sqlite3'))
-    monkeypatch.setattr('odocal_ros.bagio.write.BLOCK', 7)
+    monkeypatch.setattr('odocal_ros.bagio.write.BLOCK_MESSAGES', 7)
     reported = []
     write_bag(tmp_path / 'parts', drive_topics(drive), 'sqlite3', progress=reported.append)
     assert reported == sorted(reported)
