@@ -83,6 +83,15 @@ def test_factors_and_places_are_within_their_sigmas(options):
             assert beside['x_sigma'] < 0.02 * beside['x']
 
 
+def test_a_reversed_wheel_of_each_axle_is_reported():
+    one = made()
+    leg = one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: -a)
+                                 for k in (0, 2)})
+    inputs, found = screen(leg, config(one))
+    assert [reason.code for reason in found].count(Code.WHEEL_REVERSED) == 2
+    assert len(inputs.travels) == 4
+
+
 def test_each_axle_has_its_track_width():
     one, method = calibrated()
     widths = [name for name in method.estimates if name.startswith('track_width')]

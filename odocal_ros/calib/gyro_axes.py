@@ -74,11 +74,11 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
     if not any(one.code is Code.GYRO_SIGN for one in reasons):
         return ratio, gyro_axes(inputs, located, orientation) or reasons
     text = reasons[0].text
-    if orientation and abs(orientation.inward) > max(
-            -INVERTED, FAR_SIGMAS * orientation.inward_sigma):
+    if orientation and abs(orientation.centripetal) > max(
+            -INVERTED, FAR_SIGMAS * orientation.centripetal_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
-                 if orientation.inward < 0 else ', but match the accelerations in turns: latitude '
-                 'and longitude (x and y) are swapped, or linear_acceleration is negated')
+                 if orientation.centripetal < 0 else ', but match the accelerations in turns: '
+                 'latitude and longitude (x and y) are swapped, or linear_acceleration is negated')
     return ratio, (Reason(Code.GYRO_SIGN, text, '' if inputs.has_accelerometer else
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
@@ -92,12 +92,12 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     A flat road does not show roll and pitch, a straight one no yaw.
     """
     w_i, f_i = (map_rows(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
-    up = inputs.usual_f_b @ inputs.C_bi
+    up = inputs.median_f_b @ inputs.C_bi
     axes, names = level_axes(up / np.linalg.norm(up))
     wrong_axes = by_course(inputs, located, w_i, axes, names)
     if not wrong_axes and inputs.has_accelerometer:
-        inverted = orientation and orientation.inward < min(
-            INVERTED, -FAR_SIGMAS * orientation.inward_sigma)
+        inverted = orientation and orientation.centripetal < min(
+            INVERTED, -FAR_SIGMAS * orientation.centripetal_sigma)
         if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         wrong_axes = by_gravity(inputs, located, w_i, f_i, axes, names)
@@ -119,7 +119,7 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
-            f'{orientation.inward:.2f} ± {orientation.inward_sigma:.1g} instead of 1)')
+            f'{orientation.centripetal:.2f} ± {orientation.centripetal_sigma:.1g} instead of 1)')
     level = [name[-1] for name in names[:2]]
     wrong = [axis for axis in level
              if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
@@ -160,7 +160,7 @@ def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
 def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
                names: list[str]) -> list[WrongAxis]:
     """Return the gyro axes that measure the rotation of gravity about another axis."""
-    fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough)
+    fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough_scale)
     if fit is None:
         return []
     wrong_axes = []

@@ -129,7 +129,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     binned = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if binned is None:
         return None, np.pi
-    A, F = binned.onward + 1j * binned.inward, binned.force
+    A, F = binned.forward + 1j * binned.centripetal, binned.force
     fits = _angle(A, F), _angle(A.conj(), F)
     theta, sigma = next((fit for fit in fits if fit[1] <= AXIS_LIMIT / 2), fits[0])
     if sigma > AXIS_LIMIT / 2:

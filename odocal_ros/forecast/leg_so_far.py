@@ -105,7 +105,7 @@ def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
         raise BadData('a profile needs IMU, odometer and fixes between the marks; check the bag '
                       'with odocal inspect')
     located = _locate_or_raise(inputs, config)
-    origin, scale = located.origin, located.rough
+    origin, scale = located.origin, located.rough_scale
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
     step = max(DRIVE_STEP, (last - first) / 5e4)
@@ -125,7 +125,7 @@ def drive_profile(inputs: Inputs, config: Config) -> PlannedDrive:
 def _locate_or_raise(inputs: Inputs, config: Config) -> LocatedFixes:
     """Return the fix positions and the metres per count; raise BadData without them."""
     located = locate_fixes(inputs, config)
-    if not located.rough:
+    if not located.rough_scale:
         raise BadData('the scale is not known yet: the fixes moved too little and '
                       'odometer.nominal_scale is not set')
     return located
@@ -167,7 +167,7 @@ def fix_and_count_accuracy(inputs: Inputs, config: Config) -> dict[str, float]:
     return {'fix': float(np.sqrt((variance[0] + variance[1]) / 2)),
             'fix_up': float(np.sqrt(variance[2])),
             'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside]))),
-            'quantum': inputs.travel.quantum * _locate_or_raise(inputs, config).rough}
+            'quantum': inputs.travel.quantum * _locate_or_raise(inputs, config).rough_scale}
 
 
 class SmootherSoFar:
@@ -215,16 +215,16 @@ class SmootherSoFar:
             raise BadData(reason.text)
         _raise_if_unusable(screened.reasons)
         located = _locate_or_raise(inputs, config)
-        _raise_if_unusable(orientation_reasons(estimate_orientation(inputs, located.rough),
+        _raise_if_unusable(orientation_reasons(estimate_orientation(inputs, located.rough_scale),
                                                config.imu.nominal_yaw))
         if vars(located.origin) != (self._origin and vars(self._origin)):
             self._origin = located.origin
             self._growing.forget()
-        spans = inputs.standstills(located.rough, config)
+        spans = inputs.standstills(located.rough_scale, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         smoother_leg = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
-                                         located.rough, t_stop)
+                                         located.rough_scale, t_stop)
         reason = missing_samples_reason(smoother_leg)
         if reason:
             raise BadData(reason.text)

@@ -207,7 +207,7 @@ def standstills_of(inputs: Inputs, first: int, config: Config) -> Standstills:
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return Standstills(np.empty((0, 2), np.int64), np.empty((0, 2)), 0.0)
-    scale = locate_fixes(inputs, config).rough or 1.0
+    scale = locate_fixes(inputs, config).rough_scale or 1.0
     spans = inputs.standstills(scale, config)
     path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))

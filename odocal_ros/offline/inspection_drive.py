@@ -79,13 +79,13 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config, content: dict
     if still_reasons:       # scale, speeds, standstills and axes are computed from the counts
         findings += still_reasons
         return options
-    stops, speeds = survey.stops_and_speeds(inputs, located.rough, config)
+    stops, speeds = survey.stops_and_speeds(inputs, located.rough_scale, config)
     path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.min_motion)
     travel = _travel_between_fixes(inputs)
     is_long = path_length > 2.5 * inputs.min_motion      # judgement: then it is accurate to 1 %
-    scale = path_length / travel if is_long and travel else located.rough or None
+    scale = path_length / travel if is_long and travel else located.rough_scale or None
     # speeds with the printed scale
-    scale_ratio = scale / located.rough if scale and located.rough else 1.0
+    scale_ratio = scale / located.rough_scale if scale and located.rough_scale else 1.0
     content['drive'] = {
         'distance': path_length, 'chord': chord, 'fix_sigma': located.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
@@ -115,7 +115,7 @@ def _unit_options(inputs: Inputs, config: Config,
     """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_mounting_remedy(
         gravity_turn_reasons(inputs) or imu_orientation.unit_and_axis_reasons(
-            inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
+            inputs.median_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
         or unit_change_reasons(inputs), inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
@@ -146,7 +146,7 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
     if not is_configured and step.sum() < -MAX_BACKWARD_SHARE * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
-    axes = estimate_mounting(inputs.t_imu, w_i, f_i, travel, located.rough or 1.0)
+    axes = estimate_mounting(inputs.t_imu, w_i, f_i, travel, located.rough_scale or 1.0)
     if not inputs.has_accelerometer:
         axes = replace(axes, C_bi=None)      # gravity is assumed
     agrees = axes.C_bi is not None and np.allclose(
@@ -158,8 +158,8 @@ def _axis_options(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Float
         'forward_i': None if axes.forward_i is None else axes.forward_i.tolist(),
         'forward_sigma': axes.forward_sigma if axes.forward_i is not None else None,
         'needed': axes.rpy is not None and not agrees and not is_configured}
-    orientation = imu_orientation.estimate_orientation(inputs, located.rough) \
-        if inputs.has_accelerometer and located.rough else None
+    orientation = imu_orientation.estimate_orientation(inputs, located.rough_scale) \
+        if inputs.has_accelerometer and located.rough_scale else None
     ratio, axis_faults = check_turns(replace(inputs, w_b=w_i @ inputs.C_bi.T), located,
                                      orientation, config.imu.gyro_scale)
     content['drive']['gyro_over_course'] = ratio

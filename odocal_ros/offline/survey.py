@@ -246,7 +246,7 @@ def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floa
 def straight_sections(inputs: Inputs, located: LocatedFixes,
                       shortest: float) -> list[tuple[float, float]]:
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
-    if not located.rough or len(inputs.t_fix) < 3:
+    if not located.rough_scale or len(inputs.t_fix) < 3:
         return []
     max_fixes = 600    # fixes tested for straight sections, evenly selected
     selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, max_fixes).astype(int))
@@ -258,7 +258,7 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     # straightest sections determine it best
     ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
-    path_length = travel * max(located.rough, min(best, 1.2 * located.rough))
+    path_length = travel * max(located.rough_scale, min(best, 1.2 * located.rough_scale))
     # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
     # both end points have errors of sigma: a section within these errors is accepted

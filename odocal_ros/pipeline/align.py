@@ -158,7 +158,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nomina
     if its error is the same in every leg (``Alignment.heading_shared``).
     """
     setting = config.alignment.source
-    order = [setting] if setting != 'auto' else [] if inputs.local else [
+    order = [setting] if setting != 'auto' else [] if inputs.is_local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
     refusals = []
     for source in order if setting != 'course' else ():
@@ -234,7 +234,7 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
 
 def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                             config: Config) -> HeadingOrRefusal:
-    if inputs.local:
+    if inputs.is_local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
         return None, 'needs a standstill'

@@ -43,7 +43,7 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                  for p, e in method.estimates.items()}
     row = {p: relative.get(p, 0.0) * (method.estimates[p].value or 0.0)
            for p in method.parameters} | {'shared': shared}
-    sigma_reasons = [r for r in check_limits(estimates, prepared.nominal, prepared.config)
+    sigma_reasons = [r for r in check_limits(estimates, prepared.nominal_scale, prepared.config)
                      if r.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
@@ -102,7 +102,7 @@ def with_truncation(method: MethodResult, prepared: PreparedLeg) -> MethodResult
 
 def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     """Return the reasons for coarse steps of speed or counts."""
-    K, size = located.nominal or located.rough, half_step(inputs)
+    K, size = located.nominal_scale or located.rough_scale, half_step(inputs)
     count = inputs.travel.quantum * K
     coarse_count_m = 0.2    # m, least size of a coarse count
     if count > coarse_count_m:
@@ -112,7 +112,7 @@ def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
-    step = _speed_text(coarse.step, located.rough, inputs.scale_unit)
+    step = _speed_text(coarse.step, located.rough_scale, inputs.scale_unit)
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{step}; half a step is added in the direction of the last change')]
@@ -144,7 +144,7 @@ def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]]
     observable_m = max(0.1, 0.25 * prepared.fix_sigma)
     for name, (delay, sigma) in delays.items():
         metres = abs(delay) * speed
-        if name in prepared.inputs.aligned or not (
+        if name in prepared.inputs.clock_delays or not (
                 abs(delay) > REMARK_SIGMAS * sigma and metres > observable_m):
             continue        # of an aligned clock the delay is reported already: this is the rest
         set_to = getattr(prepared.config, name).time_offset

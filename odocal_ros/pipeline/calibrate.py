@@ -104,7 +104,7 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
         known = {r.code for r in reasons}
         return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in known)),
                         False)
-    imu_reasons, z_down = unit_and_axis_reasons(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
+    imu_reasons, z_down = unit_and_axis_reasons(inputs.median_f_b, inputs.w_b, inputs.C_bi,
                                                 config.imu)
     # takes precedence: the mean gravity of the other test is then meaningless
     if gravity_turns := gravity_turn_reasons(inputs):

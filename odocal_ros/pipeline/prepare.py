@@ -46,7 +46,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     refusal_reasons = _missing_drive_reasons(inputs, located)
     if refusal_reasons is not None:
         return None, (*reasons, *refusal_reasons)
-    accelerations = (imu_orientation.accelerations(inputs, located.rough)
+    accelerations = (imu_orientation.accelerations(inputs, located.rough_scale)
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *drive.odometer_span_reasons(inputs.travel, inputs.t_stop))
@@ -67,11 +67,11 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
                    orientation: imu_orientation.ImuOrientation | None, reasons: Sequence[Reason],
                    alignment: Alignment | None, holdout: bool) -> PreparedLeg:
     """Return a leg aligned and dead-reckoned, with the checks of its track; as ``prepare``."""
-    spans = inputs.standstills(located.rough, config)
+    spans = inputs.standstills(located.rough_scale, config)
     alignment_reasons: tuple[Reason, ...] = ()
     is_own_alignment = alignment is None
     if alignment is None:
-        alignment, alignment_reasons = align(inputs, spans, located.rough, located.fixes_n,
+        alignment, alignment_reasons = align(inputs, spans, located.rough_scale, located.fixes_n,
                                              located.origin, config)
     release_mapped_memory()
     gap_reasons = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
@@ -81,14 +81,15 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
                                        located.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
     wheel_reasons, wheel_slips = _compare_wheels(inputs, config, located, track, reasons)
-    distance, drive_reasons = drive.check_drive(track, inputs.t_stop, located.rough, config.leg)
+    distance, drive_reasons = drive.check_drive(track, inputs.t_stop, located.rough_scale,
+                                                config.leg)
     # only methods by end points need straight legs
     end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
         **vars(located), leg=leg, inputs=inputs, config=config, imu_orientation=orientation,
         lever_b=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
         alignment=alignment, alignment_reasons=alignment_reasons, epochs=epochs, track=track,
-        wheel_slips=wheel_slips, metres_per_unit=located.rough, distance=distance,
+        wheel_slips=wheel_slips, metres_per_unit=located.rough_scale, distance=distance,
         t_fit=_time_of_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop,
         holdout=holdout,
         reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, located), *wheel_reasons,
@@ -108,7 +109,7 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
     refusal_reasons = drive.motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
         inputs.min_motion)
-    if refusal_reasons or not located.rough:
+    if refusal_reasons or not located.rough_scale:
         return refusal_reasons or (Reason(
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
             'Drive farther between the marks. If the vehicle did, check the receiver (static '
@@ -131,7 +132,7 @@ def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track
     odometer, count = config.odometer, sum(not wheel.distance_ahead for wheel in inputs.travels)
     axle_reasons, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
-        located.origin.latitude, located.rough, odometer.track_width, inputs.uncertain_t,
+        located.origin.latitude, located.rough_scale, odometer.track_width, inputs.uncertain_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
     return tuple(chain(*axle_reasons)), join_axles(wheel_slips, count)
 

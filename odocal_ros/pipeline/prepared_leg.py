@@ -182,7 +182,7 @@ def configured_forward(prepared: PreparedLeg, f: Floats,
     angles = [0.0 if name in determined else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'),
         dead_reckoning.mounting_from_forward(f), strict=True)]
-    scale = prepared.nominal or prepared.path_ratio or prepared.rough
+    scale = prepared.nominal_scale or prepared.path_ratio or prepared.rough_scale
     return scale * dead_reckoning.forward_b(*angles)
 
 
@@ -232,7 +232,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
                              start, paths, prepared.config, prepared.t_fit, prepared.covered)
     return fields | {'evidence': evidence}, (
-        *section_reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal)),
+        *section_reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal_scale)),
         *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
                                                   evidence.fix_distance))
 

@@ -36,10 +36,10 @@ from odocal_ros.settings.config import Config
 def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
     leg = make_smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
-                            prepared.spans, prepared.rough, prepared.t_fit)
+                            prepared.spans, prepared.rough_scale, prepared.t_fit)
     t_slip, metres = prepared.wheel_slips.uncertain_travel()
     leg = replace(leg, uncertain_t=np.append(leg.uncertain_t, t_slip),
-                  uncertain_sigma=np.append(leg.uncertain_sigma, metres / prepared.rough))
+                  uncertain_sigma=np.append(leg.uncertain_sigma, metres / prepared.rough_scale))
     passes = count(1)
     method = smooth(leg, prepared.config, lambda *state: report_pass(next(passes), state[-1]))
     if method.estimates['scale_factor'].value is None:
@@ -129,11 +129,12 @@ def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
     begin, end = (pick([float(x.t[at]) for x in (prepared.track, left, right)])
                   for pick, at in ((max, 0), (min, -1)))
     begin, end = max(0.0, begin), min(prepared.t_fit, end)
-    start = prepared.mark(begin, prepared.path(np.array([prepared.rough, 0.0, 0.0])), 'start')
+    rough_path = prepared.path(np.array([prepared.rough_scale, 0.0, 0.0]))
+    start = prepared.mark(begin, rough_path, 'start')
     if start is None or end <= begin:
         return None
     between = (inputs.t_fix >= begin) & (inputs.t_fix <= end)
-    scale = prepared.nominal or prepared.rough
+    scale = prepared.nominal_scale or prepared.rough_scale
     return planar_leg(dead_reckon(*prepared.epochs, left), dead_reckon(*prepared.epochs, right),
                       inputs.t_fix[between], prepared.fixes_n[between],
                       inputs.covariance_n[between], (start.t, start.position_n),

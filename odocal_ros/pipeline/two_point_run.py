@@ -54,7 +54,7 @@ class TwoPointRun:
         """Return the method's result, the paths before and after, and the reasons."""
         chord = self._chord()
         refused = tuple(self.reasons) if chord is None else refusal_reasons(
-            chord, self.prepared.rough)
+            chord, self.prepared.rough_scale)
         if chord is None or refused:
             return MethodRun(refused_result(refused, self.inputs.scale_unit),
                              data_reasons=tuple(self.data_reasons))
@@ -69,11 +69,11 @@ class TwoPointRun:
         if between.sum() >= 3:
             chord, factor = self._fit_noise(chord, f, between)
         chord = replace(chord, slips=self._find_slips(chord, solve(chord, factor[2])[0]))
-        method = fit(chord, self.prepared.nominal, self.inputs.scale_unit,
+        method = fit(chord, self.prepared.nominal_scale, self.inputs.scale_unit,
                      self.inputs.travel.quantum, factor, self.config)
         self._check_counting_direction(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *check_limits(
-            method.estimates, self.prepared.nominal, self.config)))
+            method.estimates, self.prepared.nominal_scale, self.config)))
         f = method.details['f']
         paths = Paths(*map(self.prepared.path,
                            (configured_forward(self.prepared, f, method.estimates), f)))
@@ -96,7 +96,7 @@ class TwoPointRun:
     def _chord(self) -> Chord | None:
         """Return the chord between the marks; None, with a reason, without fixes."""
         prepared, track = self.prepared, self.track
-        path = prepared.path(np.array([prepared.rough, 0.0, 0.0]))
+        path = prepared.path(np.array([prepared.rough_scale, 0.0, 0.0]))
         start = prepared.mark(prepared.covered[0], path, 'start')
         end = prepared.mark(min(prepared.t_fit, prepared.covered[1]), path, 'end')
         self.reasons += [Reason(Code.NO_FIX, f'no usable fix at the {name} mark')
@@ -107,7 +107,7 @@ class TwoPointRun:
                       self._velocity_change((start, end)), prepared.alignment,
                       (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
         exact = all(m.standing or m.surveyed for m in (start, end))
-        if exact or refusal_reasons(chord, prepared.rough):
+        if exact or refusal_reasons(chord, prepared.rough_scale):
             return chord
         path = prepared.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
         return replace(chord, start=prepared.mark(start.t, path, 'start') or start,

@@ -5,6 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -40,46 +41,44 @@ def pair_wheels(wheels: Sequence[Wheel]) -> list[tuple[Wheel, ...]]:
 
 
 def usable_axles(wheels: Wheels, imu: Imu,
-                 between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
+                 marks: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
     """
-    Return the usable wheels, with the distance of steered ones ahead, and reasons.
+    Return the usable wheels, with ``distance_ahead`` of steered ones, and reasons.
 
-    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
+    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   marks : start and stop, s.
 
     A broken axle is left out if another one is usable and does not steer: one wheel does not
     measure the travel of the axle's middle.
     """
     axles = pair_wheels(wheels.wheels)
-    faults = [_faults(axle, axles, imu, between) for axle in axles]
-    fault_reasons = [reason for of_axle in faults for reason in of_axle]
+    faults = [_axle_faults(axle, axles, imu, marks) for axle in axles]
+    all_faults = list(chain(*faults))
     if len(axles) < 2:
-        return wheels, fault_reasons
+        return wheels, all_faults
     # the working wheel of a broken axle is used to detect steering of the others
-    usable = [_working_wheel(axle, of_axle) if of_axle else axle for axle, of_axle in zip(
-        axles, faults, strict=True)]
-    ahead = iter(_distances_ahead([axle for axle in usable if axle], imu, between,
-                                  wheels.uncertain_t))
-    distances = [next(ahead) if axle else np.inf for axle in usable]
+    tested = [_working_wheel(axle, axle_faults) if axle_faults else axle
+              for axle, axle_faults in zip(axles, faults, strict=True)]
+    distances = _distances_ahead(tested, imu, marks, wheels.uncertain_t)
     working = [replace(wheel, distance_ahead=distance)
-               for axle, of_axle, distance in zip(axles, faults, distances, strict=True)
-               if not of_axle for wheel in axle]
-    steered, fixed = ([wheel for wheel in working if bool(wheel.distance_ahead) is steers]
-                      for steers in (True, False))
-    if fault_reasons and (not fixed or sum(map(bool, usable)) < 2):
-        return wheels, fault_reasons
-    reasons = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_subject(axle)} left out of the mean')
-               for axle, of_axle in zip(axles, faults, strict=True) for reason in of_axle]
+               for axle, axle_faults, distance in zip(axles, faults, distances, strict=True)
+               if not axle_faults for wheel in axle]
+    steered = [wheel for wheel in working if wheel.distance_ahead]
+    unsteered = [wheel for wheel in working if not wheel.distance_ahead]
+    if all_faults and (not unsteered or sum(map(bool, tested)) < 2):
+        return wheels, all_faults
+    reasons = [Reason(Code.WHEEL_LEFT_OUT, f'{fault.text}; {_subject(axle)} left out of the mean')
+               for axle, axle_faults in zip(axles, faults, strict=True) for fault in axle_faults]
     if steered:
         reasons.append(Reason(Code.WHEELS_STEERED, f'{_subject(steered)} steered: a '
                               'steered wheel travels farther in turns. The scale factor is that '
-                              f'of the mean of {_names(fixed)}'))
+                              f'of the mean of {_names(unsteered)}'))
     return wheels.replaced(working), reasons
 
 
 def _working_wheel(axle: Axle, faults: Sequence[Reason]) -> Axle:
     """Return the working wheel of a broken axle, () if it is not certain."""
     rolled = [_path_length(wheel) for wheel in axle]
-    one_dead = len(axle) > 1 and {reason.code for reason in faults} == {Code.WHEEL_DEAD}
+    one_dead = len(axle) > 1 and {fault.code for fault in faults} == {Code.WHEEL_DEAD}
     return (axle[int(np.argmax(rolled))],) if one_dead and max(rolled) > 0 else ()
 
 
@@ -87,8 +86,8 @@ def _path_length(wheel: Travel) -> float:
     return float(np.abs(np.diff(wheel.s)).sum())
 
 
-def _faults(axle: Axle, axles: list[Axle], imu: Imu,
-            between: tuple[float, float]) -> tuple[Reason, ...]:
+def _axle_faults(axle: Axle, axles: list[Axle], imu: Imu,
+            marks: tuple[float, float]) -> tuple[Reason, ...]:
     """Return the faults of an axle; a single wheel is compared with the first axle."""
     longest = max(_path_length(wheel) for other in axles for wheel in other)
     rolled = max(map(_path_length, axle))
@@ -98,27 +97,33 @@ def _faults(axle: Axle, axles: list[Axle], imu: Imu,
                        f'(limit {100 * STALLED_SHARE:g} %)'),) if longest else ()
     if len(axle) == 1:
         axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
-    return broken_wheel_reasons(axle, imu, between)
+    return broken_wheel_reasons(axle, imu, marks)
 
 
-def _distances_ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
+def _distances_ahead(axles: list[Axle], imu: Imu, marks: tuple[float, float],
                      uncertain_t: Floats) -> list[float]:
-    """Return the distance of each axle ahead of the one that steers least, scale units."""
-    first = mean_travel(axles[0])
-    estimates = [(0.0, 0.0), *(
-        _squared_distance(mean_travel(axle), first, imu, between, uncertain_t)
-        for axle in axles[1:])]
-    squares, sigmas = np.transpose(estimates)
-    reference = int(np.argmin(squares))
-    square, sigma = squares - squares[reference], np.hypot(sigmas, sigmas[reference])
-    ahead: list[float] = np.where(square > FAULT_SIGMAS * sigma, np.sqrt(square), 0.0).tolist()
-    return ahead
+    """Return distances ahead of the axle that steers least, scale units; inf for an axle ()."""
+    tested = [k for k, axle in enumerate(axles) if axle]
+    distances = np.full(len(axles), np.inf)
+    if tested:
+        first, *others = (mean_travel(axles[k]) for k in tested)
+        squares, sigmas = np.transpose([(0.0, 0.0), *(
+            _squared_distance(other, first, imu, marks, uncertain_t) for other in others)])
+        reference = int(np.argmin(squares))
+        square, sigma = squares - squares[reference], np.hypot(sigmas, sigmas[reference])
+        distances[tested] = np.where(square > FAULT_SIGMAS * sigma, np.sqrt(square), 0.0)
+    return distances.tolist()
 
 
-def _squared_distance(axle: Travel, other: Travel, imu: Imu, between: tuple[float, float],
+def _squared_distance(axle: Travel, other: Travel, imu: Imu, marks: tuple[float, float],
                       uncertain_t: Floats) -> tuple[float, float]:
-    """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
-    pair = wheels_on_grid((axle, other), imu, between, STEER_GRID, uncertain_t)    # left: axle
+    """
+    Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible.
+
+    A fit explains the travel of the axle by that of the other one, the additional path of a
+    steered axle (its coefficient is the squared distance) and the turn.
+    """
+    pair = wheels_on_grid((axle, other), imu, marks, STEER_GRID, uncertain_t)    # left: axle
     if pair is None:
         return 0.0, 0.0
     edges = np.arange(0, len(pair.t), CELL_STEPS)
@@ -130,8 +135,8 @@ def _squared_distance(axle: Travel, other: Travel, imu: Imu, between: tuple[floa
     if keep.sum() < CELL_STEPS or not design[keep, 1].any():
         return 0.0, 0.0
     x, covariance, _ = robust_fit(design[keep], y[keep], pair.min_sigma(y[keep]))
-    additional, total = abs(x[1]) * np.abs(design[keep, 1]).sum(), np.abs(y[keep]).sum()
-    if additional <= MIN_STEERED_SHARE * total:
+    additional_path = abs(x[1]) * np.abs(design[keep, 1]).sum()
+    if additional_path <= MIN_STEERED_SHARE * np.abs(y[keep]).sum():
         return 0.0, 0.0
     return float(x[1]), float(np.sqrt(covariance[1, 1]))
 
@@ -160,4 +165,4 @@ def _subject(wheels: Sequence[Travel]) -> str:
 
 
 def _names(wheels: Sequence[Travel]) -> str:
-    return ' and '.join(one.name for one in wheels)
+    return ' and '.join(wheel.name for wheel in wheels)

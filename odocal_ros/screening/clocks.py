@@ -56,9 +56,9 @@ SYNCHRONISE_REMEDY = (
 
 def stamp_offsets(config: Config) -> dict[str, float]:
     """Return the seconds to add to the stamps of each input; 0 for the IMU, the reference."""
-    def of(group: str) -> float:
-        return float(getattr(config, group).time_offset) if group else 0.0
-    return {slot: of(one.clock) - of('imu') for slot, one in INPUTS.items()}
+    def offset(clock: str) -> float:
+        return float(getattr(config, clock).time_offset) if clock else 0.0
+    return {slot: offset(source.clock) - offset('imu') for slot, source in INPUTS.items()}
 
 
 def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
@@ -71,24 +71,25 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
         if min(len(imu.stamp_ns) - 1, len(samples.stamp_ns)) < 1 or (
                 slot == 'fix' and config.reference.points):
             continue
-        ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples)) + offset[slot]
-        if abs(ahead) > CLOCK_DIFFERENCE_LIMIT:
+        lead_s = median(_lag_at(samples.received_ns, imu) - _lag(samples)) + offset[slot]
+        if abs(lead_s) > CLOCK_DIFFERENCE_LIMIT:
             group = INPUTS[slot].clock
-            hint = f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
+            hint = f'; if this is not transport delay, add {-lead_s:+z.3f} to {group}.time_offset'
             reasons.append(Reason(
-                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
+                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {lead_s:+z.3f} s '
                 'from IMU stamps that arrive at the same time; the limit is '
                 f'{CLOCK_DIFFERENCE_LIMIT:g} s'
-                f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', clock_remedy(ahead)))
+                f'{hint if group and abs(lead_s) <= OFFSET_REACH else ""}', clock_remedy(lead_s)))
     return reasons
 
 
-def clock_remedy(ahead: float) -> str:
-    """Return the remedy for a clock that is ``ahead`` s ahead of the IMU clock."""
-    return SYNCHRONISE_REMEDY if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
+def clock_remedy(lead_s: float) -> str:
+    """Return the remedy for a clock that is ``lead_s`` s ahead of the IMU clock."""
+    return SYNCHRONISE_REMEDY if abs(lead_s) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
 
 def _stamped(samples: SomeSamples) -> SomeSamples:
+    """Return the rows that have a stamp."""
     has_stamp = samples.stamp_ns > 0
     return samples if has_stamp.all() else take(samples, has_stamp)
 
@@ -100,12 +101,12 @@ def _lag(samples: Samples) -> Floats:
 
 
 def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
-    """Return the lag of the IMU at times of arrival: (m,) s; computed in pieces."""
+    """Return the lag of the IMU, interpolated at (m,) times of arrival: (m,) s."""
     base = imu.received_ns[0]
 
     def seconds(received_ns: Ints) -> Floats:
-        since: Floats = np.multiply(received_ns - base, 1e-9)
-        return since
+        since_first: Floats = np.multiply(received_ns - base, 1e-9)
+        return since_first
 
     if not map_windows(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
         # queued messages arrive together: their mean is used
@@ -115,9 +116,9 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         return np.interp(seconds(arrival_ns), arrival, lag)
     order = np.argsort(arrival_ns, kind='stable')
     times_ns, lags = arrival_ns[order], np.empty(len(order))
-    for where, rows in enclosing_slices(times_ns, imu.received_ns):
-        lags[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
-                                       _lag(take(imu, rows)))
+    for some, rows in enclosing_slices(times_ns, imu.received_ns):
+        lags[order[some]] = np.interp(seconds(times_ns[some]), seconds(imu.received_ns[rows]),
+                                      _lag(take(imu, rows)))
     return lags
 
 
@@ -127,7 +128,7 @@ def _may_be_clock_step(stamp_ns: Ints) -> Bools:
 
 
 def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
-    """Return a leg without the steps of clocks that were set during it; CLOCK_SET for each."""
+    """Return the leg with stamps as if no clock had been set during it, and CLOCK_SET reasons."""
     rows: dict[str, Samples] = {}
     reasons: list[Reason] = []
     for slot in ('imu', *TOPICS):
@@ -157,15 +158,19 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 
 def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
-    """Return the rows after which a clock was set, and by how much, s: arrivals do not step."""
+    """
+    Return the rows after which a clock was set, and the change, s.
+
+    The stamps step there, but the arrivals do not, so that the median lag changes.
+    """
     if len(samples.stamp_ns) < 2 * STEP_LAG_ROWS or not map_windows(
             _may_be_clock_step, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
     advance = lag[:-1] - lag[1:]        # of stamps over arrivals
-    odd_step = np.abs(step - np.median(step)) > np.maximum(CLOCK_STEP, np.abs(advance) / 4)
+    is_unusual = np.abs(step - np.median(step)) > np.maximum(CLOCK_STEP, np.abs(advance) / 4)
     rows, sizes = [], []
-    for k in np.flatnonzero(odd_step & (np.abs(advance) > CLOCK_STEP / 2)).tolist():
+    for k in np.flatnonzero(is_unusual & (np.abs(advance) > CLOCK_STEP / 2)).tolist():
         first, last = max(k + 1 - STEP_LAG_ROWS, 0), k + STEP_LAG_ROWS
         size = float(np.median(lag[first:k + 1]) - np.median(lag[k + 1:last + 1]))
         if (abs(size) >= CLOCK_STEP and abs(advance[k] - size) <= 0.3 * abs(size)
@@ -176,7 +181,7 @@ def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
 
 
 def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, float]]:
-    """Yield the clocks that are late relative to the IMU, and by how much, s; < 0: early."""
+    """Yield groups of settings whose clock is late or early, and its delay to the IMU clock, s."""
     t, travel, t_fix = inputs.t_imu, inputs.travel, inputs.t_fix
     if not inputs.has_accelerometer or min(len(t), len(travel.t), len(t_fix)) < 2:
         return
@@ -184,7 +189,7 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
     if len(edges) < 3:      # no change of speed between two cells
         return
     count, (force,) = bin_means(t, edges, inputs.f_b)
-    force[count == 0] = inputs.usual_f_b
+    force[count == 0] = inputs.median_f_b
     travel_steps = np.diff(travel.at(edges))
     odometer = _delay(_without_slow_changes(np.gradient(travel_steps)[:, None], SLOW_FORCE),
                       _without_slow_changes(force, SLOW_FORCE))
@@ -198,11 +203,11 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
 
 
 def _chords(position: Floats) -> Floats:
-    """Return distances between means over adjacent ACCELERATION_S, times a constant: (n, 1)."""
+    """Return distances between sums of positions over adjacent ACCELERATION_S: (n, 1)."""
     cells = round(ACCELERATION_S / OFFSET_CELL)
     total = np.cumsum(np.pad(position, ((cells, cells), (0, 0)), mode='edge'), axis=0)
-    mean = total[cells:] - total[:-cells]
-    chords: Floats = np.linalg.norm(mean[cells:] - mean[:-cells], axis=1)[:, None]
+    window_sum = total[cells:] - total[:-cells]
+    chords: Floats = np.linalg.norm(window_sum[cells:] - window_sum[:-cells], axis=1)[:, None]
     return chords
 
 
@@ -215,33 +220,34 @@ def _without_slow_changes(x: Floats, slow: float) -> Floats:
 
 def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
     """
-    Return the delay, s, at which x (n, k) explains most of y (n, 1); 0 if small or uncertain.
+    Return the delay of y (n, 1) against x (n, k), s; 0 if small (up to OFFSET_REACH) or uncertain.
 
-    x_delay : known delay of x, s, which is added.   Small is up to OFFSET_REACH.
+    At this delay a regression on x explains the largest share of the variance of y. Rows are
+    OFFSET_CELL apart.   x_delay : known delay of x, s, which is added.
     """
     reach = round(FARTHEST_OFFSET / OFFSET_CELL)
     size = 2 * max(len(x), reach)
     product = np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj()
-    cells = np.arange(-reach, reach + 1)
+    cells = np.arange(-reach, reach + 1)      # tested delays
     correlation = np.fft.irfft(product, axis=0)[cells]
-    share = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
+    explained = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
         float((y**2).sum()), 1e-12)
-    best = 1 + int(np.argmax(share[1:-1]))
-    before, top, after = share[best - 1:best + 2]
-    parabola_top = (after - before) / max(2 * (2 * top - before - after), 1e-12)
-    delay_s = OFFSET_CELL * (cells[best] + np.clip(parabola_top, -0.5, 0.5))
-    small = np.abs(OFFSET_CELL * cells + x_delay) <= OFFSET_REACH
-    others = share[(np.abs(OFFSET_CELL * cells - delay_s) > ACCELERATION_S) | small].max()
+    best = 1 + int(np.argmax(explained[1:-1]))
+    before, largest, after = explained[best - 1:best + 2]
+    vertex = (after - before) / max(2 * (2 * largest - before - after), 1e-12)    # of a parabola
+    delay_s = OFFSET_CELL * (cells[best] + np.clip(vertex, -0.5, 0.5))
+    is_small = np.abs(OFFSET_CELL * cells + x_delay) <= OFFSET_REACH
+    is_far = np.abs(OFFSET_CELL * cells - delay_s) > ACCELERATION_S
     samples = len(y) * OFFSET_CELL / ACCELERATION_S
-    unexplained = np.maximum(1.0 - np.array([others, top]), 1e-6)      # share of the variance
+    unexplained = np.maximum(1.0 - np.array([explained[is_far | is_small].max(), largest]), 1e-6)
     log_odds = samples / 2 * np.log(unexplained[0] / unexplained[1])
     return float(delay_s + x_delay) if log_odds > DELAY_LOG_ODDS else 0.0
 
 
-def shift_stamps(samples: SomeSamples, by_ns: int, imu: ImuSamples) -> SomeSamples:
-    """Return samples with moved stamps; arrivals too, unless stamps then lag like the IMU's."""
-    lag, imu_lag = (float(np.median(one.received_ns - one.stamp_ns)) if len(one.stamp_ns) else 0.0
-                    for one in (samples, imu))
-    only_stamps = abs(lag - by_ns - imu_lag) < abs(lag - imu_lag)
-    return replace(samples, received_ns=samples.received_ns + (0 if only_stamps else by_ns),
-                   stamp_ns=samples.stamp_ns + by_ns * (samples.stamp_ns > 0))
+def shift_stamps(samples: SomeSamples, shift_ns: int, imu: ImuSamples) -> SomeSamples:
+    """Return samples with shifted stamps; arrivals too, unless stamps then lag like the IMU's."""
+    lag, imu_lag = (float(np.median(rows.received_ns - rows.stamp_ns))
+                    if len(rows.stamp_ns) else 0.0 for rows in (samples, imu))
+    only_stamps = abs(lag - shift_ns - imu_lag) < abs(lag - imu_lag)
+    return replace(samples, received_ns=samples.received_ns + (0 if only_stamps else shift_ns),
+                   stamp_ns=samples.stamp_ns + shift_ns * (samples.stamp_ns > 0))

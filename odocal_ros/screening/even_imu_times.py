@@ -36,10 +36,10 @@ def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
         return t
     even_times = _EvenTimes(t, interval, per_block)
     tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + OFFSETS
-    stamps, even = t[tested], even_times.at(t, tested)
+    stamps, even = t[tested], even_times.times_of(t, tested)
     has_jitter = np.median(np.abs(stamps - even)) > JITTER_SHARE * interval
     values = (column[tested] for column in (*w.T, *f.T))
-    return even_times.all(t) if has_jitter and _is_smoother(stamps, even, values) else t
+    return even_times.all_times(t) if has_jitter and _is_smoother(stamps, even, values) else t
 
 
 def _interval(t: Floats) -> float:
@@ -71,8 +71,8 @@ class _EvenTimes:
     def _mean_lateness(self, t: Floats) -> Floats:
         """Return the trimmed mean of stamp minus row number times interval, of each block, s."""
         n, blocks, means = self.per_block, len(t) // self.per_block, []
-        for some in np.array_split(np.arange(blocks), 1 + len(t) // CHUNK_ROWS):
-            rows = np.arange(some[0] * n, (some[-1] + 1) * n)
+        for chunk in np.array_split(np.arange(blocks), 1 + len(t) // CHUNK_ROWS):
+            rows = np.arange(chunk[0] * n, (chunk[-1] + 1) * n)
             lateness = np.sort((t[rows] - self.interval * rows).reshape(-1, n), axis=1)
             means.append(lateness[:, n // 10:n - n // 10].mean(axis=1))
         return np.concatenate(means)
@@ -90,7 +90,7 @@ class _EvenTimes:
                           last * self.per_block - 1])
         return np.stack([knots, start + slope * knots + np.pad(means, 1, mode='edge')])
 
-    def at(self, t: Floats, rows: Ints) -> Floats:
+    def times_of(self, t: Floats, rows: Ints) -> Floats:
         """Return the times of rows, s, in the shape of ``rows``; their stamps t near a loss."""
         if not len(self.knots):
             return t[rows]
@@ -98,13 +98,14 @@ class _EvenTimes:
         lost = self.lost[np.minimum(rows // self.per_block, len(self.lost) - 1)]
         return np.where(lost, t[rows], even)
 
-    def all(self, t: Floats) -> Floats:
+    def all_times(self, t: Floats) -> Floats:
         """Return the times of all rows with stamps t, strictly rising: (n,) s."""
         even_times, last = work_array(len(t)), -np.inf
-        for piece in chunks(len(t)):
-            rows = np.arange(piece.start, piece.stop)
-            times = np.maximum.accumulate(np.maximum(self.at(t, rows) - MIN_STEP * rows, last))
-            even_times[piece], last = times + MIN_STEP * rows, times[-1]
+        for chunk in chunks(len(t)):
+            rows = np.arange(chunk.start, chunk.stop)
+            times = self.times_of(t, rows) - MIN_STEP * rows
+            times = np.maximum.accumulate(np.maximum(times, last))
+            even_times[chunk], last = times + MIN_STEP * rows, times[-1]
         return even_times
 
 

@@ -51,17 +51,17 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
     """
     Return usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, and reasons.
 
-    received : number of fixes.   origin : text on which ones these are.
+    received : number of received fixes.   origin : text that follows this number.
     """
     no_fix = fix.status < gnss.min_status
     max_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
     invalid = ~has_position(fix) | (abs(fix.height) > max_height)
-    invalid = invalid | _far_from_most(fix, ~(invalid | no_fix))
+    invalid = invalid | _far_from_median(fix, ~(invalid | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
     limit = sigma_limit(sigma[~unknown & ~no_fix & ~invalid], gnss.max_sigma)
-    poor = (sigma > limit) & ~unknown
-    use = ~(no_fix | invalid | poor)
+    inaccurate = (sigma > limit) & ~unknown
+    use = ~(no_fix | invalid | inaccurate)
     reasons: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
         local = bool((fix.status == LOCAL_STATUS).any())
@@ -70,20 +70,20 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
             Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {received} fixes have '
             f'no usable covariance; {gnss.default_sigma:g} m ({name}) is used',
             f'Set {name} to the real horizontal accuracy of the positions.' if local else ''),)
-    rejected = [(f'{int(mask.sum())} {why}', remedy) for mask, why, remedy in (
+    rejected = [(f'{int(mask.sum())} {cause}', remedy) for mask, cause, remedy in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
          'gnss.min_status if these fixes are good.'),
         (invalid & ~no_fix, _invalid_text(fix, invalid & ~no_fix), 'Check the driver: latitude '
          'and longitude in degrees (swapped?), altitude in m, no 0, 0 in place of a missing '
          'position.'),
-        (poor & ~no_fix & ~invalid, f'with sigma above {limit:.3g} m', 'If these '
+        (inaccurate & ~no_fix & ~invalid, f'with sigma above {limit:.3g} m', 'If these '
          'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
          'its own uncertainty.')) if mask.any()]
     if rejected:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
-        whys, remedies = zip(*rejected, strict=True)
+        causes, remedies = zip(*rejected, strict=True)
         reasons += (Reason(code, f'{int((~use).sum())} of {received} fixes{origin} are not used: '
-                           f'{", ".join(whys)}', ' '.join(remedies)),)
+                           f'{", ".join(causes)}', ' '.join(remedies)),)
     return use, covariance, reasons
 
 
@@ -112,13 +112,13 @@ def has_position(fix: FixSamples) -> Bools:
     return on_earth
 
 
-def _far_from_most(fix: FixSamples, good: Bools) -> Bools:
-    """Return a mask of good fixes far from most others: (n,) bool."""
+def _far_from_median(fix: FixSamples, good: Bools) -> Bools:
+    """Return a mask of good fixes far from the median of these: (n,) bool."""
     is_far = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
-        away_from_most = 1e6    # m from the median fix: not a real position
-        is_far[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
+        max_distance = 1e6    # m: a fix farther away is not a real position
+        is_far[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > max_distance
     return is_far
 
 
@@ -230,8 +230,8 @@ def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,
     """Return for each span its first fix and the first after it, s, and the jump there, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
-    every = min(max(1, round(COMPARISON_INTERVAL / float(np.median(np.diff(t))))), len(t) - 1)
-    t, positions, sigma, track = t[::every], positions[::every], sigma[::every], track[::every]
+    step = min(max(1, round(COMPARISON_INTERVAL / float(np.median(np.diff(t))))), len(t) - 1)
+    t, positions, sigma, track = t[::step], positions[::step], sigma[::step], track[::step]
     rows, deviation, in_motion = _deviations(t, np.diff(positions), np.diff(track))
     if not len(rows):
         return []
@@ -278,14 +278,18 @@ def _deviations(t: Floats, fix_steps: Complexes,
     return rows, deviation, in_motion
 
 
-def _without_delay(deviation: Complexes, by_second: Complexes) -> Floats:
-    """Return sizes of deviations, (n,) m, without by_second, m/s, times a common delay."""
-    size = np.maximum(np.abs(by_second), 1e-9)
-    delays = (deviation * by_second.conj()).real / size**2
+def _without_delay(deviation: Complexes, delay_rate: Complexes) -> Floats:
+    """
+    Return sizes of deviations, (n,) m, after removal of the part by a common delay.
+
+    delay_rate : (n,) change of the deviation for each second of delay, m/s.
+    """
+    size = np.maximum(np.abs(delay_rate), 1e-9)
+    delays = (deviation * delay_rate.conj()).real / size**2
     order = np.argsort(delays)
     weight = np.cumsum(size[order])
     delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
-    remaining: Floats = np.abs(deviation - delay * by_second * (abs(delay) > JUMP_DELAY))
+    remaining: Floats = np.abs(deviation - delay * delay_rate * (abs(delay) > JUMP_DELAY))
     return remaining
 
 

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Detection of values that are no measurements: impossible, isolated, frozen, or saturated."""
+"""
+Detection of values that are no measurements: impossible, isolated, frozen, or saturated.
+
+A glitch is a spike (a jump away and back, in motion too) or an isolated outlier (without motion).
+"""
 
 from dataclasses import replace
 from functools import reduce
@@ -36,12 +40,15 @@ GROUP_GAP = 50          # rows: about a page or a packed block of a recording
 # near them may be false too
 DAMAGED_SHARE, SEVERAL_ROWS = 0.01, 4
 NEIGHBOUR_ROWS = 5          # rows without motion on each side of an isolated outlier
-# judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and in
-# median steps; its longest duration, s; largest share of the step that remains after it
-TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, RETURN_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
-# judgement: of an isolated outlier: least deviation, rad/s (0.003 rad in 0.1 s) and m/s^2, and in
-# deviations of adjacent rows; largest difference of the rows before and after, in deviations
-SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
+# judgement, of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and least
+# ratio of it to the median step; longest duration, s; largest share of the step that remains
+TURN_STEP, FORCE_STEP, USUAL_STEPS = 0.8, 50.0, 20.0
+GLITCH_TIME, RETURN_SHARE = 0.4, 0.5
+# judgement, of an isolated outlier: least deviation from the mean of its two neighbours, rad/s
+# (0.003 rad in 0.1 s) and m/s^2, and least ratio of it to those of adjacent rows; largest
+# difference of its neighbours, over the deviation
+SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES = 0.03, 2.0, 10.0
+EQUAL_NEIGHBOURS = 0.3
 GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
 ROLLING_SHARE = 0.1               # of the top speed: least mean speed of a moving vehicle
 # physical: smaller than the range of any sensor, larger than gravity at rest
@@ -57,27 +64,27 @@ def is_impossible(name: str, column: NDArray[Any]) -> Bools:
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
     largest_value = 1e300    # of unbounded columns: sums and products with it stay finite
-    largest = BEYOND_SENSOR.get(name, largest_value)
+    max_value = BEYOND_SENSOR.get(name, largest_value)
 
-    def not_usable(x: NDArray[Any]) -> Bools:
+    def is_outside(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
         # smaller values, except 0, are damaged: judgement. Two rotations by right angles leave
         # 1e-68 of a value in axes of exact zeros
         min_value = 1e-80
-        usable = (size <= largest) & ((size >= min_value) | (size == 0))
-        return ~(usable if x.ndim == 1 else reduce_columns(np.logical_and, usable))
+        possible = (size <= max_value) & ((size >= min_value) | (size == 0))
+        return ~(possible if x.ndim == 1 else reduce_columns(np.logical_and, possible))
     with np.errstate(invalid='ignore'):
-        return map_rows(not_usable, column)
+        return map_rows(is_outside, column)
 
 
 def without_invalid_orientations(samples: Oriented) -> Oriented:
     """Return IMU or heading rows; an invalid orientation becomes 0, its yaw variance NaN."""
     def is_invalid(impossible: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(impossible[:, None], 0.0, q_ni))
-        unit_length = 2.0    # largest ratio of a quaternion's length to one, and of one to it
-        widest_variance = 1e12    # rad^2, drivers use smaller values for unknown
-        return ((length < 1 / unit_length) | (length > unit_length)
-                | (np.abs(variance) > widest_variance))
+        max_length = 2.0    # of a quaternion, and of the inverse
+        max_variance = 1e12    # rad^2, drivers use smaller values for unknown
+        return ((length < 1 / max_length) | (length > max_length)
+                | (np.abs(variance) > max_variance))
 
     impossible = is_impossible('q_ni', samples.q_ni)
     invalid = map_rows(is_invalid, impossible, samples.q_ni, samples.yaw_variance)
@@ -118,14 +125,14 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
     end = -1
     max_jumps = 2000    # jumps that are tested
-    for i in jumps[:max_jumps]:
-        if i < end:
+    for row in jumps[:max_jumps]:
+        if row < end:
             continue
-        stop = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
-        returned = np.abs(x[i + 2:stop] - x[i]).max(axis=1) <= RETURN_SHARE * steps[i]
-        if returned.any():
-            end = i + 2 + int(np.argmax(returned))
-            is_spike[i + 1:end] = True
+        stop = np.searchsorted(t, t[row] + GLITCH_TIME, side='right')
+        has_returned = np.abs(x[row + 2:stop] - x[row]).max(axis=1) <= RETURN_SHARE * steps[row]
+        if has_returned.any():
+            end = row + 2 + int(np.argmax(has_returned))
+            is_spike[row + 1:end] = True
     return is_spike if is_spike.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
@@ -136,21 +143,21 @@ def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
     x : (n, k).   min_deviation : of an outlier.   Returns (n,) bool, all False if there are so
     many that it is normal for the sensor.
     """
-    edge = NEIGHBOUR_ROWS + 1
+    edge = NEIGHBOUR_ROWS + 1      # rows at each end that are not tested
 
     def is_outlier(x: Floats) -> Bools:
-        m = len(x) - 2 * edge
+        m = len(x) - 2 * edge      # tested rows
         deviations = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
         if not (deviations > min_deviation).any():
             return np.zeros(m, bool)
-        # rows next to an outlier deviate too: the largest deviation of the others
+        # the largest deviation of nearby rows; the adjacent ones deviate because of the outlier
         nearby = reduce(np.maximum, (deviations[NEIGHBOUR_ROWS + k:][:m]
                                      for d in range(2, edge) for k in (-d, d)))
         deviation = deviations[NEIGHBOUR_ROWS:][:m]
         difference = np.abs(x[edge + 1:][:m] - x[NEIGHBOUR_ROWS:][:m])
-        of_column: Bools = ((deviation > np.maximum(min_deviation, SINGLE_TIMES * nearby))
-                            & (difference < EQUAL_NEIGHBOURS * deviation))
-        return reduce_columns(np.logical_or, of_column)
+        is_isolated: Bools = ((deviation > np.maximum(min_deviation, SINGLE_TIMES * nearby))
+                              & (difference < EQUAL_NEIGHBOURS * deviation))
+        return reduce_columns(np.logical_or, is_isolated)
 
     outliers = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
@@ -172,8 +179,8 @@ def speed_glitches(t: Floats, speed: Floats) -> Bools:
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
-    speed_step = 0.3    # of the top speed, least jump from row to row of a glitch
-    return find_spikes(t, speed[:, None], max(speed_step * top, 1e-12))
+    min_share = 0.3    # of the top speed, least step from row to row
+    return find_spikes(t, speed[:, None], max(min_share * top, 1e-12))
 
 
 def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
@@ -212,20 +219,21 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
             ('gyro', w_i, imu.gyro_scale, 'rad/s', MIN_GYRO_RANGE),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', MIN_ACCELEROMETER_RANGE)):
         for axis, x in zip('xyz', columns(x_i), strict=True):
-            for extreme, inside, none in ((np.max, np.less, -np.inf),
-                                          (np.min, np.greater, np.inf)):
+            # the largest value, then the smallest; ``is_inside`` selects all other values
+            for extreme, is_inside, no_value in ((np.max, np.less, -np.inf),
+                                                 (np.min, np.greater, np.inf)):
                 limit = extreme(x, initial=0.0)
                 at_limit = x == limit
                 count, size = int(np.count_nonzero(at_limit)), abs(limit * scale)
                 if size < min_limit or count < MIN_AT_LIMIT:
                     continue
-                following = extreme(x, where=inside(x, limit), initial=none)
-                if count > TIMES_NEXT * np.count_nonzero(x == following):
+                next_value = extreme(x, where=is_inside(x, limit), initial=no_value)
+                if count > TIMES_NEXT * np.count_nonzero(x == next_value):
                     saturated.append((count, float(t_imu[at_limit.argmax()]),
                                       f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
     if not saturated:
         return ()
-    count, t, words = max(saturated)
+    count, t, text = max(saturated)
     others = f'; other axis limits reached: {len(saturated) - 1}' if len(saturated) > 1 else ''
-    return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
+    return (Reason(Code.IMU_SATURATED, f'{text} in {count} of {len(t_imu)} messages, first at '
                    f't = {t:.1f} s{others}'),)

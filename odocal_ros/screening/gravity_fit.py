@@ -106,11 +106,11 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
     bias_tilt = _means_of_seconds(_integral(rotation))
     force = _means_of_seconds((f[:, 0] + 1j * f[:, 1]) * rotation)
     direction = np.exp(1j * psi[::ROWS_A_SECOND])
-    onward = np.diff(speed) * (direction[1:] + direction[:-1]) / 2
-    inward = np.diff(direction) * (speed[1:] + speed[:-1]) / 2
+    forward = np.diff(speed) * (direction[1:] + direction[:-1]) / 2
+    centripetal = np.diff(direction) * (speed[1:] + speed[:-1]) / 2
     turn_rate, heading = _means_of_seconds(w[:, 2]), _means_of_seconds(rotation)
     # the derivatives model delays, the last two a lever arm of the IMU
-    accelerations = [onward, inward, np.gradient(onward), np.gradient(inward),
+    accelerations = [forward, centripetal, np.gradient(forward), np.gradient(centripetal),
                      np.gradient(turn_rate) * heading, turn_rate**2 * heading]
     regressors = cut(np.stack([*tilts, *accelerations], -1))
     offsets = cut(np.stack([np.ones_like(bias_tilt), bias_tilt], -1))

@@ -83,12 +83,13 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
         # a bend, or another unit, also changes the magnitude
         ratio = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
         turn_deg = _angle_between(before, after)
+        scatter = [_angle_between(tenth, mean) for side, mean in zip(
+            sides, (before, after), strict=True) for tenth in side]
         if (turn_deg > MIN_IMU_TURN and 1 / GRAVITY_RATIO < ratio < GRAVITY_RATIO
-                and all(_angle_between(one, mean) < GRAVITY_SCATTER for side, mean in zip(
-                    sides, (before, after), strict=True) for one in side)):
+                and max(scatter) < GRAVITY_SCATTER):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
             return (_imu_moved_reason(f'gravity turns by {turn_deg:.0f} deg', float(begin),
-                                  float(end)),)
+                                      float(end)),)
     return ()
 
 
@@ -98,23 +99,23 @@ def forward_turn_reasons(binned: Accelerations | None) -> tuple[Reason, ...]:
         return ()
     edges = np.linspace(0, len(binned.t), 11).astype(int)
     turns = []      # sigma and angle, deg, begin and end, s
-    for a, b in zip(edges[1:-2], edges[2:-1], strict=True):
-        sides = orientation_of(binned[:a]), orientation_of(binned[b:])
-        if sides[0] is None or sides[1] is None:
+    for begin, end in zip(edges[1:-2], edges[2:-1], strict=True):
+        before, after = orientation_of(binned[:begin]), orientation_of(binned[end:])
+        if before is None or after is None:
             continue
-        turn_deg = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
-        sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
+        turn_deg = float(np.rad2deg(wrap(after.yaw - before.yaw)))
+        sigma = float(np.rad2deg(np.hypot(before.sigma, after.sigma)))
         if MIN_IMU_TURN + YAW_SIGMAS * sigma < abs(turn_deg) < LARGEST_YAW_TURN:
-            turns.append((sigma, -turn_deg, float(binned.t[a]), float(binned.t[b])))
+            turns.append((sigma, -turn_deg, float(binned.t[begin]), float(binned.t[end])))
     if not turns:
         return ()
-    sigma, turn_deg, begin, end = min(turns)      # the most certain one
+    sigma, turn_deg, begin_s, end_s = min(turns)      # the most certain one
     return (_imu_moved_reason(f'the forward direction turns by {turn_deg:+z.0f} '
-                          f'± {max(sigma, 1.0):.0f} deg', begin, end),)
+                              f'± {max(sigma, 1.0):.0f} deg', begin_s, end_s),)
 
 
-def _imu_moved_reason(what: str, begin: float, end: float) -> Reason:
-    return Reason(Code.IMU_AXES, f'{what} in the IMU frame at about t = {begin:.0f} to '
+def _imu_moved_reason(observation: str, begin: float, end: float) -> Reason:
+    return Reason(Code.IMU_AXES, f'{observation} in the IMU frame at about t = {begin:.0f} to '
                   f'{end:.0f} s: the IMU was moved in the vehicle', REMEDY)
 
 

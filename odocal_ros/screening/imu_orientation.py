@@ -36,24 +36,24 @@ NO_GRAVITY = 0.01               # m/s^2, physical: far below gravity, in any uni
 
 @dataclass(frozen=True, eq=False)
 class Accelerations:
-    """Accelerations of the IMU in the level plane in bins of BIN_S, complex: e1 + i e2."""
+    """Specific force in the level plane and accelerations of the wheels, means over BIN_S."""
 
-    e1: Floats          # (3,) level axes, in the frame of the IMU's data
+    e1: Floats           # (3,) level axes, in the frame of the IMU's data
     e2: Floats
-    t: Floats           # (m,) s, middle of the bin
-    force: Complexes    # (m,) m/s^2
-    onward: Floats      # (m,) m/s^2, by odometer: forward
-    inward: Floats      # (m,) m/s^2, by odometer and gyro: centripetal, positive to the left
+    t: Floats            # (m,) s, middle of the bin
+    force: Complexes     # (m,) m/s^2, by the IMU: along e1 + i times along e2
+    forward: Floats      # (m,) m/s^2, acceleration by the odometer
+    centripetal: Floats  # (m,) m/s^2, acceleration by odometer and gyro, positive to the left
 
     def __getitem__(self, rows: slice) -> 'Accelerations':
-        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
-                             self.inward[rows])
+        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows],
+                             self.forward[rows], self.centripetal[rows])
 
     def changes(self) -> 'Accelerations':
         """Return the changes from bin to adjacent bin: slopes, which change slowly, cancel."""
         adjacent = np.diff(self.t) < 1.5 * BIN_S
         return Accelerations(self.e1, self.e2, self.t[1:][adjacent], np.diff(self.force)[adjacent],
-                             np.diff(self.onward)[adjacent], np.diff(self.inward)[adjacent])
+                             np.diff(self.forward)[adjacent], np.diff(self.centripetal)[adjacent])
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class ImuOrientation:
 
     yaw: float
     sigma: float
-    # ratio of the force to the centripetal acceleration by gyro and odometer, relative to this
-    # ratio of the forward acceleration: 1; -1 if gyro or accelerometer has a mirrored axis
-    inward: float = np.nan
-    inward_sigma: float = np.nan
+    # ratio of force to centripetal acceleration, over that of force to forward acceleration, and
+    # its sigma: 1 is correct, -1 if gyro or accelerometer has a mirrored axis
+    centripetal: float = np.nan
+    centripetal_sigma: float = np.nan
 
 
 def bin_accelerations(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
@@ -85,19 +85,19 @@ def bin_accelerations(t: Floats, w: Floats, f: Floats, up: Floats, travel: Trave
     turn_rate = w @ up
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN_S
     middle = (edges[:-1] + edges[1:]) / 2
-    onward = (travel.at(middle + BIN_S) - 2 * travel.at(middle) + travel.at(middle - BIN_S)) \
+    forward = (travel.at(middle + BIN_S) - 2 * travel.at(middle) + travel.at(middle - BIN_S)) \
         * metres_per_unit / BIN_S**2
     e1 = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(up, e1)
-    use = np.flatnonzero(count)
-    return Accelerations(e1, e2, middle[use], (f @ e1 + 1j * (f @ e2))[use], onward[use],
-                         (speed * turn_rate)[use])
+    full = np.flatnonzero(count)      # bins with rows
+    return Accelerations(e1, e2, middle[full], (f @ e1 + 1j * (f @ e2))[full], forward[full],
+                         (speed * turn_rate)[full])
 
 
 def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
     """Return the changes of the accelerations of a leg, None if it is too short."""
-    mean = inputs.usual_f_b
+    mean = inputs.median_f_b
     size = float(np.linalg.norm(mean))
     binned = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
                                metres_per_unit) if size else None
@@ -114,11 +114,11 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
     """
     Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
 
-    force = (gain[0] onward + gain[1] i inward), complex; the argument of gain[0] is the forward
-    direction. With its own gain, the sign of the gyro has no effect.
+    force = gain[0] forward + gain[1] i centripetal, complex; the argument of gain[0] is the
+    forward direction. As centripetal has its own gain, the sign of the gyro has no effect.
     """
     force = binned.force
-    design = np.stack([binned.onward, 1j * binned.inward], -1)
+    design = np.stack([binned.forward, 1j * binned.centripetal], -1)
     normal = design.conj().T @ design
     if len(design) < ORIENTATION_BINS or np.linalg.cond(normal) > 1e9:
         return None
@@ -127,20 +127,24 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
     residual = force - design @ gain
     # half of the residual is across, and every other change is independent (they share bins)
     variances = np.vdot(residual, residual).real / len(design) * np.diag(inverse).real
-    sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
-    largest_sigma = np.deg2rad(10.0)    # of the direction
-    min_gain, largest_gain = 0.5, 2.0    # of a valid fit: the right one is 1
-    if sigma > largest_sigma or not min_gain < abs(gain[0]) < largest_gain:
+    sigma, centripetal_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
+    max_sigma = np.deg2rad(10.0)    # of the direction
+    min_gain, max_gain = 0.5, 2.0    # of a valid fit: the right one is 1
+    if sigma > max_sigma or not min_gain < abs(gain[0]) < max_gain:
         return None
     forward = gain[0].real * binned.e1 + gain[0].imag * binned.e2
     return ImuOrientation(float(-np.arctan2(forward[1], forward[0])), float(sigma),
-                          float((gain[1] / gain[0]).real), float(inward_sigma))
+                          float((gain[1] / gain[0]).real), float(centripetal_sigma))
 
 
 def corrected_forward_axis(orientation: ImuOrientation | None, f: Floats) -> Floats:
-    """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
+    """
+    Return f, (3,), scale times forward axis, with the yaw of the IMU orientation if far from it.
+
+    A difference below 10 deg, or 3 sigma, has no effect on the detection of slips.
+    """
     yaw, pitch = mounting_from_forward(f)
-    min_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
+    min_difference = np.deg2rad(10.0)
     if orientation is None or abs(float(wrap(orientation.yaw - yaw))) < max(
             min_difference, 3 * orientation.sigma):
         return f
@@ -185,8 +189,8 @@ def unit_and_axis_reasons(median_f_b: Floats, w_b: Floats, C_bi: Floats,
         return tuple(reasons), False
     up = median_f_b / size
     upright = int(np.argmax(np.abs(up @ C_bi)))
-    if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()
-                               for some in chunks(len(w_b))):
+    if not reasons and not any((np.abs(w_b[rows] @ C_bi[:, upright]) > ROUNDING).any()
+                               for rows in chunks(len(w_b))):
         reasons.append(Reason(Code.NO_IMU, f'angular_velocity.{AXES[upright]} is always zero: the '
                               'IMU publishes no turn rate about its upright axis', 'Publish all '
                               'three turn rates, or use an IMU that measures them.'))
@@ -208,7 +212,7 @@ def _unit_reasons(median_f_b: Floats, w_b: Floats, imu: ImuConfig) -> list[Reaso
     top_rate = float(np.percentile(map_rows(lambda w: lengths(w - bias), w_b), 99.9,
                                    overwrite_input=True))
     reasons = []
-    if not any(w_b[some].any() for some in chunks(len(w_b))):
+    if not any(w_b[rows].any() for rows in chunks(len(w_b))):
         reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
                               'imu.gyro_scale is 0', 'Check the gyro in the IMU driver, or name '
                               'another topic with --imu-topic.'))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Inputs of the methods: screened rows of a leg, fixes in metres, metres per count."""
+"""Inputs of the methods: screened rows of a leg, fixes in metres, approximate scale."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -54,24 +54,24 @@ class Inputs:
     fixes_rejected: int
     scale_unit: str
     has_accelerometer: bool = True     # False: f_b is assumed gravity
-    local: bool = False                # True: fixes are positions in a local frame
-    # clocks that were seconds from the IMU's, by group of settings: s, > 0 late; corrected
-    aligned: Mapping[str, float] = field(default_factory=dict)
+    is_local: bool = False             # True: fixes are positions in a local frame
+    # corrected delays of clocks seconds from the IMU's, by group of settings: s, > 0 late
+    clock_delays: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
-    def usual_f_b(self) -> Floats:
+    def median_f_b(self) -> Floats:
         """Return the median of the specific force, which points up: (3,) m/s^2."""
         return medians(self.f_b)
 
     @property
     def up_b(self) -> Floats:
         """Return the direction of the median specific force: (3,) unit vector, 0 without force."""
-        return self.usual_f_b / max(float(np.linalg.norm(self.usual_f_b)), 1e-9)
+        return self.median_f_b / max(float(np.linalg.norm(self.median_f_b)), 1e-9)
 
     @property
     def min_motion(self) -> float:
         """Return the minimum distance between positions that is certainly motion, m."""
-        return LOCAL_MOVES if self.local else GNSS_MOVES
+        return LOCAL_MOVES if self.is_local else GNSS_MOVES
 
     def standstills(self, metres_per_unit: float, config: Config) -> Floats:
         """Return the standstills of ``leg.standstill`` or longer, begin and end: (k, 2) s."""
@@ -83,7 +83,7 @@ class Inputs:
         if not len(spans):
             return self
         return replace(self, travel=self.travel.mirrored(spans),
-                       travels=tuple(one.mirrored(spans) for one in self.travels))
+                       travels=tuple(travel.mirrored(spans) for travel in self.travels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +93,8 @@ class LocatedFixes:
     origin: Origin                     # of n
     fixes_n: NDArray[np.float64]       # (k, 3) m, NaN up if a fix has no height
     fix_sigma: float                   # m, median 1 sigma of a horizontal axis, NaN: no fixes
-    nominal: float                     # K0, metres per unit of travel, 0: unknown
-    rough: float                       # scale by the fixes, K0 if they move too little
+    nominal_scale: float               # K0, metres per unit of travel, 0: unknown
+    rough_scale: float                 # by the fixes, to some per cent; K0 if they hardly move
 
 
 def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
@@ -103,14 +103,14 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     if not len(inputs.t_fix):
         return LocatedFixes(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
     origin = median_origin(inputs.t_fix, inputs.geodetic)
-    if inputs.local:
+    if inputs.is_local:
         latitude = np.deg2rad(config.reference.latitude_deg)
         origin = replace(origin, local_earth_rate=rate_without_north(float(latitude)))
     geodetic = inputs.geodetic.copy()
-    lost = np.isnan(geodetic[:, 2])
-    geodetic[lost, 2] = origin.height
+    no_height = np.isnan(geodetic[:, 2])
+    geodetic[no_height, 2] = origin.height
     fixes_n = origin.to_n(geodetic)
-    fixes_n[lost, 2] = np.nan
+    fixes_n[no_height, 2] = np.nan
     sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
     rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
                         inputs.min_motion) or nominal
@@ -124,9 +124,9 @@ def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
     t_fix : (k,) s since the start mark.   geodetic : (k, 3) latitude, longitude, rad, height, m.
     """
     fixes_at_start = 11    # judgement: nearest to the start mark
-    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:fixes_at_start])
-    r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
-    central = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
+    rows = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:fixes_at_start])
+    r_e = ecef_from_geodetic(geodetic[rows, 0], geodetic[rows, 1], 0.0)
+    central = rows[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
     latitude, longitude, height = geodetic[central].tolist()
     heights = geodetic[~np.isnan(geodetic[:, 2]), 2] if np.isnan(height) else [height]
     return Origin(latitude, longitude, float(np.median(heights)) if len(heights) else 0.0)

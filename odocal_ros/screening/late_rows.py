@@ -5,10 +5,10 @@
 Sampling times of odometer rows that arrive late: in bursts, or all with random delays.
 
 A counter without a header is stamped at arrival: a delayed message (serial line, busy machine)
-looks like a wheel that slides and then spins. The sender's rhythm, which are even times, is
-estimated from the rows with the smallest delays, or from medians. The median delay remains; delays
-beyond it are removed if travel is smoother on the rhythm. Rows of a burst that do not fit the
-rhythm, because rows were lost, get times by their travel.
+looks like a wheel that slides and then spins. The sender's rhythm, its evenly spaced sampling
+times, is estimated from the rows with the smallest delays, or from medians. The median delay
+remains; delays beyond it are removed if travel is smoother on the rhythm. Rows of a burst that do
+not fit the rhythm, because rows were lost, get times by their travel.
 """
 
 import numpy as np
@@ -69,20 +69,20 @@ def arrival_jitter(t: Floats) -> float | None:
 
 
 def intervals(t: Floats) -> list[float]:
-    """Return candidates of the sender's interval, s: by all sent rows, and by received ones."""
+    """Return the possible intervals of the sender, s: with lost rows counted, and without."""
     window = 5.0    # s over which means are taken
     n = max(1, int(window * (len(t) - 1) / max(t[-1] - t[0], window)))
     step = np.diff(t)
     usual = median(step)
     # if most rows have the same stamp, the median over windows is zero
     mean = median(t[n:] - t[:-n]) / n or float(t[-1] - t[0]) / len(step)
-    steady_share = 0.005    # larger difference: rows are lost, or all have random delays
-    if abs(mean - usual) < steady_share * mean:
+    max_difference = 0.005    # of the mean; if larger, rows are lost or have random delays
+    if abs(mean - usual) < max_difference * mean:
         return [mean]
-    even_share = 0.3    # share of the intervals that are within a quarter of the usual one
-    even = np.mean(np.abs(step - usual) < usual / 4) > even_share
+    min_share = 0.3    # of the intervals, within a quarter of the usual one
+    is_even = np.mean(np.abs(step - usual) < usual / 4) > min_share
     # if more than half of the rows are lost, the median is not the interval
-    if not even or usual < mean / 2:
+    if not is_even or usual < mean / 2:
         return [mean]
     sent = running_sum(np.round(step / usual))    # number of rows, with the lost ones
     return [median((t[n:] - t[:-n]) / np.maximum(sent[n:] - sent[:-n], 1.0)), mean]
@@ -140,8 +140,9 @@ def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     lowest = min(ratio for ratio, _, _ in candidates)
     smoother_ratio, equal_ratio = 0.9, 1.1    # judgement: limits of the ratio, over that of others
     is_smoother = lowest < smoother_ratio
-    _, interval, even = next(
-        x for x in candidates if x[0] <= equal_ratio * lowest) if is_smoother else candidates[-1]
+    _, interval, even = next(candidate for candidate in candidates
+                             if candidate[0] <= equal_ratio * lowest) \
+        if is_smoother else candidates[-1]
     return interval, even, is_smoother
 
 
@@ -182,13 +183,13 @@ def _rhythm_of_median(t: Floats, interval: float) -> list[Floats]:
         return []
     line = np.polyval(np.polyfit(middle_rows, medians, min(1, len(medians) - 1)), row)
     # exponential lateness has a sigma of 1.4 jitters, its median of n rows 1.4 / sqrt(n)
-    per = max(MEDIAN_WINDOW / interval, (1.4 * jitter / MEDIAN_SIGMA)**2)
-    return [interval * row + line + np.interp(row, *_medians(lateness - line, per))]
+    block_rows = max(MEDIAN_WINDOW / interval, (1.4 * jitter / MEDIAN_SIGMA)**2)
+    return [interval * row + line + np.interp(row, *_medians(lateness - line, block_rows))]
 
 
-def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
-    """Return the middle rows of blocks of ``per`` rows, and their medians."""
-    blocks = np.array_split(x, max(1, int(len(x) / per)))
+def _medians(x: Floats, block_rows: float) -> tuple[Floats, Floats]:
+    """Return the middle rows of blocks of about ``block_rows`` rows, and their medians."""
+    blocks = np.array_split(x, max(1, int(len(x) / block_rows)))
     size = np.array([len(block) for block in blocks])
     return np.cumsum(size) - size / 2, np.array([np.median(block) for block in blocks])
 
@@ -219,22 +220,28 @@ def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
     return np.where((rows + NODES[0] >= 0) & (rows + NODES[-1] <= last), -predicted, 0.0)
 
 
-def _times_by_travel(t: Floats, travel: Floats, a: int, b: int, interval: float) -> Floats:
-    """Return the times of the rows between a and b by travel; their stamps if no burst."""
-    rows = np.arange(a + 1, b)
+def _times_by_travel(t: Floats, travel: Floats, before: int, after: int,
+                     interval: float) -> Floats:
+    """
+    Return the times of the rows between two rows by their travel, if they are a burst.
+
+    The speed is assumed constant. A burst is short, and its apparent speed is far higher than the
+    adjacent ones; the rows of other intervals keep their stamps.
+    """
+    rows = np.arange(before + 1, after)
 
     def speed(first: int, last: int) -> float:
         first, last = max(first, 0), min(last, len(t) - 1)
         size: float = abs(travel[last] - travel[first]) / max(t[last] - t[first], interval / 10)
         return size
 
-    adjacent = max(speed(a - NODE_STEP, a), speed(b, b + NODE_STEP))
-    constant_speed = 1.0    # s within which speed is almost constant
-    burst_ratio = 3.0       # of apparent over adjacent speed: larger than of a wheel
-    if t[b] - t[a] > constant_speed or not adjacent or speed(a + 1, b) < burst_ratio * adjacent:
+    adjacent = max(speed(before - NODE_STEP, before), speed(after, after + NODE_STEP))
+    max_duration = 1.0    # s within which speed is almost constant
+    min_ratio = 3.0       # of apparent over adjacent speed: larger than of a wheel
+    duration, distance = t[after] - t[before], travel[after] - travel[before]
+    is_burst = (duration <= max_duration and adjacent
+                and speed(before + 1, after) >= min_ratio * adjacent)
+    if not is_burst or distance == 0:
         return t[rows]
-    if travel[a] == travel[b]:      # forth and back: it gives no time
-        return t[rows]
-    # some rows of the burst are lost, so that its rhythm is useless
-    by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])
-    return np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))
+    by_travel = t[before] + (travel[rows] - travel[before]) * duration / distance
+    return np.maximum.accumulate(np.clip(by_travel, t[before], t[rows]))

@@ -41,33 +41,34 @@ def has_accelerometer(f_i: Floats) -> bool:
 
 
 def missing_force_cause(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
-    """Return the reason why accelerations are unusable, else '': an axis at zero has no gyro."""
+    """Return the cause of unusable accelerations of an IMU, '' if they are usable."""
     if not has_accelerometer(imu.f_i):
         return 'publishes turn rates but no acceleration'
     with np.errstate(all='ignore'):
-        some = thinned(imu.f_i, GRAVITY_ROWS)
-        some = some[np.isfinite(some).all(axis=1)]
-        if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < MIN_GRAVITY:
+        forces = thinned(imu.f_i, GRAVITY_ROWS)
+        forces = forces[np.isfinite(forces).all(axis=1)]
+        if len(forces) and np.linalg.norm(np.median(forces, axis=0)) * accel_scale < MIN_GRAVITY:
             return 'publishes accelerations without gravity'
-    dead = np.logical_and.reduce([(imu.w_i[rows] == 0).all(axis=0) for rows in chunks(
-        len(imu.w_i))] or [np.zeros(3, bool)])
-    # a missing rate about the vertical is reported elsewhere
-    if dead.any() and len(some) and not dead[int(np.argmax(np.abs(np.median(some, axis=0))))]:
-        axes = ' and '.join(name for name, axis in zip('xyz', dead, strict=True) if axis)
-        return f'publishes no turn rate about {axes}, so accelerations cannot be levelled'
+    has_no_gyro = np.logical_and.reduce([      # always zero, by axis
+        (imu.w_i[rows] == 0).all(axis=0) for rows in chunks(len(imu.w_i))] or [np.zeros(3, bool)])
+    if has_no_gyro.any() and len(forces):
+        vertical = int(np.argmax(np.abs(np.median(forces, axis=0))))
+        if not has_no_gyro[vertical]:      # else it is reported by ``unit_and_axis_reasons``
+            axes = ' and '.join('xyz'[k] for k in np.flatnonzero(has_no_gyro))
+            return f'publishes no turn rate about {axes}, so accelerations cannot be levelled'
     return ''
 
 
 def with_assumed_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
-    """Return a leg, upright on level ground if its IMU has no usable force, and the reason."""
-    why = missing_force_cause(leg.imu, config.imu.accel_scale)
-    if not why:
+    """Return the leg, with gravity as specific force if it has no usable one, and the reason."""
+    cause = missing_force_cause(leg.imu, config.imu.accel_scale)
+    if not cause:
         return leg, ()
     up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
     scale = config.imu.accel_scale
     gravity_i = np.tile(up_i * G / (scale if scale > 1e-12 else 1.0), (len(leg.imu.f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
-        Code.NO_ACCELEROMETER, f'the IMU {why}. The scale is estimated from gyro, odometer and '
+        Code.NO_ACCELEROMETER, f'the IMU {cause}. The scale is estimated from gyro, odometer and '
         'fixes; the ground is assumed to be level. Yaw and pitch mounting need an '
         'accelerometer; for the yaw an external heading is also sufficient'),)
 
@@ -96,9 +97,9 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
         left_out += ['external headings']
         leg = leg.with_rows(heading=samples.HeadingSamples.empty())
     latitude = math.radians(config.reference.latitude_deg)
-    unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
+    earth_rate = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '
-            f'{math.degrees(unknown) * 3600:.1f} deg/h of the Earth rate are estimated as gyro '
+            f'{math.degrees(earth_rate) * 3600:.1f} deg/h of the Earth rate are estimated as gyro '
             'bias')
     if left_out:
         text += f'; {" and ".join(left_out)} are not used'

@@ -29,42 +29,42 @@ BY_FIT = 'IMU and fixes move backwards'
 
 
 def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
-                    between: tuple[float, float]) -> Floats:
+                    marks: tuple[float, float]) -> Floats:
     """
     Return begin and end of reversing in which the counter counts up: (m, 2) s.
 
     travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate with
-    bias, rad/s, specific force, m/s^2.   between : (2,) the marks, s; only the usual ratio also
-    uses earlier starts. The result is empty if travel counts down in reverse, or if the IMU's x
-    axis points across the vehicle.
+    bias, rad/s, specific force, m/s^2.   marks : start and stop, s; starts before them only
+    contribute to the usual ratio. The result is empty if travel counts down in reverse, or if the
+    IMU's x axis points across the vehicle.
     """
-    none = np.empty((0, 2))
+    no_spans = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:
-        return none
+        return no_spans
     t = np.arange(max(travel.t[0], t_imu[0]) + ACCELERATION_TIME,
                   min(travel.t[-1], t_imu[-1]) - ACCELERATION_TIME, REVERSING_STEP)
     if len(t) < 2 * (STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP:
-        return none
+        return no_spans
     begins, ends = _sections_between_stops(t, travel)
     if len(begins) < 2:
-        return none
+        return no_spans
     force = _Forces(t, t_imu, w_b, f_b)
-    before, middle, after = (travel.at(t + d) for d in (
-        -ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
+    before, middle, after = (
+        travel.at(t + delay) for delay in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
     acceleration = (before - 2 * middle + after) / ACCELERATION_TIME**2
-    ratio, sigma = np.array([_ratio(t, acceleration, force, a, b)
-                             for a, b in zip(begins, ends, strict=True)]).T
+    ratio, sigma = np.array([_force_ratio(t, acceleration, force, begin, end)
+                             for begin, end in zip(begins, ends, strict=True)]).T
     path = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
     significant = np.abs(ratio) > FAULT_SIGMAS * sigma
     forward_sign = np.sign((path * np.sign(ratio))[significant].sum())
     usual = significant & (np.sign(ratio) == forward_sign)
     if not forward_sign or not usual.any():
-        return none
+        return no_spans
     usual_ratio = np.median(np.abs(ratio[usual]))
-    low, high = 0.5, 2.0    # limits of the ratio of a reversed start over the usual one
-    is_reversed = significant & ~usual & (np.abs(ratio) > low * usual_ratio) & (
-        np.abs(ratio) < high * usual_ratio)
-    is_reversed &= (t[ends] > between[0]) & (t[begins] < between[1])
+    lowest, highest = 0.5, 2.0    # ratio of a reversed start over the usual one
+    is_reversed = significant & ~usual & (np.abs(ratio) > lowest * usual_ratio) & (
+        np.abs(ratio) < highest * usual_ratio)
+    is_reversed &= (t[ends] > marks[0]) & (t[begins] < marks[1])
     # at the last step of the grid the vehicle still moves
     return np.stack([t[begins[is_reversed]] - ACCELERATION_TIME,
                      t[ends[is_reversed]] + ACCELERATION_TIME], -1)
@@ -73,23 +73,25 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
 def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
                            metres_per_unit: float) -> Floats:
     """
-    Return the sections between stops with a slip of twice their length: reversed, (m, 2) s.
+    Return the sections between stops with a slip of twice their length, (m, 2) s: reversed ones.
 
-    slips : of the smoother, dicts of t and duration, s, and metres, wheel travel minus vehicle
-    travel.   A wheel that spins on the spot slips by once its travel.
+    slips : of the smoother, each with ``t`` and ``duration``, s, and ``metres``, wheel travel
+    minus vehicle travel. A wheel that spins on the spot slips by once its travel.
     """
     t = np.arange(travel.t[0] + ACCELERATION_TIME, travel.t[-1] - ACCELERATION_TIME,
                   REVERSING_STEP)
-    begins, ends = _sections_between_stops(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
+    if len(t) <= 2:
+        return np.empty((0, 2))
+    begins, ends = _sections_between_stops(t, travel)
     spans = np.stack([t[begins] - ACCELERATION_TIME, t[ends] + ACCELERATION_TIME], -1)
     path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
-    middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
-    size = np.array([s['metres'] for s in slips])
-    slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
-    min_backwards = 1.0    # m of path
-    twice = slipped / np.maximum(2 * path, min_backwards)
-    low, high = 0.8, 1.2    # of twice the path length, as slip of a reversed section
-    return spans[(path > min_backwards) & (twice > low) & (twice < high)]
+    middle = np.array([slip['t'] + slip['duration'] / 2 for slip in slips])
+    size = np.array([slip['metres'] for slip in slips])
+    slipped = np.array([size[(middle > begin) & (middle < end)].sum() for begin, end in spans])
+    min_path = 1.0    # m
+    share = slipped / np.maximum(2 * path, min_path)      # of twice the path
+    lowest, highest = 0.8, 1.2      # of a reversed section
+    return spans[(path > min_path) & (share > lowest) & (share < highest)]
 
 
 def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, evidence: str,
@@ -97,20 +99,25 @@ def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | No
     """Return REVERSING_UNSIGNED with the reversed sections; evidence : BY_IMU or BY_FIT."""
     if not len(spans):
         return ()
-    how = 'the counter does not count down' if signed else 'odometer.signed is false'
-    path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
-    each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
-            for (a, b), m in zip(spans.tolist(), path.tolist(), strict=True)]
+    cause = 'the counter does not count down' if signed else 'odometer.signed is false'
+    path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or 0.0)
+    sections = [f'{end - begin:.0f} s from t = {begin:.1f} s'
+                + (f', {length:.1f} m' if metres_per_unit else '')
+                for (begin, end), length in zip(spans.tolist(), path.tolist(), strict=True)]
     max_listed = 3    # sections listed in the text
-    more = f' and {len(each) - max_listed} more' if len(each) > max_listed else ''
-    times = f'{len(each)} time{"s" * (len(each) > 1)}'
+    more = f' and {len(sections) - max_listed} more' if len(sections) > max_listed else ''
+    times = f'{len(sections)} time{"s" * (len(sections) > 1)}'
     return (Reason(Code.REVERSING_UNSIGNED, f'{times} {evidence} while the odometer counts up: '
-                   f'the vehicle reversed and {how}; counted as reverse: '
-                   f'{"; ".join(each[:max_listed])}{more}'),)
+                   f'the vehicle reversed and {cause}; counted as reverse: '
+                   f'{"; ".join(sections[:max_listed])}{more}'),)
 
 
 def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
-    """Return the first and the last step of each section of motion that begins with a stop."""
+    """
+    Return the first and the last step of each section of motion after a stop: (k,) rows of t each.
+
+    t : (n,) s, steps of REVERSING_STEP.
+    """
     half = ACCELERATION_TIME / 2
     speed = np.abs(travel.at(t + half) - travel.at(t - half)) / ACCELERATION_TIME
     top = np.percentile(speed, 95)
@@ -121,8 +128,8 @@ def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     stops = speed <= max(1.01 * travel.quantum / ACCELERATION_TIME, stop_share * top)
     moving = runs(~stops) - [0, 1]
     begins, ends = moving[moving[:, 0] > 0].T
-    long = (ends - begins) * REVERSING_STEP > 2 * ACCELERATION_TIME
-    return begins[long], ends[long]
+    is_long = (ends - begins) * REVERSING_STEP > 2 * ACCELERATION_TIME
+    return begins[is_long], ends[is_long]
 
 
 class _Forces:
@@ -136,25 +143,31 @@ class _Forces:
 
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
         self.angle = integral_at(t, t_imu, w_b)
-        times = [t + d for d in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
+        times = [t + delay for delay in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
         self.speed_before, self.speed = integrals_at(times[:2], t_imu, f_b)
         before, middle, after = twice_integrals_at(times, t_imu, f_b[:, 0])
         self.along = (before - 2 * middle + after) / ACCELERATION_TIME**2
 
 
-def _ratio(t: Floats, acceleration: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
-    """Return the ratio of force to odometer acceleration, from step a to b, and its sigma."""
-    low = max(0, a - round((STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP))
-    longest_start = 12.0    # s after a stop that are used: later the tilt drifts
-    high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))
-    # the integral of the force at rest points up: as the vehicle pitches, gravity enters x
-    stop_end = max(a - round(ACCELERATION_TIME / REVERSING_STEP), 0)
-    up = force.speed[stop_end] - force.speed_before[low]
+def _force_ratio(t: Floats, acceleration: Floats, force: _Forces, begin: int,
+                 end: int) -> tuple[float, float]:
+    """
+    Return the ratio of force to odometer acceleration from step begin to end, and its sigma.
+
+    A fit of the force by acceleration, constant and linear drift, from the stop before to 12 s
+    after the begin. The gravity that enters x as the vehicle pitches is removed: up at the stop,
+    by the integral of the force, is rotated by the gyro.
+    """
+    first = max(0, begin - round((STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP))
+    max_duration = 12.0    # s after a stop that are used: later the tilt drifts
+    rows = slice(first, min(len(t), end + 1, begin + round(max_duration / REVERSING_STEP)))
+    stop_end = max(begin - round(ACCELERATION_TIME / REVERSING_STEP), 0)
+    up = force.speed[stop_end] - force.speed_before[first]
     up /= max(np.linalg.norm(up), 1e-9)
-    turn = force.angle[low:high] - force.angle[low]
+    turn = force.angle[rows] - force.angle[first]
     tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
-    y, times = force.along[low:high] - G * tilt, t[low:high]
-    design = np.stack([acceleration[low:high], np.ones(len(times)), times - times.mean()], -1)
+    y, times = force.along[rows] - G * tilt, t[rows]
+    design = np.stack([acceleration[rows], np.ones(len(times)), times - times.mean()], -1)
     x, *_ = np.linalg.lstsq(design, y, rcond=None)
     cofactor = np.linalg.inv(design.T @ design + 1e-12 * np.eye(3))[0, 0]
     residual = float(np.sqrt(np.mean((y - design @ x)**2)))

@@ -61,7 +61,7 @@ def screen(leg: Leg, config: Config,
     fixes, fix_reasons = _fix_fields(leg, config, rows)
     reasons += row_reasons + fix_reasons
     inputs = _make_inputs(leg, config, rows, fixes)
-    inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
+    inputs = replace(inputs, has_accelerometer=not levelled, is_local=bool(local))
     wheels = rows.wheels      # the mean has the rows of the first one
     for slot, wheel in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
         reasons += topic_gap(slot, wheel.t)
@@ -101,7 +101,7 @@ def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason,
             'Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with one clock.'))
     if delay_reasons:
         inputs, reasons = screen(leg, config)
-        inputs = replace(inputs, aligned=late_by)
+        inputs = replace(inputs, clock_delays=late_by)
     return leg, inputs, (*delay_reasons, *reasons)
 
 
@@ -203,7 +203,7 @@ def _without_reversing(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Re
                             (0.0, inputs.t_stop))
     if not len(spans):
         return inputs, ()
-    metres_per_unit = locate_fixes(inputs, config).rough or None
+    metres_per_unit = locate_fixes(inputs, config).rough_scale or None
     return inputs.mirrored(spans), reversing_reasons(
         spans, inputs.travel, metres_per_unit, BY_IMU, config.odometer.signed)
 
@@ -211,7 +211,7 @@ def _without_reversing(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Re
 def _without_dead_reckoned(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     """Return inputs without fixes that the receiver has dead-reckoned, and the reason if any."""
     located = locate_fixes(inputs, config)
-    if not located.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
+    if not located.rough_scale or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs, ()
     rate = map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
     # the median is the bias: drives have straights, and turns to both sides
@@ -219,7 +219,7 @@ def _without_dead_reckoned(inputs: Inputs, config: Config) -> tuple[Inputs, tupl
     t = inputs.t_imu[::1 + len(inputs.t_imu) // TRACK_ROWS]
     heading = np.exp(1j * integral_at(t, inputs.t_imu, rate))
     x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-    steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough
+    steps = np.diff(inputs.travel.at(t), prepend=0.0) * located.rough_scale
     track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
     dropped, reasons = dead_reckoned_fixes(inputs.t_fix, located.fixes_n, sigma,

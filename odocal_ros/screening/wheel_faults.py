@@ -55,20 +55,20 @@ class WheelPair:
         return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
-def wheels_on_grid(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
+def wheels_on_grid(axle: Sequence[Travel], imu: Imu, marks: tuple[float, float], step: float,
                    uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
     """
     Return the wheels in cells of ``step`` s, None with fewer than 20 common cells.
 
-    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
+    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   marks : start and stop, s.
     uncertain_t : (d,) s, times of uncertain travel; cells next to them are not known.
     """
     t_imu, w_b, f_b = imu
     left, right = axle
     if min(len(left.t), len(right.t), len(t_imu)) < 2:
         return None
-    begin = max(left.t[0], right.t[0], t_imu[0], between[0])
-    end = min(left.t[-1], right.t[-1], t_imu[-1], between[1])
+    begin = max(left.t[0], right.t[0], t_imu[0], marks[0])
+    end = min(left.t[-1], right.t[-1], t_imu[-1], marks[1])
     t = begin + step * np.arange(max(0, int((end - begin) / step) + 1))
     if len(t) < 21:
         return None
@@ -79,53 +79,56 @@ def wheels_on_grid(axle: Sequence[Travel], imu: Imu, between: tuple[float, float
         gap = np.diff(times)
         for k in np.flatnonzero(gap > max(GAP_INTERVALS * np.median(gap), 0.2)):
             known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
-    for at in uncertain_t:
-        known &= (t[1:] < at - step) | (t[:-1] > at + step)
+    for time in uncertain_t:
+        known &= (t[1:] < time - step) | (t[:-1] > time + step)
     return WheelPair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
                      max(left.quantum, right.quantum),
-                     tuple(one.name or side for one, side in zip(axle, SIDES, strict=True)))
+                     tuple(wheel.name or side for wheel, side in zip(axle, SIDES, strict=True)))
 
 
-def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floats | None = None,
+def robust_fit(A: Floats, y: Floats, min_sigma: float,
+               prior: Sequence[float] | Floats | None = None,
                start: Sequence[float] | Floats | None = None) -> tuple[Floats, Floats, float]:
     """
     Return x of y = A x by least squares with Tukey's weights, its covariance, and sigma of y.
 
-    A, y : (n, k), (n,) design and values.   floor : least sigma of y.   prior : (k,) sigmas of
-    the coefficients about zero, inf: no prior.   start : (k,) coefficients that fit many rows;
+    A, y : (n, k), (n,) design and values.   min_sigma : least sigma of y.   prior : (k,) sigmas
+    of the coefficients about zero, inf: no prior.   start : (k,) coefficients that fit many rows;
     default: least squares. The sigma of y is by the median of the residuals.
     """
-    size = np.abs(A).max(axis=0)
-    size[size == 0] = 1.0
-    A = A / size
-    information = np.zeros(A.shape[1]) if prior is None else 1 / (np.asarray(prior) * size)**2
+    column_size = np.abs(A).max(axis=0)
+    column_size[column_size == 0] = 1.0
+    A = A / column_size
+    information = np.zeros(A.shape[1]) if prior is None else (
+        1 / (np.asarray(prior) * column_size)**2)
     weight, sigma = np.ones(len(y)), 0.0
-    x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * size
+    x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * column_size
     tukey_passes = 20
     for k in range(tukey_passes):
         if k or start is not None:
             residual = y - A @ x
-            sigma = max(robust_sigma(residual), floor)
+            sigma = max(robust_sigma(residual), min_sigma)
             u = residual / (TUKEY * sigma)
             # absolute values first (Huber): without a start Tukey's weights can converge anywhere
             huber = start is None and k < tukey_passes // 2
             weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
                 np.abs(u) < 1, (1 - u**2)**2, 0.0)
         H = (A * weight[:, None]).T @ A + np.diag(
-            information * max(sigma, floor)**2 + 1e-12 * len(y))
+            information * max(sigma, min_sigma)**2 + 1e-12 * len(y))
         x = np.linalg.solve(H, A.T @ (weight * y))
-    return x / size, np.linalg.inv(H) * sigma**2 / np.outer(size, size), sigma
+    covariance = np.linalg.inv(H) * sigma**2 / np.outer(column_size, column_size)
+    return x / column_size, covariance, sigma
 
 
 def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
-                         between: tuple[float, float]) -> tuple[Reason, ...]:
+                         marks: tuple[float, float]) -> tuple[Reason, ...]:
     """
     Return WHEEL_DEAD and WHEEL_REVERSED, once each, if one wheel fails; () if both count.
 
     axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
-    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with bias.   between : (2,) the marks, s.
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with bias.   marks : start and stop, s.
     """
-    pair = wheels_on_grid(axle, imu, between, FAULT_CELL)
+    pair = wheels_on_grid(axle, imu, marks, FAULT_CELL)
     if pair is None:
         return ()
     steps = np.diff([pair.left, pair.right])          # (2, n)
@@ -155,20 +158,20 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
         pair, steps, design @ x, x[0], covariance[0, 0], imu)
 
 
-def _fit_right_wheel(design: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
+def _fit_right_wheel(design: Floats, y: Floats, min_sigma: float) -> tuple[Floats, Floats]:
     """
     Return the coefficients of left wheel, turn and time in the right wheel, and their covariance.
 
     design : (n, 3) travel of the left wheel, turn, rad, duration, s, of each cell.   y : (n,)
-    travel of the right wheel.   floor : least sigma of y. Of two robust fits, one that starts
-    without turns, the one with fewer outliers is used.
+    travel of the right wheel.   min_sigma : least sigma of y. Of two robust fits, one of which
+    starts without turns, the one with fewer outliers is used.
     """
     rolling = design[:, 0] != 0
     usual = float(np.median(y[rolling] / design[rolling, 0])) if rolling.any() else 1.0
-    # share of the top speed: gyro bias times track width, 1 sigma
-    bias_of_top = 0.02
-    drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_CELL
-    fits = [robust_fit(design, y, floor, (np.inf, np.inf, drift), start)
+    # 1 sigma of gyro bias times track width, over the top speed
+    drift_share = 0.02
+    drift = drift_share * float(np.percentile(np.abs(y), 95)) / FAULT_CELL
+    fits = [robust_fit(design, y, min_sigma, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
     smallest = min(sigma for _, _, sigma in fits)
     # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
@@ -180,7 +183,7 @@ def _fit_right_wheel(design: Floats, y: Floats, floor: float) -> tuple[Floats, F
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:
-    """Return a mask of the cells in which each wheel certainly rolls, by its steps: (2, n)."""
+    """Return a mask of the cells in which a wheel certainly rolls, of (2, n) steps: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
     return np.abs(steps) > np.maximum(ROLLING_SHARE * top, 0.5 * quantum)
 
@@ -191,10 +194,10 @@ def _stalled_cells(pair: WheelPair, steps: Floats, k: int) -> Bools:
     other_rolls = _rolling(steps, pair.quantum)[1 - k]
     still: Bools = pair.known & (this_wheel <= STALLED_SHARE * other) & other_rolls
     shortest_stall = 2.0    # s without a count while the other wheel rolls; shorter is slip
-    for a, b in runs(still):
-        if ((b - a) * FAULT_CELL < shortest_stall
-                or other[a:b].sum() < OTHER_WHEEL_COUNTS * pair.quantum):
-            still[a:b] = False
+    for begin, end in runs(still):
+        if ((end - begin) * FAULT_CELL < shortest_stall
+                or other[begin:end].sum() < OTHER_WHEEL_COUNTS * pair.quantum):
+            still[begin:end] = False
     return still
 
 
@@ -202,15 +205,16 @@ def _without_pivots(stalled: Bools, steps: Floats, design: Floats, x: Floats, k:
     """Return the cells of ``stalled`` in which wheel k is not the centre of a turn, by the fit."""
     stalled = stalled.copy()
     ratio, turn_part = x[0], design[:, 1:] @ x[1:]
-    for a, b in runs(stalled):
+    for begin, end in runs(stalled):
+        cells = slice(begin, end)
         # travel of wheel k that the other wheel and the gyro predict, and without the turn
         if k == 1:
-            predicted, straight = (design[a:b] @ x).sum(), ratio * steps[0][a:b].sum()
+            predicted, straight = (design[cells] @ x).sum(), ratio * steps[0][cells].sum()
         else:
-            straight = steps[1][a:b].sum()
-            predicted = straight - turn_part[a:b].sum()
+            straight = steps[1][cells].sum()
+            predicted = straight - turn_part[cells].sum()
         if abs(predicted) < abs(straight) / 2:
-            stalled[a:b] = False
+            stalled[cells] = False
     return stalled
 
 
@@ -224,17 +228,17 @@ def _dead_reasons(pair: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple
     other = np.abs(steps[1 - k])
     lost = other[stalled[k]].sum()
 
-    def dead_from(cell: int) -> bool:
-        rest: float = other[cell:].sum()
-        return bool(np.abs(steps[k][cell:]).sum() <= STALLED_SHARE * rest + pair.quantum)
+    def is_dead_from(cell: int) -> bool:
+        other_travel: float = other[cell:].sum()
+        return bool(np.abs(steps[k][cell:]).sum() <= STALLED_SHARE * other_travel + pair.quantum)
     begin = pair.t[first]
-    if dead_from(first):
+    if is_dead_from(first):
         when = f'from t = {begin:.1f} s on'
     else:
         several = len(spans) > 1
         when = f'{len(spans)} time{"s" * several}, first from t = {begin:.1f} s for ' \
                f'{(spans[0][1] - first) * FAULT_CELL:.1f} s'
-        if several and dead_from(last):
+        if several and is_dead_from(last):
             when += f', last from t = {pair.t[spans[-1][0]]:.1f} s on'
     return (Reason(Code.WHEEL_DEAD, f'the {pair.names[k]} wheel does not count {when}, in '
                    f'{percent_text(lost, other.sum())} of the travel of the {pair.names[1 - k]} '
@@ -256,26 +260,27 @@ def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: f
     """
     if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
         k = _wheel_against_imu(pair, steps, imu)
-        which = (f'the {pair.names[k]} wheel counts down when the vehicle drives forward, the '
-                 f'{pair.names[1 - k]} wheel counts up' if k is not None else
-                 'one wheel counts up while the other counts down; the IMU data cannot decide '
-                 'which is correct')
-        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both wheels is not the travel '
+        text = (f'the {pair.names[k]} wheel counts down when the vehicle drives forward, the '
+                f'{pair.names[1 - k]} wheel counts up' if k is not None else
+                'one wheel counts up while the other counts down; the IMU data cannot decide '
+                'which is correct')
+        return (Reason(Code.WHEEL_REVERSED, f'{text}: the mean of both wheels is not the travel '
                        'of the vehicle'),)
     rolling = _rolling(np.stack([expected, steps[1]]), pair.quantum).all(axis=0)
-    against = pair.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
-    against_time = 1.5    # s of counting against the other wheel
-    spans = [(a, b) for a, b in runs(against) if (b - a) * FAULT_CELL >= against_time]
+    is_opposite = pair.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
+    min_duration = 1.5    # s of counting opposite to the other wheel
+    spans = [(begin, end) for begin, end in runs(is_opposite)
+             if (end - begin) * FAULT_CELL >= min_duration]
     if ratio <= 0 or not spans:
         return ()
     backward = [-step[step < 0].sum() for step in steps]
     unsigned = [k for k in (0, 1)
                 if backward[k] <= 3 * pair.quantum + STALLED_SHARE * backward[1 - k]]
-    which = (f'the {pair.names[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
-             else 'one wheel counts up while the other counts down')
-    a, b = spans[0]
-    return (Reason(Code.WHEEL_REVERSED, f'{which}: {len(spans)} time{"s" * (len(spans) > 1)}, '
-                   f'first at t = {pair.t[a]:.1f} s for {(b - a) * FAULT_CELL:.1f} s'),)
+    text = (f'the {pair.names[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
+            else 'one wheel counts up while the other counts down')
+    begin, end = spans[0]
+    return (Reason(Code.WHEEL_REVERSED, f'{text}: {len(spans)} time{"s" * (len(spans) > 1)}, '
+                   f'first at t = {pair.t[begin]:.1f} s for {(end - begin) * FAULT_CELL:.1f} s'),)
 
 
 def _wheel_against_imu(pair: WheelPair, steps: Floats, imu: Imu) -> int | None:

@@ -53,9 +53,10 @@ def leg_of(leg, config):
     """Return a leg in the format of the smoother."""
     inputs, _ = screen(leg, config)
     located = locate_fixes(inputs, config)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough,
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough_scale,
                         config.leg.standstill)
-    return make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans, located.rough)
+    return make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
+                             located.rough_scale)
 
 
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):

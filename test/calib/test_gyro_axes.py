@@ -106,7 +106,7 @@ def test_two_gyro_axes_with_the_same_signal_are_not_an_axis_fault(monkeypatch, x
     fit = GravityFit(np.array([x, y, 0.0]), np.array([0.1, 0.05, 0.02]), np.full(3, 12.0))
     monkeypatch.setattr('odocal_ros.calib.gyro_axes.gravity_fit', lambda *_: fit)
     inputs = SimpleNamespace(t_imu=None, travel=None)
-    found = by_gravity(inputs, SimpleNamespace(rough=1.0), None, None, None, ['x', 'y', 'z'])
+    found = by_gravity(inputs, SimpleNamespace(rough_scale=1.0), None, None, None, ['x', 'y', 'z'])
     assert [sent for sent, *_ in found] == named
 
 
@@ -183,7 +183,7 @@ def test_correct_gyro_is_not_reported(scenario, more):
 def test_fit_finds_each_coefficient_within_its_sigma():
     made = town()
     inputs = screen_leg(made.leg(), settings(made)).inputs
-    axes, _ = level_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
+    axes, _ = level_axes(inputs.median_f_b / np.linalg.norm(inputs.median_f_b))
     for M, expected in ((np.eye(3), SOUND), (AXES['mirrored x'], SOUND * [-1, 1, 1]),
                         (AXES['x and y swapped'], SOUND[[1, 0, 2]])):
         fit = gravity_fit(inputs.t_imu, inputs.w_b @ M.T, inputs.f_b, axes, inputs.travel,

@@ -118,7 +118,7 @@ def test_random_walk_scale_is_the_scale_of_the_last_leg(legs):
 
 def test_marginal_information_includes_a_wheel_change_within_the_leg(legs):
     _, config, results = legs
-    run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config,
+    run = SimpleNamespace(distance=1000.0, nominal_scale=0.0, config=config,
                           wheel_slips=replace(NO_SLIPS, change=8e-4))
     loose = with_wheel_change(results[0], run)
     scale = loose.estimates[SCALE]

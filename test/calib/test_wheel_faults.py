@@ -29,7 +29,7 @@ def prepared(**options):
     made = drive(**options)
     config = settings(made)
     found, _ = prepare(made.leg(), screen(made.leg(), config)[0], config)
-    return found.inputs, found.track, found.origin.latitude, found.rough
+    return found.inputs, found.track, found.origin.latitude, found.rough_scale
 
 
 def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=prepared, **more):

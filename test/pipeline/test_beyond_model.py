@@ -74,7 +74,7 @@ def test_a_delay_of_zero_is_not_reported():
 def test_a_delay_is_reported_if_significant_and_with_an_effect(late, sigma, fix_sigma, is_said):
     t = np.arange(0.0, 60.0, 0.1)
     run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
-        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, aligned={}))       # 10 m/s
+        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, clock_delays={}))       # 10 m/s
     assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
 
 

@@ -120,7 +120,7 @@ def test_the_leg_is_placed_in_the_frame_as_sent(made, latitude_deg):
     config = settings(made, reference__latitude_deg=latitude_deg)
     inputs, _ = screen(posed(made, latitude_deg), config)
     there = locate_fixes(inputs, config)
-    assert inputs.local
+    assert inputs.is_local
     assert there.origin.local_earth_rate == rate_without_north(math.radians(latitude_deg))
     sent = made.positions()[:len(there.fixes_n)]
     off = there.fixes_n - there.fixes_n[0] - (sent - sent[0])
@@ -183,7 +183,7 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
     inputs, _ = screen(posed(made), config)
     there = locate_fixes(inputs, config)
     leg = make_smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)),
-                            there.rough)
+                            there.rough_scale)
     grade = grade_of(config.imu)
     np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias_sigma,
                                math.hypot(1e-6, OMEGA))
