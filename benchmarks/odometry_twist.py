@@ -90,7 +90,7 @@ def relay(args) -> None:
     from sensor_msgs.msg import Imu
     from std_msgs.msg import Int64
 
-    from odocal_ros.live.messages import WaitingMessages
+    from odocal_ros.live.messages import MessageQueue
     from odocal_ros.live.odometry import CHECK_PERIOD_S, EXECUTOR_PERIOD_S, TemplatePublisher
     rclpy.init()
     node = rclpy.create_node(args.role)
@@ -114,7 +114,7 @@ def relay(args) -> None:
         rclpy.spin(node)
     waiting = []
     for kind, name, callback in topics:
-        waiting.append((WaitingMessages(node), callback))
+        waiting.append((MessageQueue(node), callback))
         waiting[-1][0].subscribe(kind, name, qos)
     executor, serve_at = rclpy.executors.SingleThreadedExecutor(), 0.0
     executor.add_node(node)

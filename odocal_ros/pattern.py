@@ -16,8 +16,9 @@ Point = tuple[float, float]
 Rectangle = tuple[float, float, float, float]      # x and y, least and largest
 # m within which an error of the path is corrected. Judgement: at 0.5 m/s with commands that are
 # 0.1 and 0.2 s late, robots leave the pattern by 0.9 and 2.5 cm with any value from 0.2 to 0.8
-REACH = 0.4
-TURN_FROM, TURN_TO = 0.2, 0.02      # rad off the path: turn on the spot; aligned. Judgement
+CORRECTION_LENGTH = 0.4
+MAX_HEADING_ERROR = 0.2             # rad. Judgement: beyond it the robot turns on the spot
+ALIGNED = 0.02                      # rad. Judgement: heading error at which this turn ends
 SLOWEST, SLOWEST_TURN = 0.03, 0.1   # m/s, rad/s. Judgement: slower, many wheels stick
 MOVED, MOVED_TURN = 0.01, 0.02      # m, rad. Judgement: at the slowest within a second
 POSE_LOST_S = 0.5                   # judgement: without a pose
@@ -33,18 +34,19 @@ class Piece:
     heading: float            # at its start, rad from the x axis, counter-clockwise
     length: float             # m
     curvature: float = 0.0    # 1/m, positive to the left
-    rests: bool = True        # the robot stops at its end
+    stops: bool = True        # the robot stops at its end
     side: int = 1             # of a half turn before it, 1: left
 
-    def located(self, x: float, y: float) -> tuple[float, float]:
-        """Return the distance along the piece, m, and the distance to the left of it, m."""
-        c, s = math.cos(self.heading), math.sin(self.heading)
-        along, left = c * (x - self.x) + s * (y - self.y), c * (y - self.y) - s * (x - self.x)
+    def along_and_left(self, x: float, y: float) -> tuple[float, float]:
+        """Return the path length along the piece to a point, and its distance to the left, m."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        along = cos * (x - self.x) + sin * (y - self.y)
+        left = cos * (y - self.y) - sin * (x - self.x)
         if not self.curvature:
             return along, left
         radius, side = 1 / abs(self.curvature), math.copysign(1.0, self.curvature)
-        inwards = radius - side * left       # from the centre outwards
-        return radius * math.atan2(along, inwards), side * (radius - math.hypot(along, inwards))
+        outwards = radius - side * left       # from the centre of the circle
+        return radius * math.atan2(along, outwards), side * (radius - math.hypot(along, outwards))
 
 
 def rectangle_of(config: PatternConfig) -> Rectangle:
@@ -78,13 +80,13 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
 
 def _alternating(pieces: list[Piece]) -> list[Piece]:
     """Return pieces with half turns to the left and right by turns, as the track width needs."""
-    found, side = pieces[:1], 1
+    alternating, side = pieces[:1], 1
     for before, piece in zip(pieces, pieces[1:], strict=False):
-        turn = piece.heading - before.heading - before.curvature * before.length
-        found.append(replace(piece, side=side))
-        if abs(math.remainder(turn, 2 * math.pi)) > HALF_TURN:
+        alternating.append(replace(piece, side=side))
+        if abs(_angle(piece.heading - before.heading - before.curvature * before.length)
+               ) > HALF_TURN:
             side = -side
-    return found
+    return alternating
 
 
 def _lines(points: Sequence[Point]) -> list[Piece]:
@@ -124,58 +126,55 @@ def _figure_eight(inner: Rectangle) -> list[Piece]:
             pieces.append(Piece(
                 centre[0] + side * radius * (math.sin(turned) - math.sin(heading)),
                 centre[1] + side * radius * (math.cos(heading) - math.cos(turned)),
-                turned, radius * math.pi / 2, side / radius, rests=side < 0 and quarter == 3))
+                turned, radius * math.pi / 2, side / radius, stops=side < 0 and quarter == 3))
     return pieces
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress on a route: piece, turning on the spot, end of the rest, last command."""
+    """Progress on a route."""
 
-    piece: int = 0
-    turning: bool = True
-    rest_until: float = -math.inf
-    t: float = math.nan
+    piece: int = 0                    # index of the piece, the length of the route at its end
+    turning: bool = True              # on the spot
+    rest_until: float = -math.inf     # s, end of a rest between pieces
+    t: float = math.nan               # s, of the last command, and its speed, m/s
     speed: float = 0.0
 
 
-def command(route: Sequence[Piece], now: Progress, pose: Pose, t: float,
+def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
             config: PatternConfig) -> tuple[float, float, Progress]:
-    """
-    Return speed, m/s, turn rate, rad/s, and the progress after it.
-
-    t : s.   The route is driven when ``piece`` of the progress is its length.
-    """
-    step = 0.0 if math.isnan(now.t) else max(t - now.t, 0.0)
-    now = replace(now, t=t)
-    if now.piece == len(route) or t < now.rest_until:
-        return 0.0, 0.0, replace(now, speed=0.0)
-    piece = route[now.piece]
-    along, left = piece.located(*pose[:2])
+    """Return speed, m/s, and turn rate, rad/s, at a time t, s, and the progress after it."""
+    step_s = 0.0 if math.isnan(progress.t) else max(t - progress.t, 0.0)
+    progress = replace(progress, t=t)
+    if progress.piece == len(route) or t < progress.rest_until:
+        return 0.0, 0.0, replace(progress, speed=0.0)
+    piece = route[progress.piece]
+    along, left = piece.along_and_left(*pose[:2])
     heading_error = _angle(pose[2] - piece.heading - piece.curvature * along)
     if abs(heading_error) > HALF_TURN:
         heading_error = math.copysign(heading_error, -piece.side)
-    if now.turning and abs(heading_error) > TURN_TO:
+    if progress.turning and abs(heading_error) > ALIGNED:
         rate = max(min(1.5 * abs(heading_error), config.turn_rate), SLOWEST_TURN)
-        return 0.0, -math.copysign(rate, heading_error), replace(now, speed=0.0)
-    to_go = piece.length - along
-    if to_go <= 0:
-        rests = piece.rests
-        after = replace(
-            now, piece=now.piece + 1, turning=rests, speed=0.0 if rests else now.speed,
-            rest_until=t + config.rest if rests else now.rest_until)
-        return command(route, after, pose, t, config)
-    if abs(heading_error) > TURN_FROM:
-        return 0.0, 0.0, replace(now, turning=True, speed=0.0)
+        return 0.0, -math.copysign(rate, heading_error), replace(progress, speed=0.0)
+    remaining = piece.length - along      # m
+    if remaining <= 0:
+        progress = replace(progress, piece=progress.piece + 1, turning=piece.stops)
+        if piece.stops:
+            progress = replace(progress, speed=0.0, rest_until=t + config.rest)
+        return command(route, progress, pose, t, config)
+    if abs(heading_error) > MAX_HEADING_ERROR:
+        return 0.0, 0.0, replace(progress, turning=True, speed=0.0)
     limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / 1.5,
-                now.speed + config.acceleration * step)
-    if piece.rests:
-        limit = min(limit, math.sqrt(2 * config.acceleration * to_go))
+                progress.speed + config.acceleration * step_s)
+    if piece.stops:
+        limit = min(limit, math.sqrt(2 * config.acceleration * remaining))
     speed = min(max(limit, SLOWEST), config.speed)
-    # across'' = -across / REACH^2 - 2 across' / REACH, by distance: critically damped
-    curvature = piece.curvature - left / REACH**2 - 2 * heading_error / REACH
+    # critically damped: with d = CORRECTION_LENGTH and derivatives by path length,
+    # left'' = -left / d^2 - 2 left' / d, where left' is the heading error
+    curvature = (piece.curvature - left / CORRECTION_LENGTH**2
+                 - 2 * heading_error / CORRECTION_LENGTH)
     rate = max(-config.turn_rate, min(speed * curvature, config.turn_rate))
-    return speed, rate, replace(now, turning=False, speed=speed)
+    return speed, rate, replace(progress, turning=False, speed=speed)
 
 
 def has_moved(before: Pose, after: Pose) -> bool:

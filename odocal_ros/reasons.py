@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Verdict(Enum):
-    """What a result is good for; ``rejected`` results keep every value they computed."""
+    """Usability of a result; ``rejected`` results keep every value they computed."""
 
     ACCEPTED = 'accepted'
     CAUTION = 'caution'
@@ -29,7 +29,7 @@ NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
 class Code(Enum):
     """A reason code: (severity, remedy)."""
 
-    # the data that came
+    # topics and messages
     NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
                       'robot without an IMU: set odometer.left and odometer.right, or '
                       'odometer.wheels.')
@@ -261,18 +261,18 @@ class Code(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A code, a text with numbers, and a specific remedy ``do`` if there is one."""
+    """A code, a text with numbers, and a remedy for this case in place of that of the code."""
 
     code: Code
     text: str
-    do: str = ''
+    special_remedy: str = ''
 
     def __str__(self) -> str:
         return f'{self.code.name}: {self.text}'
 
     @property
     def remedy(self) -> str:
-        return self.do or self.code.remedy
+        return self.special_remedy or self.code.remedy
 
     def as_dict(self) -> dict[str, Any]:
         return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
@@ -289,5 +289,5 @@ def cautions(reasons: Iterable['Reason']) -> list['Reason']:
 
 
 def verdict_of(reasons: Iterable['Reason']) -> Verdict:
-    """Return the most severe verdict that the reasons ask for."""
+    """Return the most severe verdict of the reasons."""
     return Verdict.worst(r.code.severity for r in reasons)

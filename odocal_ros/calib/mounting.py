@@ -86,12 +86,12 @@ def _listed(C_bi: Floats, digits: int = 10) -> str:
 
 def with_mounting_remedy(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
     """Return reasons, with the setting to make in IMU_AXES, estimated from screened inputs."""
-    if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
+    if not any(r.code is Code.IMU_AXES and not r.special_remedy for r in reasons):
         return list(reasons)
     estimate = estimate_mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
                                  inputs.travel, 1.0)
-    return [replace(r, do=r.do or remedy(estimate)) if r.code is Code.IMU_AXES else r
-            for r in reasons]
+    return [replace(r, special_remedy=r.special_remedy or remedy(estimate))
+            if r.code is Code.IMU_AXES else r for r in reasons]
 
 
 def estimate_mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,

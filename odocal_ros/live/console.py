@@ -57,18 +57,18 @@ class TopicReport:
 
         lost : topic -> messages lost so far; a smaller number than before starts a new count.
         """
-        found = [text for text in dict.fromkeys(duplicate_publishers) if text
+        texts = [text for text in dict.fromkeys(duplicate_publishers) if text
                  and text not in self._reported_duplicates]
-        self._reported_duplicates.update(found)
+        self._reported_duplicates.update(texts)
         for topic, count in lost.items():
             reported = self._reported_counts.get(topic, 0)
             if count < reported:
                 reported = self._reported_counts[topic] = 0
             if count >= max(1, LOSS_FACTOR * reported):
                 self._reported_counts[topic] = count
-                found.append(f'{losses_text({topic: count})}. Likely cause: CPU load or '
+                texts.append(f'{losses_text({topic: count})}. Likely cause: CPU load or '
                              'network. Reduce the load, or set the QoS of the topic to reliable')
-        return found
+        return texts
 
 
 def losses_text(lost: dict[str, int]) -> str:
@@ -92,8 +92,8 @@ class Console:
         self._pause_ns = MISSING_LOG_DELAY_NS      # until the one after it
         self._missing_text = ''      # missing inputs of the last view, numbers removed
         self._leg_id = 0             # the leg whose faults are logged
-        self._reported: set[Code] = set()      # logged faults of this leg
-        self._withdrawn: set[Code] = set()     # logged as no longer valid
+        self._logged_faults: set[Code] = set()      # of this leg
+        self._logged_ends: set[Code] = set()        # faults logged as no longer valid
 
     def report(self, view: SessionView, steady_ns: int) -> None:
         self._log_faults(view)
@@ -133,15 +133,15 @@ class Console:
         """Log the problems of the current leg, each once."""
         leg_id = view.session.leg_id
         if self._leg_id != leg_id:
-            self._leg_id, self._reported, self._withdrawn = leg_id, set(), set()
+            self._leg_id, self._logged_faults, self._logged_ends = leg_id, set(), set()
         for fault in view.faults:
-            if fault.code not in self._reported:
-                self._reported.add(fault.code)
+            if fault.code not in self._logged_faults:
+                self._logged_faults.add(fault.code)
                 self._log.warning(f'leg {leg_id}: {fault}. {fault.remedy}')
         if view.session.state is not State.RECORDING:
             return
-        withdrawn = self._reported - self._withdrawn - {fault.code for fault in view.faults}
-        for code in sorted(withdrawn, key=lambda code: code.name):
-            self._withdrawn.add(code)
+        ended = self._logged_faults - self._logged_ends - {fault.code for fault in view.faults}
+        for code in sorted(ended, key=lambda code: code.name):
+            self._logged_ends.add(code)
             self._log.info(f'leg {leg_id}: {code.name} no longer applies: later messages '
                            'contradict it')

@@ -55,8 +55,8 @@ class DrivePattern(CheckedNode):
         self._rectangle = pattern.rectangle_of(self.config)
         pattern.route_of(self.config, self._rectangle[:2])      # raises now, not at ~/start
         self._pose: pattern.Pose | None = None
-        self._pose_at = -math.inf       # time of its arrival; all times are s, steady clock
-        self._bumped = self._ending = False
+        self._pose_time = -math.inf     # of its arrival; all times are s, steady clock
+        self._is_bumper_pressed = self._is_ending = False
         self._route: tuple[pattern.Piece, ...] = ()     # empty: the robot is not driven
         self._progress, self._started_s, self._stop_commands_left = pattern.Progress(), 0.0, 0
         # pose and time at which the robot last moved
@@ -78,7 +78,7 @@ class DrivePattern(CheckedNode):
         """Process callbacks until a signal; the robot is stopped before the context ends."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._end)
-        while self.context.ok() and not self._ending:
+        while self.context.ok() and not self._is_ending:
             executor.spin_once(timeout_sec=PERIOD_S)
 
     def destroy_node(self) -> None:
@@ -90,25 +90,26 @@ class DrivePattern(CheckedNode):
         super().destroy_node()  # type: ignore[no-untyped-call]
 
     def _end(self, *_: object) -> None:
-        self._ending = True
+        self._is_ending = True
 
     def _receive_pose(self, message: Any) -> None:
         pose = message.pose if hasattr(message.pose, 'position') else message.pose.pose
         q = pose.orientation
         heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
         self._pose = pose.position.x, pose.position.y, heading
-        self._pose_at = time.monotonic()
+        self._pose_time = time.monotonic()
 
     def _receive_bumper(self, message: Bool) -> None:
-        self._bumped = message.data
+        self._is_bumper_pressed = message.data
         if self._route:
             self._tick()        # at once
 
     def _stop_reason(self) -> str:
         now = time.monotonic()
         driven_s = now - self._started_s if self._route else 0.0
-        return pattern.stop_cause(self._pose, now - self._pose_at, self._rectangle, self._bumped,
-                                driven_s, self.config.timeout)
+        return pattern.stop_cause(
+            self._pose, now - self._pose_time, self._rectangle, self._is_bumper_pressed, driven_s,
+            self.config.timeout)
 
     def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         reason = 'a pattern is already running' if self._route else self._stop_reason()

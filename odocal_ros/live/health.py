@@ -32,11 +32,11 @@ class Health:
 
     def __init__(self) -> None:
         self.count = 0
-        self.unusable = 0      # messages that could not be read
-        self.lost = 0          # messages missing in the middleware's sequence numbers
-        self.lost_before = 0   # ``lost`` at the begin of the leg
+        self.unreadable_count = 0    # messages that could not be read
+        self.lost_count = 0          # messages missing in the middleware's sequence numbers
+        self.lost_before_leg = 0     # ``lost_count`` at the begin of the leg
         self.gaps = 0          # steps of the stamps beyond the limit
-        self.stampless = False    # no stamp in the last messages
+        self.has_no_stamps = False    # no stamp in the last messages
         self.last_arrival_ns = 0
         self.delay_s = 0.0     # send time minus stamp of the newest message
         self.fix_status: int | None = None      # NavSatStatus of the newest fix
@@ -48,19 +48,19 @@ class Health:
         """Restart after a jump of time; counts of losses stay."""
         self.newest_ns = 0
         self.jumped_back = False
-        self._ahead: list[int] = []      # unconfirmed stamps far ahead
-        self._behind = 0                 # stale rows at the end of the last block
+        self._stamps_ahead: list[int] = []      # far ahead, not confirmed yet
+        self._stale_rows = 0                    # far behind, at the end of the last block
         # count of messages and newest stamp after each block
         self._block_ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
 
     def register_arrival(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count lost messages; sequences: publisher's numbers in order of arrival, or None."""
         self.last_arrival_ns = now_ns
-        numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
+        numbers = [number for number in [self._last_sequence, *sequences] if number is not None]
         steps = [after - before for before, after in pairwise(numbers)]
         # numbers of several publishers, or of a restarted one, cannot be used
         if steps and min(steps) > 0:
-            self.lost += sum(steps) - len(steps)
+            self.lost_count += sum(steps) - len(steps)
         if numbers:
             self._last_sequence = numbers[-1]
 
@@ -74,7 +74,7 @@ class Health:
         zero, not far ahead or behind.
         """
         self.count += len(stamps)
-        self.stampless = bool(stamps) and max(stamps) <= 0
+        self.has_no_stamps = bool(stamps) and max(stamps) <= 0
         plausible = self._not_ahead(stamps)
         rows = [row for row, is_plausible in enumerate(plausible) if is_plausible]
         if rows:
@@ -90,15 +90,16 @@ class Health:
         """Return a mask of stamps that exist and are not far ahead of the last one."""
         plausible, last = [stamp > 0 for stamp in stamps], self.newest_ns
         first = next((stamp for stamp in stamps if stamp > 0), 0)
-        if not self._ahead and max(stamps, default=0) - (last or first) < STAMP_JUMP_NS:
+        if not self._stamps_ahead and max(stamps, default=0) - (last or first) < STAMP_JUMP_NS:
             return plausible
         for row, stamp in enumerate(stamps):
             if plausible[row] and last and stamp - last >= STAMP_JUMP_NS:
-                is_near = self._ahead and abs(stamp - self._ahead[-1]) < STAMP_JUMP_NS
-                self._ahead = [*self._ahead, stamp] if is_near else [stamp]
-                plausible[row] = len(self._ahead) >= TIME_RESTART_ROWS
+                before = self._stamps_ahead
+                is_confirming = before and abs(stamp - before[-1]) < STAMP_JUMP_NS
+                self._stamps_ahead = [*before, stamp] if is_confirming else [stamp]
+                plausible[row] = len(self._stamps_ahead) >= TIME_RESTART_ROWS
             if plausible[row]:
-                last, self._ahead = stamp, []
+                last, self._stamps_ahead = stamp, []
         return plausible
 
     def _update_times(self, stamps: list[int], max_gap_s: float | None) -> None:
@@ -119,7 +120,7 @@ class Health:
         """Return the newest stamp after a block, and note whether time has restarted."""
         # one or two stamps far behind are a driver error, more are a restart of time; if a block
         # ends with few of them, or has one row only, the next block decides
-        stale_before, self._behind = self._behind, 0
+        stale_before, self._stale_rows = self._stale_rows, 0
         if not steps or min(steps) >= -TIME_RESTART_NS:
             return stamps_with_last[-1]
         step_row = steps.index(min(steps))
@@ -134,7 +135,7 @@ class Health:
             return stamps_with_last[-1]
         rows = len(stamps_with_last) - 1 - step_row
         if rows < TIME_RESTART_ROWS if step_row else rows + stale_before < 2:
-            self._behind = rows
+            self._stale_rows = rows
             return stamps_with_last[step_row]
         self.jumped_back = True
         return stamps_with_last[-1]
@@ -154,6 +155,6 @@ class Health:
         recent = [end for end in self._block_ends if end[1] >= self.newest_ns - RATE_SPAN_NS]
         if len(recent) < 2:
             recent = list(self._block_ends)[-2:]
-        if len(recent) < 2 or recent[-1][1] <= recent[0][1]:
-            return 0.0
-        return (recent[-1][0] - recent[0][0]) / ((recent[-1][1] - recent[0][1]) * 1e-9)
+        (first_count, first_ns), (count, newest_ns) = recent[0], recent[-1]
+        return (count - first_count) / ((newest_ns - first_ns) * 1e-9) if (
+            newest_ns > first_ns) else 0.0

@@ -30,7 +30,7 @@ from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: including the writing, a kill loses about a second
 JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node must stop
-HEAD = """\
+FILE_HEAD = """\
 # Journal of a leg: 'odocal replay' on this folder computes it again with the settings below,
 # which are those in force when the leg was started. They are a ROS parameter file too:
 # --params-file, ros2 param load, odocal replay --config.
@@ -53,12 +53,12 @@ class Journal:
         self._marks: Received | None = None
         self._due_ns = 0                 # steady time of the next batch
         self._limit = 0                  # bytes of all journals; 0: no journal is written
-        self._reach_ns = 0               # duration of the messages kept for later legs
+        self._preroll_ns = 0             # duration of the messages kept for later legs
         self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
-        self._ended = False              # its samples are complete
+        self._is_complete = False        # all samples of this leg have come
         self._last_event = ''            # event of its last stored status
-        self._dropped: set[int] = set()  # legs reported as dropped
-        self._reported = ''              # the logged error
+        self._dropped_legs: set[int] = set()     # reported as dropped
+        self._logged_error = ''          # the error that was logged last
 
     @property
     def error(self) -> str:
@@ -89,21 +89,21 @@ class Journal:
             return
         if now_ns >= self._due_ns:
             self._hand_over()
-        if self._ended and not is_busy:
-            self._leg_id, self._ended = 0, False
+        if self._is_complete and not is_busy:
+            self._leg_id, self._is_complete = 0, False
             self._writer.submit(self._writer.finish)
-        if self.error != self._reported:
-            self._reported = self.error
-            if self._reported:
-                self._log.warning(f'the journal cannot be written: {self._reported}')
+        if self.error != self._logged_error:
+            self._logged_error = self.error
+            if self._logged_error:
+                self._log.warning(f'the journal cannot be written: {self._logged_error}')
 
     def _update_limit(self, config: Config) -> int:
-        """Update limit and reach from the settings; return the limit, 0 for no journal."""
+        """Update limit and pre-roll from the settings; return the limit, 0 for no journal."""
         if self._limit and not config.journal.max_bytes:
             self.restart()
         self._limit = config.journal.max_bytes
         # the recorder's margin, and a batch of about a second
-        self._reach_ns = round((config.leg.preroll + PREROLL_MARGIN_S + 1.0) * 1e9)
+        self._preroll_ns = round((config.leg.preroll + PREROLL_MARGIN_S + 1.0) * 1e9)
         return self._limit
 
     def _hand_over(self) -> None:
@@ -111,7 +111,7 @@ class Journal:
         batch, self._batch = self._batch, {}
         marks, self._marks = self._marks, None
         if batch or marks:
-            self._writer.submit(self._writer.take, batch, self._reach_ns, marks)
+            self._writer.submit(self._writer.take, batch, self._preroll_ns, marks)
 
     def begin(self, session: Session, topics: dict[str, str]) -> None:
         """Open the journal of the leg that the session has just started."""
@@ -120,7 +120,7 @@ class Journal:
             return
         self._hand_over()       # earlier messages are pre-roll
         now_ns = self._clock.now().nanoseconds
-        self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
+        self._leg_id, self._is_complete, self._last_event = session.leg_id, False, ''
         self._writer.submit(self._writer.begin, JournalPlan(
             session.leg_id, output_root(config, self._node) / 'journal',
             f'{iso(now_ns).replace(":", "-")}_leg_{session.leg_id}',
@@ -130,9 +130,9 @@ class Journal:
     def store_status(self, session: Session, array: DiagnosticArray) -> None:
         """Store a published status, by which a replay finds the marks of the leg."""
         leg_id, event = session.leg_id, session.event
-        dropped = event in DROPPED_EVENTS and leg_id not in self._dropped
+        dropped = event in DROPPED_EVENTS and leg_id not in self._dropped_legs
         if event in DROPPED_EVENTS:
-            self._dropped.add(leg_id)
+            self._dropped_legs.add(leg_id)
         if leg_id != self._leg_id and not dropped:
             return
         marks = self._marks if leg_id == self._leg_id else None
@@ -149,9 +149,9 @@ class Journal:
 
     def end(self) -> None:
         """Note that the leg's samples are complete: later ones belong to no leg."""
-        if self._leg_id and not self._ended:
+        if self._leg_id and not self._is_complete:
             self._hand_over()
-            self._ended = True
+            self._is_complete = True
             self._writer.submit(self._writer.end)
 
     def restart(self) -> None:
@@ -172,7 +172,7 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
     about = {'software': f'odocal_ros {__version__}', 'node': node, 'leg_id': leg_id,
              'leg_start_ns': start_ns}
     about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
-    return HEAD + parameter_block(flat(config)) + parameter_block(about, 'odocal_journal')
+    return FILE_HEAD + parameter_block(flat(config)) + parameter_block(about, 'odocal_journal')
 
 
 def replay_command(folder: str, start_ns: int = 0) -> str:

@@ -20,8 +20,8 @@ from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
 JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
 FOLDER_NEW_S = 10.0       # judgement: a node may still be about to write into a younger folder
-WAITING_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
-HEADS_BYTES = 2**20            # judgement: for metadata and file heads
+UNWRITTEN_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
+METADATA_BYTES = 2**20            # judgement: for metadata and file heads
 
 
 def journal_folders(root: Path) -> list[Path]:
@@ -107,7 +107,7 @@ class LegJournal:
     """
     Writes the journal of one leg; ``error`` is the cause while writing fails, else empty.
 
-    Chunks that cannot be written wait in memory for the next attempt. Above WAITING_BYTES the
+    Chunks that cannot be written stay in memory for the next attempt. Above UNWRITTEN_BYTES the
     journal ends with the data written so far, and the error stays.
     """
 
@@ -116,64 +116,64 @@ class LegJournal:
         self.plan = plan
         self.error = ''
         self._channels = channels
-        self._waiting = chunks        # the pre-roll is written with the start mark, not before
+        self._unwritten = chunks      # the pre-roll is written with the start mark, not before
         self._bag: SegmentedBag | None = None
         self._lock: TextIO | None = None
         self._other_bytes = 0              # bytes of the other journals
         self._is_closed = False       # given up, or finished
-        self.late: list[PackedChunk] = []  # marks that came after the end, not written yet
+        self.late_marks: list[PackedChunk] = []      # after the end, not written yet
 
     @property
     def folder(self) -> str:
         return str(self._bag.folder) if self._bag else ''
 
     def put(self, chunks: list[PackedChunk]) -> None:
-        """Write chunks, after the waiting ones."""
+        """Write chunks, after those that are not written yet."""
         if self._is_closed:
             return
-        self._waiting += chunks
-        if self._waiting:
+        self._unwritten += chunks
+        if self._unwritten:
             self._attempt(self._write)
         if self.error and not self._is_closed and sum(
-                chunk.size for chunk in self._waiting) > WAITING_BYTES:
+                chunk.size for chunk in self._unwritten) > UNWRITTEN_BYTES:
             self._give_up(f'{self.error}; no further attempt in this leg')
 
     def finish(self) -> None:
         """Join the files to one complete bag."""
         if not self._is_closed:
             self.put([])
-            if self._bag is not None and not self._waiting:
+            if self._bag is not None and not self._unwritten:
                 self._attempt(self._finish)
             elif self._bag is not None and not self._bag.segments:     # nothing was written
                 shutil.rmtree(self._bag.folder, ignore_errors=True)
                 self._bag = None
-        self._is_closed, self._waiting = True, []
+        self._is_closed, self._unwritten = True, []
         if self._lock is not None:
             self._lock.close()
 
     def add(self, chunks: list[PackedChunk]) -> None:
         """Add a mark to the finished journal."""
-        self.late += chunks
+        self.late_marks += chunks
         self.retry()
 
     def retry(self) -> None:
         """Write the marks that are not written yet."""
         bag = self._bag
         if bag is None or not bag.segments or not bag.folder.exists():
-            self.late = []         # there is nothing to replay
-        elif self.late:
+            self.late_marks = []         # there is nothing to replay
+        elif self.late_marks:
             self._attempt(self._add_late)
 
     def _add_late(self) -> None:
         assert self._bag is not None
-        self._bag.add(self.late)
-        self.late, self.error = [], ''
+        self._bag.add(self.late_marks)
+        self.late_marks, self.error = [], ''
 
     def _write(self) -> None:
         if self._bag is None:
             self._bag = self._open()
         # joining files, this one included, temporarily needs their size twice
-        size = 2 * sum(chunk.size for chunk in self._waiting) + HEADS_BYTES
+        size = 2 * sum(chunk.size for chunk in self._unwritten) + METADATA_BYTES
         size += self._bag.unjoined_size
         if self._other_bytes + self._bag.size + size > self.plan.limit:
             used_bytes = make_room(self.plan.root, self.plan.limit, size)
@@ -182,8 +182,8 @@ class LegJournal:
                 self._give_up(f'{self.plan.root}: the journals reach their limit of '
                               f'{self.plan.limit} bytes; raise journal.max_bytes')
                 return
-        self._bag.append(self._waiting)
-        self._waiting = []
+        self._bag.append(self._unwritten)
+        self._unwritten = []
         self._bag.join_some()
 
     def _open(self) -> SegmentedBag:
@@ -204,11 +204,11 @@ class LegJournal:
 
     def _finish(self) -> None:
         assert self._bag is not None
-        used_bytes = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
-        self._bag.finish(free_bytes=self.plan.limit - used_bytes - HEADS_BYTES)
+        used_bytes = make_room(self.plan.root, self.plan.limit, self._bag.size + METADATA_BYTES)
+        self._bag.finish(free_bytes=self.plan.limit - used_bytes - METADATA_BYTES)
 
     def _give_up(self, error: str) -> None:
-        self.error, self._is_closed, self._waiting = error, True, []
+        self.error, self._is_closed, self._unwritten = error, True, []
 
     def _attempt(self, write: Callable[[], object]) -> None:
         try:

@@ -21,6 +21,7 @@ from odocal_ros.live.messages import definition_of
 
 ALWAYS_NS = 1      # definition: stamp of static messages, which every journal contains
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
+StampedChunks = deque[tuple[int, PackedChunk]]      # stamp of its last message, ns, and the chunk
 
 
 @dataclass
@@ -36,35 +37,42 @@ class Received:
 
 
 class PreRoll:
-    """The newest chunks of each topic, as far back as a leg may reach, limited in bytes."""
+    """The newest chunks of each topic that a later leg may use, limited in bytes."""
 
     def __init__(self) -> None:
-        self._held: dict[str, deque[tuple[int, PackedChunk]]] = {}
+        self._chunks: dict[str, StampedChunks] = {}
         self.size = 0
 
-    def feed(self, slot: str, newest_ns: int, chunk: PackedChunk, reach_ns: int) -> None:
-        """Keep a chunk by the stamp of its last row; drop those more than ``reach_ns`` older."""
-        held = self._held.setdefault(slot, deque())
-        held.append((newest_ns, chunk))
+    def feed(self, slot: str, newest_ns: int, chunk: PackedChunk, preroll_ns: int) -> None:
+        """Keep a chunk by the stamp of its last row; drop those more than ``preroll_ns`` older."""
+        chunks = self._chunks.setdefault(slot, deque())
+        chunks.append((newest_ns, chunk))
         self.size += chunk.size
         # by the topic's own stamps: a topic on another clock must not grow without limit
-        while held[0][0] < newest_ns - reach_ns:
-            self._drop(held)
+        while chunks[0][0] < newest_ns - preroll_ns:
+            self._drop_oldest(chunks)
         while self.size > PREROLL_BYTES:
-            self._drop(max(self._held.values(), key=lambda h: sum(c.size for _, c in h)))
+            self._drop_oldest(max(self._chunks.values(), key=_size))
 
-    def _drop(self, held: deque[tuple[int, PackedChunk]]) -> None:
-        self.size -= held.popleft()[1].size
+    def _drop_oldest(self, chunks: StampedChunks) -> None:
+        _, chunk = chunks.popleft()
+        self.size -= chunk.size
 
     def chunks(self) -> list[PackedChunk]:
         """Return all chunks in order of time."""
-        return sorted((chunk for held in self._held.values() for _, chunk in held),
+        return sorted((chunk for chunks in self._chunks.values() for _, chunk in chunks),
                       key=lambda chunk: chunk.start_ns)
 
     def clear(self) -> None:
         """Forget all except static messages."""
-        self._held = {slot: held for slot, held in self._held.items() if held[-1][0] == ALWAYS_NS}
-        self.size = sum(chunk.size for held in self._held.values() for _, chunk in held)
+        self._chunks = {slot: chunks for slot, chunks in self._chunks.items()
+                        if chunks[-1][0] == ALWAYS_NS}
+        self.size = sum(map(_size, self._chunks.values()))
+
+
+def _size(chunks: StampedChunks) -> int:
+    """Return the size of chunks, bytes."""
+    return sum(chunk.size for _, chunk in chunks)
 
 
 class JournalWriter:
@@ -82,7 +90,7 @@ class JournalWriter:
         self._preroll = PreRoll()
         self._leg: LegJournal | None = None
         self._is_recording = False                    # samples of that leg continue
-        self._closed: dict[int, LegJournal] = {}      # finished journals, by leg
+        self._closed_legs: dict[int, LegJournal] = {}      # finished journals, by leg
         self._jobs: queue.SimpleQueue[tuple[Callable[..., None], Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_journal', daemon=True)
         self._thread.start()
@@ -115,15 +123,15 @@ class JournalWriter:
 
     # jobs
 
-    def take(self, batch: dict[str, Received], reach_ns: int, marks: Received | None) -> None:
+    def take(self, batch: dict[str, Received], preroll_ns: int, marks: Received | None) -> None:
         """Pack a batch, keep it as pre-roll of later legs, and write it to the open leg."""
         chunks = []
         for slot, received in batch.items():
             chunk = self._packed(received)
             chunks.append(chunk)
-            self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, reach_ns)
-        for leg in self._closed.values():     # a mark that drops a leg must reach its journal
-            if leg.late:
+            self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, preroll_ns)
+        for leg in self._closed_legs.values():     # a mark that drops a leg must reach its journal
+            if leg.late_marks:
                 leg.retry()
                 self.error = leg.error
         if self._leg is not None:
@@ -145,8 +153,8 @@ class JournalWriter:
 
     def add(self, leg_id: int, marks: Received) -> None:
         """Add a mark to the journal of a leg that is closed."""
-        if leg_id in self._closed:
-            leg = self._closed[leg_id]
+        if leg_id in self._closed_legs:
+            leg = self._closed_legs[leg_id]
             leg.add([self._packed(marks)])
             self.error = leg.error
 
@@ -156,7 +164,7 @@ class JournalWriter:
         if leg is not None:
             leg.finish()
             self._show()
-            self._closed[leg.plan.leg_id] = leg
+            self._closed_legs[leg.plan.leg_id] = leg
             self._leg = None
 
     def _packed(self, received: Received) -> PackedChunk:

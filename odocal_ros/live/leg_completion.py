@@ -55,14 +55,14 @@ class LegCompletion:
         self._worker = worker.Worker()
         self._running_estimate = RunningEstimate(self._worker, self._log)
         self._node_name = node.get_fully_qualified_name()
-        self._computing = worker.Computing(self._worker, self._fail, self.show_status,
+        self._active_job = worker.ActiveJob(self._worker, self._fail, self.show_status,
                                            node.context.ok)
         self._observability: Observability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
         self._snapshot: LegRecorder | None = None  # samples of the stopped leg, kept for a retry
         self._view_at_stop: SessionView | None = None     # of the stopped leg
         self._distance_m = 0.0                # of the leg that changed last
-        self._imu_silent = False              # in the recorded leg
+        self._is_imu_silent = False              # in the recorded leg
         self._console = Console(self._log)
         self._saver = ResultSaver(self._worker, self._log, self.show_status, self._node_name)
 
@@ -81,7 +81,7 @@ class LegCompletion:
         self._stop_when_too_long()
         self._close_when_complete()
         if self._view_at_stop is not None and self.session.state is State.COMPUTING:
-            self._computing.answer_late(partial(answers.provisional_answer, self._view_at_stop))
+            self._active_job.answer_late(partial(answers.provisional_answer, self._view_at_stop))
         if self.session.state is State.RECORDING:
             self._running_estimate.update(self._recording.newest_ns,
                                           self._recording.progress.distance_m())
@@ -90,8 +90,9 @@ class LegCompletion:
 
     def _report_silence(self) -> None:
         """Publish the status immediately when the IMU falls silent or returns."""
-        before, self._imu_silent = self._imu_silent, self._recording.imu_silent_s() > SILENT_TIME
-        if self._imu_silent is not before:
+        is_silent = self._recording.imu_silent_s() > SILENT_TIME
+        if is_silent is not self._is_imu_silent:
+            self._is_imu_silent = is_silent
             self.show_status()
 
     def decode_new_messages(self) -> None:
@@ -147,7 +148,7 @@ class LegCompletion:
             forecast = self._view_at_stop.forecast
         config = session.config if session.is_busy else self._config()
         return SessionView(
-            session, config, missing=inputs.missing(config),
+            session, config, missing=inputs.missing_reasons(config),
             duplicate_publishers=inputs.duplicate_publishers(),
             lost_messages=inputs.lost(), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self._publishing.results(),
@@ -158,7 +159,7 @@ class LegCompletion:
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            stage=self._computing.stage, saved=self._saver.saved, lost_leg=self._lost_leg_text(),
+            stage=self._active_job.stage, saved=self._saver.saved, lost_leg=self._lost_leg_text(),
             save_error=self._saver.error, journal=self._journal.folder,
             journal_error=self._journal.error, has_received=recording.has_received(),
             is_local=recording.is_local, has_imu=not inputs.without_imu)
@@ -184,7 +185,7 @@ class LegCompletion:
 
     def _start_refusal(self) -> str:
         """Return the reason why no leg can start, as text; empty if one can."""
-        missing = self._recording.inputs.missing(self._config())
+        missing = self._recording.inputs.missing_reasons(self._config())
         clocks = self._recording.progress.clocks.differing(self._config())
         return '; '.join(missing) or (clock_difference_text(clocks) if clocks else '')
 
@@ -233,10 +234,10 @@ class LegCompletion:
 
     def _compute(self, samples: LegRecorder) -> None:
         session = self.session
-        kept = [leg.results for leg in session.legs]
-        self._computing.submit(partial(
-            worker.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
-            session.carried, session.is_automatic, self._computing.report),
+        kept_results = [leg.results for leg in session.legs]
+        self._active_job.submit(partial(
+            worker.compute, samples, session.start_ns, session.stop_ns, kept_results,
+            session.config, session.carried, session.is_automatic, self._active_job.report),
             self._handle_leg_result)
 
     def _fail(self, error: str) -> None:
@@ -246,22 +247,22 @@ class LegCompletion:
         self._log.error(f'leg {self.session.leg_id} failed: {error}')
         remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
                   'it') if self.session.has_open_leg else 'call ~/reset'
-        self._computing.answer(False, f'failed: {error}; {remedy}')
+        self._active_job.answer(False, f'failed: {error}; {remedy}')
 
-    def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
+    def _handle_leg_result(self, leg: worker.ComputedLeg | worker.UnusedLeg) -> None:
         leg_id, self._snapshot, self._view_at_stop = self.session.leg_id, None, None
-        self._distance_m = sum(one.distance for one in done.results)
-        if isinstance(done, worker.UnusedLeg):
-            self.session.drop_unusable(done.reason)
-            text = f'leg {leg_id}, {self._distance_m:.0f} m, is not used: {done.reason}'
+        self._distance_m = sum(result.distance for result in leg.results)
+        if isinstance(leg, worker.UnusedLeg):
+            self.session.drop_unusable(leg.reason)
+            text = f'leg {leg_id}, {self._distance_m:.0f} m, is not used: {leg.reason}'
             self._log.info(text)
-            self._computing.answer(False, text)
+            self._active_job.answer(False, text)
             return
-        self.session.finish(done.results, done.calibration)
-        self.session.set_carried(done.carried, done.released)
-        success, text = self._publish_result(done.calibration, done.paths, done.results)
+        self.session.finish(leg.results, leg.calibration)
+        self.session.set_carried(leg.carried, leg.released)
+        success, text = self._publish_result(leg.calibration, leg.paths, leg.results)
         if success and self._config().output.autosave:
-            self._save(done.calibration)
+            self._save(leg.calibration)
 
     def _publish_result(self, calibration: Calibration, paths: worker.Paths,
                         parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
@@ -272,7 +273,7 @@ class LegCompletion:
                                               quantities_text(answers.quantities_ok(view)),
                                               answers.advice_after_result(view))
         self._log.info(text)
-        self._computing.answer(success, text)
+        self._active_job.answer(success, text)
         return success, text
 
     def _lost_leg_text(self) -> str:
@@ -287,10 +288,10 @@ class LegCompletion:
         self.session.cancel(drop_cause)
         self._running_estimate.end()
         self._close_by_ns = self._snapshot = self._view_at_stop = None
-        self._computing.drop()
+        self._active_job.drop()
         self.show_status()
         self._journal.end()
-        self._computing.answer(False, text or self._lost_leg_text())
+        self._active_job.answer(False, text or self._lost_leg_text())
 
     def _save(self, calibration: Calibration, by_operator: bool = False) -> Future:
         inputs = self._recording.inputs

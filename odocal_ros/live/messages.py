@@ -31,7 +31,7 @@ MSG_NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': '
 # definition: of latched topics, publisher and subscriber
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# type of a field in the classes of rclpy: sequence<base<bound>, longest>, or base<bound>[count]
+# type of a field in the classes of rclpy: sequence<base<bound>, max_length>, or base<bound>[count]
 FIELD_TYPE = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
 Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
 
@@ -59,20 +59,20 @@ def definition_of(kind: type) -> str:
     Constants and defaults are missing: the classes have none, and no message depends on them.
     """
     texts: dict[str, str] = {}
-    _collect(kind, '', texts)
+    _collect_texts(kind, '', texts)
     first, *others = texts.items()
     return first[1] + ''.join(f'{"=" * 80}\nMSG: {name}\n{text}' for name, text in others)
 
 
-def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
-    """Add the texts of a class and of all types that it uses."""
+def _collect_texts(kind: Any, name: str, texts: dict[str, str]) -> None:
+    """Add the text of a class, by its name, and those of all types that it uses."""
     fields = {field: _msg_types(rclpy_type)
               for field, rclpy_type in kind.get_fields_and_field_types().items()}
     texts[name] = ''.join(f'{msg_type} {field}\n' for field, (_, msg_type) in fields.items())
     for base, _ in fields.values():
         if '/' in base and base not in texts:
             package, _, leaf = base.rpartition('/')
-            _collect(getattr(importlib.import_module(f'{package}.msg'), leaf), base, texts)
+            _collect_texts(getattr(importlib.import_module(f'{package}.msg'), leaf), base, texts)
 
 
 def _msg_types(rclpy_type: str) -> tuple[str, str]:
@@ -80,11 +80,11 @@ def _msg_types(rclpy_type: str) -> tuple[str, str]:
     match = FIELD_TYPE.fullmatch(rclpy_type)
     if match is None:
         raise ValueError(f'a field of type {rclpy_type}')
-    sequence, base, bound, longest, _, count = match.groups()
+    sequence, base, bound, max_length, _, count = match.groups()
     base = MSG_NAMES.get(base, base)
     text = base + (f'<={bound[1:-1]}' if bound else '')
     if sequence:
-        return base, f'{text}[<={longest}]' if longest else f'{text}[]'
+        return base, f'{text}[<={max_length}]' if max_length else f'{text}[]'
     return base, text + (count or '')
 
 
@@ -100,9 +100,9 @@ class Gate(MutuallyExclusiveCallbackGroup):
             super().can_execute(entity))  # type: ignore[no-untyped-call]
 
 
-class WaitingMessages:
+class MessageQueue:
     """
-    The messages of one topic that were not taken yet, in order of arrival.
+    The messages of one topic since the last ``take``, in order of arrival.
 
     In simulated time the node's clock gives the send time, so that the executor takes messages.
     """

@@ -121,7 +121,7 @@ class OdometryNode(CheckedNode):
             next_check_s = time.monotonic() + CHECK_PERIOD_S
             self._run_cycle()
             until = max(next_check_s, min(self._due_ns * 1e-9, next_executor_s))
-            if any(source.waiting.gate.is_open for source in self._inputs.values()):
+            if any(source.queue.gate.is_open for source in self._inputs.values()):
                 while (left := until - time.monotonic()) > 0:      # it takes the messages
                     executor.spin_once(timeout_sec=left)
                 continue
@@ -190,8 +190,9 @@ class OdometryNode(CheckedNode):
             source.update_publishers()
             if not source.is_flowing():
                 source.find_type(self.config)
-        for text in self._topics.new_texts({source.topic: source.health.lost for source in inputs},
-                                           [source.duplicate_publishers() for source in inputs]):
+        for text in self._topics.new_texts(
+                {source.topic: source.health.lost_count for source in inputs},
+                [source.duplicate_publishers() for source in inputs]):
             self.get_logger().warning(text)
         missing = list(filter(None, (source.missing_reason() for source in inputs)))
         clock_difference_s = self._odometry.clock_difference_s()

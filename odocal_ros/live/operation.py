@@ -115,9 +115,9 @@ class AutomaticLegs(LegCompletion):
         super()._restart_after_jump()
         self._search = LegSearch(self._config()) if self._search_settings else None
 
-    def _handle_leg_result(self, done: worker.Computed | worker.UnusedLeg) -> None:
-        super()._handle_leg_result(done)
-        for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
+    def _handle_leg_result(self, leg: worker.ComputedLeg | worker.UnusedLeg) -> None:
+        super()._handle_leg_result(leg)
+        for reason in leg.calibration.reasons if isinstance(leg, worker.ComputedLeg) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._logged_changes:
                 self._logged_changes.add(reason.text)
                 self._log.warning(f'{reason}. {reason.remedy}')
@@ -160,7 +160,7 @@ class Operation(AutomaticLegs):
         if session.state is State.RECORDING and still_s < MARK_STILL_S:
             raise Refused(f'the wheels have stood for {still_s:.1f} s, required: '
                           f'{MARK_STILL_S:g} s; stand on the point and call again')
-        delay_s = self._recording.inputs.leading.health.delay_s
+        delay_s = self._recording.inputs.leading_input.health.delay_s
         mark = session.mark(newest_ns - round(HALF_MARK * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
         self.show_status()
@@ -180,7 +180,7 @@ class Operation(AutomaticLegs):
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             return self._last_result()
-        return self._computing.create_future(worker.STOP_ANSWER_S)
+        return self._active_job.create_future(worker.STOP_ANSWER_S)
 
     def _last_result(self) -> tuple[bool, str]:
         session, view = self.session, self.view()
@@ -212,8 +212,8 @@ class Operation(AutomaticLegs):
         if not remaining:
             self._publishing.set_results(None)
             self._publishing.show_paths(worker.leg_paths(None, self._config()))
-            self._computing.drop()      # an earlier undo may still be computed
-            self._computing.answer(True, f'{text}; no leg is left')
+            self._active_job.drop()      # an earlier undo may still be computed
+            self._active_job.answer(True, f'{text}; no leg is left')
             self.show_status()
             return True, f'{text}; no leg is left'
 
@@ -221,9 +221,9 @@ class Operation(AutomaticLegs):
             self.session.settle(outcome[0])
             self._publish_result(*outcome)
 
-        self._computing.submit(
+        self._active_job.submit(
             partial(worker.recombine, remaining, self._config(), self.session.carried), handle)
-        return self._computing.create_future()
+        return self._active_job.create_future()
 
     def reset(self) -> tuple[bool, str]:
         if self.session.state is State.FAILED and self.session.has_open_leg:

@@ -204,16 +204,16 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
         message = missing_reason
     elif health.fix_status is not None and health.fix_status < 0:
         status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
-    elif health.unusable:
+    elif health.unreadable_count:
         status = DiagnosticStatus.WARN
-        message = f'{rate:.1f} Hz, {health.unusable} messages unreadable'
+        message = f'{rate:.1f} Hz, {health.unreadable_count} messages unreadable'
     else:
         status, message = DiagnosticStatus.OK, f'{rate:.1f} Hz'
     # the first two have the names of diagnostic_updater, which monitors search for
     values = {'Events since startup': health.count, 'Actual frequency (Hz)': rate,
               'rate_hz': rate, 'age_s': silent if math.isfinite(silent) else -1.0,
-              'messages': health.count, 'gaps': health.gaps, 'dropped': health.lost,
-              'unreadable': health.unusable, 'stamp_delay_s': health.delay_s}
+              'messages': health.count, 'gaps': health.gaps, 'dropped': health.lost_count,
+              'unreadable': health.unreadable_count, 'stamp_delay_s': health.delay_s}
     if health.fix_status is not None:
         values['fix_status'] = health.fix_status
     return DiagnosticStatus(

@@ -78,13 +78,13 @@ class Inputs:
         return not (self._needs_imu or imu.publishers or imu.health.last_arrival_ns)
 
     @property
-    def leading(self) -> Input:
+    def leading_input(self) -> Input:
         """Return the topic whose stamps set the marks: the IMU, or else the odometer."""
         imu = self.by_slot['imu']
         is_leading = self._needs_imu or imu.newest_ns
         return imu if is_leading else self.by_slot['odometer']
 
-    def missing(self, config: Config) -> list[str]:
+    def missing_reasons(self, config: Config) -> list[str]:
         """Return the causes that prevent a leg, one line per missing topic."""
         return [source.missing_reason() for source in self.required(config)
                 if not source.is_flowing()]
@@ -92,11 +92,11 @@ class Inputs:
     def begin_leg(self) -> None:
         """Start a new count of lost messages."""
         for source in self.by_slot.values():
-            source.health.lost_before = source.health.lost
+            source.health.lost_before_leg = source.health.lost_count
 
     def lost(self) -> dict[str, int]:
         """Return topic -> messages lost since the last leg began, or since the start."""
-        return {source.topic: source.health.lost - source.health.lost_before
+        return {source.topic: source.health.lost_count - source.health.lost_before_leg
                 for source in self.by_slot.values()}
 
     def duplicate_publishers(self) -> list[str]:
@@ -146,13 +146,13 @@ class Recording:
         self._store_messages = store_messages
         self.block_listener: Callable[[str, Samples], None] | None = None
         self._clock = node.get_clock()
-        self.progress = self._no_progress()
+        self.progress = self._new_progress()
         self._clock_jumped = False
         self._jumps = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(seconds=-CLOCK_BACK_S)),
             post_callback=self._note_jump)
 
-    def _no_progress(self) -> Progress:
+    def _new_progress(self) -> Progress:
         return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def decode_new_messages(self, config: Config, known_scale: float) -> None:
@@ -220,7 +220,7 @@ class Recording:
     @property
     def newest_ns(self) -> int:
         """Return the newest stamp of the leading topic, by which marks are set; 0 without one."""
-        return self.inputs.leading.newest_ns
+        return self.inputs.leading_input.newest_ns
 
     def has_passed(self, mark_ns: int) -> bool:
         """Return True if every topic with messages has passed a mark."""
@@ -237,13 +237,13 @@ class Recording:
 
     @property
     def has_time_jumped(self) -> bool:
-        return self._clock_jumped or self.inputs.leading.health.jumped_back
+        return self._clock_jumped or self.inputs.leading_input.health.jumped_back
 
     def restart(self) -> None:
         """Drop all samples, after a jump of time."""
         self._clock_jumped = False
         self.recorder.clear()
-        self.progress = self._no_progress()
+        self.progress = self._new_progress()
         for source in self.inputs.by_slot.values():
             source.take()
             source.health.reset_times()

@@ -90,15 +90,16 @@ class ResultFolders:
             outdated = names[:-kept] if kept else []
             linked = _link_target(root / LATEST)
             kept_names = {newest.name, linked, *(
-                one.previous_target for one in self._written if one.folder.name == linked)}
+                result.previous_target for result in self._written
+                if result.folder.name == linked)}
             for name in reversed(names if outdated else []):
-                found = stored_in(root / name)
-                if found and found.usable:
+                stored = stored_in(root / name)
+                if stored and stored.usable:
                     kept_names.add(name)
                     break
-            for name in (n for n in outdated if n not in kept_names):
-                found = stored_in(root / name)
-                if found and found.config.get('leg.automatic'):
+            for name in (name for name in outdated if name not in kept_names):
+                stored = stored_in(root / name)
+                if stored and stored.config.get('leg.automatic'):
                     shutil.rmtree(root / name, ignore_errors=True)
 
     def withdraw(self, since_ns: int) -> Path | None:

@@ -67,14 +67,14 @@ class RunningEstimate:
 
     def end(self) -> None:
         self._forget()
-        self._thinned: ThinnedLeg | None = None
-        self._gaps: leg_so_far.ImuGaps | None = None
-        self._earlier: Forecast | None = None    # best of the earlier sections
+        self._thinned_leg: ThinnedLeg | None = None
+        self._imu_gaps: leg_so_far.ImuGaps | None = None
+        self._earlier_forecast: Forecast | None = None    # best of the earlier sections
 
     def _forget(self) -> None:
         """Stop a running update, and discard its data."""
         self._stop_event.set()
-        self._current: Forecast | None = None     # of the current section
+        self._section_forecast: Forecast | None = None     # of the current section
         self._pre_roll: LegRecorder | None = None
         self._faults: tuple[Reason, ...] = ()
         self._new_blocks: list[Block] = []
@@ -86,26 +86,28 @@ class RunningEstimate:
         self.end()
         self._config, self._pre_roll = config, recorder
         self._start_section(start_ns, recorder.form)
-        self._gaps = leg_so_far.ImuGaps(start_ns, config.leg.max_gap)
-        self._gaps.feed(recorder.rows('imu'))      # leg.automatic sets marks in the past
+        self._imu_gaps = leg_so_far.ImuGaps(start_ns, config.leg.max_gap)
+        self._imu_gaps.feed(recorder.rows('imu'))      # leg.automatic sets marks in the past
 
     @property
     def forecast(self) -> Forecast | None:
-        return combine_sections(self._earlier, self._current)
+        return combine_sections(self._earlier_forecast, self._section_forecast)
 
     def _start_section(self, start_ns: int, form: OdometerForm) -> None:
         self._stop_event, self._start_ns = threading.Event(), start_ns
-        self._thinned, self._smoother = ThinnedLeg(form), leg_so_far.SmootherSoFar()
+        self._thinned_leg, self._smoother = ThinnedLeg(form), leg_so_far.SmootherSoFar()
         self._due_ns = start_ns + UPDATE_PERIOD_NS
 
     def feed(self, slot: str, block: Any) -> None:
         """Store the rows of a received block that have a plausible stamp."""
-        if self._thinned is None:
+        if self._thinned_leg is None:
             return
-        if slot == 'imu' and self._gaps is not None and (resumed_ns := self._gaps.feed(block)):
-            self._earlier = self.forecast
+        # of the first sample after a gap
+        resumed_ns = self._imu_gaps.feed(block) if slot == 'imu' and self._imu_gaps else 0
+        if resumed_ns:
+            self._earlier_forecast = self.forecast
             self._forget()
-            self._start_section(resumed_ns, self._thinned.form)
+            self._start_section(resumed_ns, self._thinned_leg.form)
             block = take(block, block.stamp_ns >= resumed_ns)
         self._new_blocks.append((slot, block))
 
@@ -115,24 +117,25 @@ class RunningEstimate:
 
         silent_s : time from the last IMU message to the newest of all, s.
         """
-        if self._gaps is None:
+        if self._imu_gaps is None:
             return ()
         cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there; values are those of the '
-                      'better section') for r in self._gaps.reasons(silent_s)]
-        reasons = (*cut, *self._faults, *(self._current.faults if self._current else ()))
+                      'better section') for r in self._imu_gaps.reasons(silent_s)]
+        forecast = self._section_forecast
+        reasons = (*cut, *self._faults, *(forecast.faults if forecast else ()))
         by_code = {r.code: r for r in reversed(reasons)}
         return tuple(most_severe_first(by_code.values()))
 
     def update(self, newest_ns: int, distance_m: float = 0.0) -> None:
         """Submit an update of the leg to a stamp, with its length, m, to the worker if due."""
-        if (self._thinned is None or self._is_updating or newest_ns < self._due_ns
+        if (self._thinned_leg is None or self._is_updating or newest_ns < self._due_ns
                 or time.monotonic() < self._pause_until):
             return
         self._due_ns, self._is_updating = newest_ns + UPDATE_PERIOD_NS, True
         pre_roll, self._pre_roll = self._pre_roll, None
         new_blocks, self._new_blocks = self._new_blocks, []
         self._worker.submit(
-            partial(_compute_update, self._thinned, pre_roll, new_blocks, self._start_ns,
+            partial(_compute_update, self._thinned_leg, pre_roll, new_blocks, self._start_ns,
                     self._config, self._stop_event, self._smoother),
             partial(self._receive_update, self._stop_event, distance_m))
 
@@ -143,7 +146,8 @@ class RunningEstimate:
         self._is_updating = False
         result = result or UpdateResult(error=error)
         self._faults = result.faults
-        self._current = result.forecast and replace(result.forecast, distance_m=distance_m)
+        self._section_forecast = result.forecast and replace(
+            result.forecast, distance_m=distance_m)
         if self._is_loaded:
             self._pause_until = time.monotonic() + result.cpu_time_s / UPDATE_CPU_SHARE
         self._is_loaded = True       # the first update loads pre-roll and modules: no pause

@@ -27,7 +27,7 @@ from odocal_ros.data.samples import FixSamples, Reading
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.health import Health
 from odocal_ros.live.journal_writer import ALWAYS_NS
-from odocal_ros.live.messages import message_class, WaitingMessages
+from odocal_ros.live.messages import message_class, MessageQueue
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.message_fields import Pairs, TRANSFORMS
 from odocal_ros.messages.odometer_types import TYPES
@@ -59,15 +59,15 @@ class StaticTransforms:
         self.topic = moving_topic + STATIC
         self._reader = reader
         self._deserialize = partial(deserialize_message, message_type=kind)
-        self._waiting = WaitingMessages(node)
-        self._waiting.subscribe(kind, self.topic, QoSProfile(
+        self._queue = MessageQueue(node)
+        self._queue.subscribe(kind, self.topic, QoSProfile(
             history=HistoryPolicy.KEEP_LAST, depth=STATIC_DEPTH,
             reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages since the last call, and their send times, ns."""
-        self._waiting.follow_clock()
-        return self._waiting.take()[:2]
+        self._queue.follow_clock()
+        return self._queue.take()[:2]
 
     def decode(self, raws: list[bytes], sent_ns: list[int]) -> Pairs:
         """Return the positions that could not be computed without these transforms."""
@@ -99,7 +99,7 @@ class Input:
         self._configured_frame = ''     # imu.frame_id at the subscription
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
-        self.waiting = WaitingMessages(node)
+        self.queue = MessageQueue(node)
         self.static: StaticTransforms | None = None     # second topic of a TF reference
 
     def check(self, config: Config) -> None:
@@ -110,7 +110,7 @@ class Input:
 
     def update_publishers(self) -> None:
         """Update clock and publishers, and without any the suggested topics."""
-        self.waiting.follow_clock()
+        self.queue.follow_clock()
         self._update_health()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.suggestions = [] if self.publishers else self._suggested_topics()
@@ -177,7 +177,7 @@ class Input:
             history=HistoryPolicy.KEEP_LAST, depth=INPUTS[self.slot].queue,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
         self._deserialize = partial(deserialize_message, message_type=kind)
-        self.waiting.subscribe(kind, self.name, qos)
+        self.queue.subscribe(kind, self.name, qos)
         self.reader, self.msgtype, self.error = reader, msgtype, ''
         if isinstance(reader, TransformReader):
             self.static = StaticTransforms(self._node, self.topic, kind, reader.static)
@@ -192,7 +192,7 @@ class Input:
 
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages since the last call, and their send times, ns."""
-        raws, sent_ns, numbers = self.waiting.take()
+        raws, sent_ns, numbers = self.queue.take()
         if raws:
             self.health.register_arrival(numbers, time.monotonic_ns())
         return raws, sent_ns
@@ -245,7 +245,7 @@ class Input:
             self._failed += len(raws)
             self.error = f'{self.topic}: {error_text(error)}'
             pairs = []
-        self.health.unusable = self._failed + reader.unreadable
+        self.health.unreadable_count = self._failed + reader.unreadable
         if not pairs and reader.error:
             self.error = f'{self.topic}: {reader.error}'
         return pairs
@@ -265,7 +265,7 @@ class Input:
         silent = self.health.silent_s(time.monotonic_ns())
         if self.error:
             return self.error
-        if self.health.stampless:
+        if self.health.has_no_stamps:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
             names = ' or '.join(self.suggestions)

@@ -53,7 +53,7 @@ STOP_ANSWER_S = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Computed:
+class ComputedLeg:
     """
     Result of a leg.
 
@@ -78,13 +78,13 @@ class UnusedLeg:
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
-            kept: list[tuple[LegResult, ...]], config: Config,
+            kept_results: list[tuple[LegResult, ...]], config: Config,
             carried: CarriedInformation | None = None, is_automatic: bool = False,
-            progress: Callable[[Stage], None] | None = None) -> Computed | UnusedLeg:
+            progress: Callable[[Stage], None] | None = None) -> ComputedLeg | UnusedLeg:
     """
     Return a leg's result, its combination with the kept legs, and the paths to publish.
 
-    start_ns, stop_ns : stamps of the marks.   kept : results of each kept leg.   carried :
+    start_ns, stop_ns : stamps of the marks.   kept_results : of each kept leg.   carried :
     information of earlier legs.   progress : called with each stage of the computation.
     """
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
@@ -92,15 +92,15 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     if is_automatic and (reason := rejecting_reason(results[0])):
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
-    released = max(0, len(kept) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
-    oldest = [result for leg in kept[:released] for result in leg]
-    new_carried = add_to_carried(oldest, config, carried)
+    released = max(0, len(kept_results) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
+    new_carried = add_to_carried(
+        [result for leg in kept_results[:released] for result in leg], config, carried)
     # results of the two-point method cannot be added to ``carried``: all legs are kept
     if new_carried is carried and not is_automatic:
         released = 0
-    current = [result for leg in kept[released:] for result in leg]
-    calibration = combine([*current, *results], config, new_carried, known_imu(config))
-    return Computed(results, paths, calibration, new_carried, released)
+    all_results = [*(result for leg in kept_results[released:] for result in leg), *results]
+    calibration = combine(all_results, config, new_carried, known_imu(config))
+    return ComputedLeg(results, paths, calibration, new_carried, released)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,
@@ -140,7 +140,8 @@ class Worker:
 
     def __init__(self) -> None:
         self._jobs: queue.Queue[tuple[Job, OnDone] | None] = queue.Queue()
-        self._done: queue.SimpleQueue[tuple[OnDone, Any, Exception | None]] = queue.SimpleQueue()
+        self._outcomes: queue.SimpleQueue[tuple[OnDone, Any, Exception | None]] = (
+            queue.SimpleQueue())
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
@@ -154,8 +155,8 @@ class Worker:
 
     def poll(self) -> None:
         """Deliver the results of finished jobs."""
-        while not self._done.empty():
-            on_done, result, error = self._done.get()
+        while not self._outcomes.empty():
+            on_done, result, error = self._outcomes.get()
             on_done(result, error)
 
     def close(self, grace_s: float = JOB_GRACE_S) -> bool:
@@ -168,9 +169,9 @@ class Worker:
         while (entry := self._jobs.get()) is not None:
             job, on_done = entry
             try:
-                self._done.put((on_done, job(), None))
+                self._outcomes.put((on_done, job(), None))
             except Exception as error:
-                self._done.put((on_done, None, error))
+                self._outcomes.put((on_done, None, error))
             del entry, job, on_done      # release the job's leg now, not at the next job
             release_memory()
             self._jobs.task_done()
@@ -189,9 +190,9 @@ def release_memory() -> None:
         _libc.malloc_trim(0)
 
 
-class Computing:
+class ActiveJob:
     """
-    At most one active job of the worker, and the callers that wait for its result.
+    The newest job of the worker, unless it is dropped, and the callers that wait for its result.
 
     on_failure : called with the cause if a job raises, or the handling of its result.   on_end :
     called after each job that was not dropped.   is_alive : false during shutdown, when an error
@@ -202,8 +203,9 @@ class Computing:
                  on_end: Callable[[], None], is_alive: Callable[[], bool]) -> None:
         self._worker, self._on_failure = worker, on_failure
         self._on_end, self._is_alive = on_end, is_alive
-        self._active_job: object | None = None
-        self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
+        self._token: object | None = None       # of the job, None without one
+        # the future of each, and the monotonic time, s, until which it waits
+        self._callers: list[tuple[Future, float]] = []
         self.stage = Stage()
 
     def report(self, stage: Stage) -> None:
@@ -213,13 +215,13 @@ class Computing:
 
     def submit(self, job: Job, handle: Callable[[Any], object]) -> None:
         """Run a job in the worker and hand its result to ``handle``, unless it is dropped."""
-        self._active_job = token = object()
+        self._token = token = object()
         self.stage = Stage()
 
         def on_done(result: Any, error: Exception | None) -> None:
-            if token is not self._active_job:
+            if token is not self._token:
                 return
-            self._active_job = None
+            self._token = None
             try:
                 if error is None:
                     handle(result)
@@ -235,24 +237,24 @@ class Computing:
 
     def drop(self) -> None:
         """Ignore the result of the active job."""
-        self._active_job = None
+        self._token = None
 
     def create_future(self, patience_s: float = math.inf) -> Future:
         """Return a future of (success, text), which ``answer`` or ``answer_late`` completes."""
         future = Future()
-        self._waiting.append((future, time.monotonic() + patience_s))
+        self._callers.append((future, time.monotonic() + patience_s))
         return future
 
     def answer(self, success: bool, text: str) -> None:
         """Answer all waiting callers."""
-        waiting, self._waiting = self._waiting, []
-        for future, _ in waiting:
+        callers, self._callers = self._callers, []
+        for future, _ in callers:
             future.set_result((success, text))
 
     def answer_late(self, text: Callable[[], str]) -> None:
         """Answer the callers that have waited for their ``patience_s``; the job continues."""
         now = time.monotonic()
-        expired = [future for future, until in self._waiting if until <= now]
-        self._waiting = [(future, until) for future, until in self._waiting if until > now]
+        expired = [future for future, until in self._callers if until <= now]
+        self._callers = [(future, until) for future, until in self._callers if until > now]
         for future in expired:
             future.set_result((True, text()))

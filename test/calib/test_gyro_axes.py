@@ -62,7 +62,7 @@ X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])}
 def test_wrong_axis_rejects_the_leg_and_names_the_correction(changes, code, do):
     result = calibrate(with_imu(town(), **changes), settings(town()))
     assert rejecting(result) == {code} == set(reason_texts(result))
-    assert do in next(r.do for r in result.reasons)
+    assert do in next(r.special_remedy for r in result.reasons)
 
 
 @pytest.mark.parametrize('seed', [5, 6])
@@ -120,7 +120,8 @@ def test_third_sensor_identifies_the_wrong_sign(topic, changes, cause):
     leg = replace(town().leg(), **{topic: changed(getattr(town(), topic), **changes)})
     (found,) = (r for r in calibrate(leg, settings(town())).reasons if r.code is Code.GYRO_SIGN)
     assert cause in found.text
-    assert ('Set imu.mounting_rpy' in found.do) == ('f_i' in changes and cause == 'instead of 1)')
+    assert ('Set imu.mounting_rpy' in found.special_remedy) == (
+        'f_i' in changes and cause == 'instead of 1)')
 
 
 def test_mirrored_gyro_is_found_by_accelerations_with_few_fixes():
@@ -154,7 +155,7 @@ def test_axes_are_those_of_the_messages_for_any_mounting():
         reasons = of_gyro(town(), AXES[name], C, **{'imu.mounting_rpy': rpy})
         if Code.GYRO_SIGN in reasons:      # the axis that turns with the course
             continue
-        assert DO[name] in reasons[Code.GYRO_AXES].do, name
+        assert DO[name] in reasons[Code.GYRO_AXES].special_remedy, name
     assert not {Code.GYRO_SIGN, Code.GYRO_AXES} & set(
         of_gyro(town(), SAME, C, **{'imu.mounting_rpy': rpy}))
 

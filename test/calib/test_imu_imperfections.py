@@ -195,10 +195,11 @@ def test_configured_lever_arm_only_is_to_be_measured_again(set_to, found, ratio,
     reason, = remarks._lever_arm_reasons(value, sigma, np.full(len(CONSTANTS), ratio),
                                          with_settings(Config(), {'gnss.lever_arm': set_to}))
     assert f'gnss.lever_arm {text}' in reason.text
-    assert re.search(do, reason.do)
-    assert ('easure' in reason.do) != ('larger' in text)
-    assert ('On z, a body that rolls' in reason.do) == ('easure' in reason.do)
-    assert 'Slip in turns' not in reason.do
+    remedy = reason.special_remedy
+    assert re.search(do, remedy)
+    assert ('easure' in remedy) != ('larger' in text)
+    assert ('On z, a body that rolls' in remedy) == ('easure' in remedy)
+    assert 'Slip in turns' not in remedy
 
 
 @pytest.mark.parametrize(('imu_arm', 'part'), [

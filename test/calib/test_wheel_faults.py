@@ -204,7 +204,7 @@ def test_gyro_without_turns_does_not_determine_the_factors():
     assert result.methods == {}
     reason = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
     assert 'turns by the gyro are only' in reason.text
-    assert 'gyro_scale' not in reason.do
+    assert 'gyro_scale' not in reason.special_remedy
 
 
 def with_gyro_noise(sigma, grade):

@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from odocal_ros.live import answers, worker
-from odocal_ros.live.messages import WaitingMessages
+from odocal_ros.live.messages import MessageQueue
 from odocal_ros.live.node import AWAITED_TICK_S, TICK_S
 from odocal_ros.live.topic_input import Input
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -64,7 +64,7 @@ def test_name_overrides_and_remaps_are_passed_to_the_node(embedded):
 def test_messages_wait_in_the_queue_and_have_the_times_of_their_senders(embedded):
     node, client = embedded
     imu = Input(node, 'imu', ('sensor_msgs/msg/Imu',))
-    waiting = imu.waiting
+    waiting = imu.queue
     assert not waiting.gate.can_execute(imu)   # the executor is not woken for each message
     info = {'received_timestamp': 9, 'publication_sequence_number': 1}
     waiting._receive(b'first', info | {'source_timestamp': 5})
@@ -75,7 +75,7 @@ def test_messages_wait_in_the_queue_and_have_the_times_of_their_senders(embedded
 
 def test_without_take_message_the_executor_delivers_all_messages(embedded):
     node, client = embedded
-    waiting = WaitingMessages(node)
+    waiting = MessageQueue(node)
     waiting.subscribe(String, 'words', QoSProfile(depth=10))
     publisher = client.node.create_publisher(
         String, node.resolve_topic_name('words'), QoSProfile(depth=10))

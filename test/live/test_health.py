@@ -53,8 +53,8 @@ def test_the_rate_follows_from_stamps_and_the_silence_limit_from_the_rate():
 
 
 def test_lost_messages_and_gaps_are_counted_but_not_between_two_publishers():
-    assert health_of(arrived=[[5, 6, 9], [10, 12]]).lost == 3       # 7, 8 and 11
-    assert health_of(arrived=[[5, 900, 6, 901], [1, 2]]).lost == 0
+    assert health_of(arrived=[[5, 6, 9], [10, 12]]).lost_count == 3       # 7, 8 and 11
+    assert health_of(arrived=[[5, 900, 6, 901], [1, 2]]).lost_count == 0
     assert health_of([1.0, 1.01, 1.6], max_gap_s=0.5).gaps == 1
     # 0.54 s exceeds 5 intervals of 0.1 s, 0.45 s does not
     assert health_of(np.arange(1, 2, 0.1), [2.0, 2.45, 2.99]).gaps == 1
@@ -116,11 +116,11 @@ def test_stamps_far_ahead_are_accepted_if_the_next_ones_continue_them():
 
 
 def test_after_a_time_jump_stamps_are_not_reported_as_zero():
-    assert not Health().stampless
-    assert health_of([0.0, 0.0]).stampless
+    assert not Health().has_no_stamps
+    assert health_of([0.0, 0.0]).has_no_stamps
     health = health_of([0.0, 0.0], [5.0, 5.1])
     health.reset_times()
-    assert (health.newest_ns, health.stampless) == (0, False)
+    assert (health.newest_ns, health.has_no_stamps) == (0, False)
 
 
 def travelled(*blocks, form=COUNTER, scale=0.02):

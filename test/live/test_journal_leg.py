@@ -195,7 +195,7 @@ def test_only_the_oldest_unlocked_journals_are_removed(tmp_path):
 
 
 def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
+    monkeypatch.setattr(journal_leg, 'METADATA_BYTES', 10_000)
     limit, taken, write_file = 1_200_000, [], segments.write_file
 
     def watched(*args):
@@ -215,7 +215,7 @@ def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
 
 
 def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
+    monkeypatch.setattr(journal_leg, 'METADATA_BYTES', 10_000)
     folder_of(tmp_path, 'old', 1000, 1)
     one = journal(tmp_path, limit=500_000)
     for k in range(20):
@@ -231,7 +231,7 @@ def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypat
 
 
 def test_unwritten_data_waits_in_memory_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'WAITING_BYTES', 350_000)
+    monkeypatch.setattr(journal_leg, 'UNWRITTEN_BYTES', 350_000)
     one = journal(tmp_path)
     one.put([large(0)])
     with monkeypatch.context() as patch:
@@ -239,7 +239,7 @@ def test_unwritten_data_waits_in_memory_up_to_a_limit(tmp_path, monkeypatch):
         for k in range(1, 6):
             one.put([large(k)])
     assert 'no further attempt in this leg' in one.error
-    assert not one._waiting
+    assert not one._unwritten
     one.put([large(6)])                # an early end is better than a gap
     one.finish()
     with open_bag(one.folder) as bag:

@@ -105,7 +105,7 @@ def test_two_imus_on_one_topic_reject_the_leg_and_the_setting_chooses_one(made, 
     used, other = map(int, re.findall(r"(\d+) (?:messages )?of 'imu_[ab]'",
                                       reasons[Code.SEVERAL_IMUS].text))
     assert used == pytest.approx(other, abs=5)
-    assert "imu.frame_id: 'imu_b'" in reasons[Code.SEVERAL_IMUS].do
+    assert "imu.frame_id: 'imu_b'" in reasons[Code.SEVERAL_IMUS].special_remedy
 
     chosen, reasons = found_reasons(made, mixed(made, 2), tmp_path / 'a',
                                     **{'imu.frame_id': 'imu_a'})

@@ -89,7 +89,7 @@ def test_length_and_turns_agree_with_the_closed_form(pattern, length, left, righ
     assert found == pytest.approx((left, right), abs=0.05)
     assert rows[-1, 1:3] == pytest.approx((route[0].x, route[0].y), abs=0.05)
     still = (rows[:, 4] == 0) & (rows[:, 5] == 0)
-    assert still.sum() * DT >= (sum(p.rests for p in route) - 1) * config.rest - 1e-9
+    assert still.sum() * DT >= (sum(p.stops for p in route) - 1) * config.rest - 1e-9
 
 
 def test_positions_on_arcs_are_located_by_geometry():
@@ -101,7 +101,8 @@ def test_positions_on_arcs_are_located_by_geometry():
             at = piece.heading + piece.curvature * share * piece.length
             x = centre[0] + (radius - left) * math.sin(at)
             y = centre[1] - (radius - left) * math.cos(at)
-            assert piece.located(x, y) == pytest.approx((share * piece.length, left), abs=1e-9)
+            expected = share * piece.length, left
+            assert piece.along_and_left(x, y) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize(('given', 'message'), [
