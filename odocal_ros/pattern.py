@@ -96,11 +96,11 @@ def _lines(points: Sequence[Point]) -> list[Piece]:
 
 
 def _straight(inner: Rectangle) -> list[Piece]:
+    """Return a line back and forth in the middle, along the longer side."""
     x, y, right, high = inner
-    if right - x >= high - y:
-        a, b = (x, (y + high) / 2), (right, (y + high) / 2)
-    else:
-        a, b = ((x + right) / 2, y), ((x + right) / 2, high)
+    middle_x, middle_y = (x + right) / 2, (y + high) / 2
+    a, b = ((x, middle_y), (right, middle_y)) if right - x >= high - y else (
+        (middle_x, y), (middle_x, high))
     return _lines([a, b, a])
 
 
@@ -185,11 +185,7 @@ def has_moved(before: Pose, after: Pose) -> bool:
 
 def stop_cause(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bool,
                driven_s: float, timeout_s: float) -> str:
-    """
-    Return the cause to stop at once, empty without one.
-
-    pose : the newest, and its age.   driven_s : time since the start.
-    """
+    """Return the cause to stop at once, '' without one; driven_s : time since the start."""
     if bumped:
         return 'the bumper is pressed'
     if pose is None or not age_s <= POSE_LOST_S:

@@ -29,17 +29,12 @@ Values = Mapping[str, NDArray[Any] | Callable[[slice], Any]]
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """
-    A topic to be written.
-
-    time_ns : (n,) int64 bag times, in the order to be written.
-    pack    : returns the serialised messages of a slice of rows as a structured array.
-    """
+    """A topic to be written."""
 
     name: str
     msgtype: str
-    time_ns: np.ndarray
-    pack: Callable[[slice], np.ndarray]
+    time_ns: np.ndarray                    # (n,) int64 bag times, in the order to be written
+    pack: Callable[[slice], np.ndarray]    # serialised messages of rows, as a structured array
 
 
 def _message_template(msgtype: str, variable_parts: Mapping[str, Any]

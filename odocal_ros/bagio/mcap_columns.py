@@ -65,7 +65,9 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
         columns = _columns(block, is_known, scan, report_damage)
         if len(channels) < len(known_channels):
             columns = columns.take(is_requested[columns.channel])
-        columns = _in_order(_join(later, columns) if later else columns)
+        columns = _join(later, columns) if later else columns
+        if (columns.time_ns[1:] < columns.time_ns[:-1]).any():
+            columns = columns.take(np.argsort(columns.time_ns, kind='stable'))
         end = int(np.searchsorted(columns.time_ns, index[number].start_ns)) if number < len(
             index) else len(columns.time_ns)
         later = columns.take(slice(end, None)) if end < len(columns.time_ns) else None
@@ -201,13 +203,6 @@ def _join(*parts: Columns) -> Columns:
                     np.concatenate([raws.start + offset
                                     for raws, offset in zip(packed, base, strict=False)]),
                     np.concatenate([raws.size for raws in packed])))
-
-
-def _in_order(columns: Columns) -> Columns:
-    """Return messages in order of time."""
-    if (columns.time_ns[1:] >= columns.time_ns[:-1]).all():
-        return columns
-    return columns.take(np.argsort(columns.time_ns, kind='stable'))
 
 
 def _batch(columns: Columns, channels: Mapping[int, Channel]) -> Batch:

@@ -188,15 +188,12 @@ class McapFile(BagFile):
                                               is_truncated=not is_complete)
                     yield from self._messages_by_scan(chunk, is_truncated=not is_complete)
                 elif op == mcap.MESSAGE:
-                    number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
-                    if number not in self._channels or time_ns >= LATEST_NS:
-                        raise Damaged('a damaged record')
-                    yield time_ns, number, body[mcap.MESSAGE_HEAD.size:]
+                    yield self._entry(body)
                 elif op in (mcap.SCHEMA, mcap.CHANNEL):
                     self._add_definition(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
-                self.damage = self.damage or (
-                    str(error) if isinstance(error, Damaged) else 'a damaged record')
+                self._report_damage(
+                    error if isinstance(error, Damaged) else Damaged('a damaged record'))
 
     def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
@@ -216,24 +213,26 @@ class McapFile(BagFile):
             stop = content + size
             if stop > end:
                 break
-            if op == mcap.MESSAGE:
-                if size < mcap.MESSAGE_HEAD.size:
-                    raise Damaged(mcap.CHUNK_DAMAGED)
-                number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(records, content)
-                if number not in self._channels or time_ns >= LATEST_NS:
-                    raise Damaged(mcap.CHUNK_DAMAGED)
-                messages.append((time_ns, number, records[content + mcap.MESSAGE_HEAD.size:stop]))
-            elif op in (mcap.SCHEMA, mcap.CHANNEL):
-                try:
+            try:
+                if op == mcap.MESSAGE:
+                    messages.append(self._entry(records[content:stop]))
+                elif op in (mcap.SCHEMA, mcap.CHANNEL):
                     self._add_definition(op, records[content:stop])
-                except (struct.error, UnicodeDecodeError):
-                    raise Damaged(mcap.CHUNK_DAMAGED) from None
-            else:       # not allowed in a chunk
-                raise Damaged(mcap.CHUNK_DAMAGED)
+                else:
+                    raise Damaged('a record that is not allowed in a chunk')
+            except (Damaged, struct.error, UnicodeDecodeError):
+                raise Damaged(mcap.CHUNK_DAMAGED) from None
             offset = stop
         if offset != end and not is_truncated:
             raise Damaged(mcap.CHUNK_DAMAGED)
         return messages
+
+    def _entry(self, body: bytes) -> Entry:
+        """Return the message in the content of a record; raise Damaged or struct.error."""
+        number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
+        if number not in self._channels or time_ns >= LATEST_NS:
+            raise Damaged('a damaged record')
+        return time_ns, number, body[mcap.MESSAGE_HEAD.size:]
 
     def _add_definition(self, op: int, body: bytes) -> None:
         """Store the schema or the channel in the content of a record."""

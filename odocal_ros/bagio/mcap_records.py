@@ -36,19 +36,14 @@ FOOTER_SIZE = RECORD.size + 20 + len(MAGIC)     # format: bytes of the footer re
 
 
 class ChunkIndex(NamedTuple):
-    """
-    Index entry of a chunk: times, offset and size of its record in the file, channels.
-
-    index_size : bytes of the message index after the chunk, limited by ``ordered_chunks`` to the
-    space before the next chunk.   unpacked_size : bytes, as stated.
-    """
+    """Entry of a chunk in the index, as stated; offset and size are those of its record, bytes."""
 
     start_ns: int
     end_ns: int
     offset: int
     size: int
     channels: frozenset[int]
-    index_size: int = 0
+    index_size: int = 0      # of the message index after the chunk; ``ordered_chunks`` limits it
     unpacked_size: int = 0
 
 
@@ -129,12 +124,7 @@ class Chunk(NamedTuple):
 
 def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
                  is_truncated: bool = False) -> Chunk:
-    """
-    Return the chunk of a record, or raise Damaged.
-
-    begin, stop : range of the record's content in the data.   is_truncated : the file
-    ends within it.
-    """
+    """Return the chunk in data[begin:stop], the content of a record, or raise Damaged."""
     body = memoryview(data)[begin:stop]
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)

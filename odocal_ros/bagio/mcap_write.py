@@ -90,11 +90,7 @@ class Written(NamedTuple):
 
 def write_file(path: Path, channels: Mapping[int, Channel],
                chunks: Iterable[PackedChunk]) -> Written:
-    """
-    Write an mcap file completely or not at all; it is on the disk when this returns.
-
-    Raises OSError: it cannot be written; no part of it remains.
-    """
+    """Write a file completely to the disk, or raise OSError and leave no part of it."""
     with whole_file(path) as file:
         return _fill(file, channels, chunks)
 

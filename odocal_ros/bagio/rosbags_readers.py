@@ -163,11 +163,7 @@ class Types:
 
 
 def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
-    """
-    Return the smallest number of values in a message: its arrays of fixed length.
-
-    fielddefs : definitions of rosbags, by type: name, and pairs of a field and its type.
-    """
+    """Return the smallest number of values of a message; fielddefs : definitions of rosbags."""
     max_depth = 50    # of messages in messages
     if depth > max_depth:
         raise ValueError('it contains itself')

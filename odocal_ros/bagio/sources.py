@@ -40,17 +40,13 @@ class Span:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """
-    Content of metadata.yaml on a bag.
-
-    foreign_formats : serialization formats, if none is cdr.   fault : why the file is not used.
-    """
+    """Content of metadata.yaml on a bag."""
 
     file_names: tuple[str, ...] = ()
     bag_span: Span | None = None
     file_spans: Mapping[str, Span] = field(default_factory=dict)      # by name of the file
-    foreign_formats: str = ''
-    fault: str = ''
+    foreign_formats: str = ''      # serialization formats, if none is cdr
+    fault: str = ''                # why the file is not used
 
 
 @dataclass(frozen=True)
@@ -64,11 +60,7 @@ class Source:
 
 
 def find_source(path: Path) -> Source:
-    """
-    Return the source at a path: a folder, its metadata.yaml, or a file of a bag.
-
-    Raises BadBag: the path does not exist, or is not a bag.
-    """
+    """Return the source of a folder, its metadata.yaml, or a file of a bag; raise BadBag."""
     path = Path(path)
     if not path.exists():
         raise BadBag(f'{path}: no such file or folder')

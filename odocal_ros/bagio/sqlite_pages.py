@@ -16,7 +16,7 @@ from typing import NamedTuple
 from odocal_ros.bagio.bag_file import FileBytes
 from odocal_ros.safe_io.limits import limit_factor, MESSAGE_BYTES
 
-LEAF = 0x0D                       # format: first byte of a page with rows, sqlite.org/fileformat2
+LEAF = b'\x0D'      # format: first byte of a page with rows, sqlite.org/fileformat2
 # format: of rosbag2: id (NULL: it is the row number), topic_id, timestamp, data
 COLUMN_COUNT = 4
 # format: bytes of an integer, by the type code in a row
@@ -50,19 +50,12 @@ class LeafPages:
         self._usable_bytes = self._page_size - reserved_bytes      # of each page
         stated_pages = struct.unpack_from('>I', header, 28)[0]
         self.is_truncated = len(self._file) < stated_pages * self._page_size
-        first_rows = {}      # by index of the page
+        first_rows = {}      # number of the first row by index of the page
         for page in range(1, len(self._file) // self._page_size):
-            first_row = self._first_row(page)
-            if first_row is not None:
-                first_rows[page] = first_row
+            offset = page * self._page_size
+            if self._file[offset:offset + 1] == LEAF and (row := next(self._rows_of(page), None)):
+                first_rows[page] = row.number
         self._pages = sorted(first_rows, key=first_rows.__getitem__)
-
-    def _first_row(self, page: int) -> int | None:
-        """Return the number of the first row of a page of messages, None for other pages."""
-        offset = page * self._page_size
-        if self._file[offset:offset + 1] != bytes([LEAF]):
-            return None
-        return next((row.number for row in self._rows_of(page)), None)
 
     def rows(self, topic_ids: Container[int] | None, last_row: int = -1
              ) -> Iterator[tuple[int, int, bytes]]:
@@ -136,11 +129,7 @@ class LeafPages:
 
 
 def _numbers_of(page: bytes, offset: int) -> tuple[int, int, int]:
-    """
-    Return topic_id, timestamp and offset of the message in the content of a row.
-
-    Raises ValueError if it is not a row of messages.
-    """
+    """Return topic_id, timestamp and offset of the message in a row; ValueError if it is none."""
     # the header has its length and a type code for each column
     length, position = _varint(page, offset)
     if length > 10 * COLUMN_COUNT:      # a varint has nine bytes at most

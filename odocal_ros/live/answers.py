@@ -54,11 +54,7 @@ def result_answer(calibration: Calibration, parts: Sequence[LegResult] = (), leg
 
 
 def provisional_answer(at_stop: SessionView) -> str:
-    """
-    Return the answer that a leg is being computed, with its running estimate.
-
-    at_stop : view just before the stop mark. The answer has no verdict but *provisional*.
-    """
+    """Return a *provisional* answer with the running estimate; at_stop : view before the mark."""
     session, forecast = at_stop.session, at_stop.forecast
     estimates = forecast.estimates if forecast else {}
     estimate = 'there is no running estimate'

@@ -55,7 +55,7 @@ class AutomaticLegs(LegCompletion):
         """Hand a received block to the running estimate and to the search for legs."""
         self._running_estimate.feed(slot, block)
         if self._search is not None:
-            self._search.feed(slot, block, self._recording.inputs.form)
+            self._search.feed(slot, block, self._recording.inputs.form())
 
     def _update_search(self) -> None:
         """Create the search for the settings in force; none without leg.automatic."""
@@ -192,7 +192,7 @@ class Operation(AutomaticLegs):
                                                   advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
-            form = self._recording.inputs.form
+            form = self._recording.inputs.form()
             return answers.restored_answer(session.restored, form.scale_unit if form else '',
                                            within_limits)
         raise Refused('no leg is running and there is no result yet: call ~/start_leg first')

@@ -89,11 +89,7 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
 
 
 def declare_settings(node: Node, kind: type = Config) -> Any:
-    """
-    Declare every setting as a parameter and return the configuration, of class ``kind``.
-
-    Raises BadConfig: an override has the wrong type or is out of range.
-    """
+    """Declare all settings, return the configuration; raise BadConfig for a wrong override."""
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
         # None for an empty list, which rclpy reads as bytes
@@ -123,11 +119,7 @@ def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
 
 
 def check_qos(node: Node, topics: Iterable[str]) -> None:
-    """
-    Raise BadConfig for a QoS override of an input that rclpy would refuse.
-
-    The error of rclpy is internal, and is raised only when the topic is subscribed.
-    """
+    """Raise BadConfig for QoS overrides that rclpy refuses, but not before the subscription."""
     overrides = getattr(node, '_parameter_overrides', {})
     for topic in topics:
         for policy, allowed in QOS.items():
@@ -173,11 +165,7 @@ def refuse_after_start(kind: type) -> Callable[[list[Parameter]], msg.SetParamet
 
 
 def declare_results(node: Node, units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
-    """
-    Declare ``result.*``; return the saved result given by overrides, if any.
-
-    units : names of the estimates, and their units.
-    """
+    """Declare ``result.*``; return the result in overrides, if any; units : by estimate."""
     for name, default in _result_defaults(units).items():
         unit = units.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
         about = msg.ParameterDescriptor(dynamic_typing=True, description=(
@@ -213,11 +201,7 @@ def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[st
 
 def restored_from(results: dict[str, Any],
                   units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
-    """
-    Return the result in the parameters ``result.*``, None without one.
-
-    Raises BadConfig: impossible values, by the checks of a calibration.json.
-    """
+    """Return the result in ``result.*``, None without one; raise BadConfig if it is impossible."""
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
         raise BadConfig(f'result.legs: {legs} is not a number of legs; {FILE_REMEDY}')

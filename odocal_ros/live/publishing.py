@@ -135,11 +135,7 @@ def level(view: SessionView) -> Any:
 
 
 def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
-    """
-    Return the message of the status as one line: state, accuracy, next action, problems.
-
-    hint : the next action.   ok : whether each quantity meets its limit.
-    """
+    """Return state, accuracy, next action (hint) and problems; ok : which values are in limits."""
     session = view.session
     legs = counted(len(session.legs), 'leg')
     if session.carried:

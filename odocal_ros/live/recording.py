@@ -109,17 +109,10 @@ class Inputs:
         return {slot: source.topic for slot, source in self.by_slot.items()
                 if source.reader is not None and not (slot == 'imu' and self.without_imu)}
 
-    @property
-    def form(self) -> OdometerForm | None:
-        """Return the form of the odometer's values, None until its type is known."""
-        reader = self.by_slot['odometer'].reader
-        return reader.form if reader else None
-
-    @property
-    def form_right(self) -> OdometerForm | None:
-        """Return the form of the right wheel's values where it has a topic of its own."""
-        right = self.by_slot.get('odometer_right')
-        return right.reader.form if right and right.reader else None
+    def form(self, slot: str = 'odometer') -> OdometerForm | None:
+        """Return the meaning of odometer values; None without the topic or before its type."""
+        source = self.by_slot.get(slot)
+        return source.reader.form if source and source.reader else None
 
 
 def _used_inputs(config: Config) -> dict[str, tuple[str, ...]]:
@@ -156,11 +149,7 @@ class Recording:
         return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def decode_new_messages(self, config: Config, known_scale: float) -> None:
-        """
-        Decode the messages since the last call, in blocks.
-
-        known_scale : scale factor of an earlier result or estimate, for the distance; NaN without.
-        """
+        """Decode new messages; known_scale : scale factor for the distance, NaN without one."""
         fix = self.inputs.by_slot.get('fix')
         static = fix.static if fix else None     # a TF reference has two topics
         if static is not None:
@@ -190,7 +179,7 @@ class Recording:
         self._distribute('fix', block, config, 0.0)
 
     def _distribute(self, slot: str, block: Samples, config: Config, known_scale: float) -> None:
-        self.progress.feed(slot, block, config, self.inputs.form, known_scale)
+        self.progress.feed(slot, block, config, self.inputs.form(), known_scale)
         if self.block_listener is not None:
             self.block_listener(slot, block)
 
@@ -230,9 +219,8 @@ class Recording:
     def snapshot(self) -> LegRecorder:
         """Return the samples so far, for another thread."""
         copy = self.recorder.snapshot()
-        if self.inputs.form is not None:
-            copy.form = self.inputs.form
-        copy.form_right = self.inputs.form_right
+        copy.form = self.inputs.form() or copy.form
+        copy.form_right = self.inputs.form('odometer_right')
         return copy
 
     @property
@@ -250,7 +238,7 @@ class Recording:
 
     def two_wheels(self) -> bool:
         """Return True if there are two wheels, known as left and right."""
-        form = self.inputs.form
+        form = self.inputs.form()
         sent = [self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3]]
         return sent == [True, True, False] and (form is None or form.sides_known)
 

@@ -112,11 +112,7 @@ class RunningEstimate:
         self._new_blocks.append((slot, block))
 
     def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
-        """
-        Return the problems of the leg so far, one reason per code, the most severe first.
-
-        silent_s : time from the last IMU message to the newest of all, s.
-        """
+        """Return a reason for each problem, the worst first; silent_s : since an IMU message."""
         if self._imu_gaps is None:
             return ()
         cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there; values are those of the '

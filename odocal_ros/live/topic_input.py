@@ -47,11 +47,7 @@ QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFO
 
 
 class StaticTransforms:
-    """
-    The topic of static transforms for a TF reference; each publisher sends them once.
-
-    They are valid at all times, so each journal has all of them.
-    """
+    """The topic of static transforms of a TF reference, sent once and kept in every journal."""
 
     slot, msgtype, newest_ns = 'fix_static', TRANSFORMS, ALWAYS_NS
 

@@ -30,13 +30,7 @@ from odocal_ros.messages.message_fields import (
     View,
 )
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import (
-    FrameFilter,
-    MAX_SINGLE_READS,
-    RawMessages,
-    Table,
-    tables,
-)
+from odocal_ros.messages.raws import FrameFilter, RawMessages, SMALL_BLOCK, Table, tables
 from odocal_ros.settings.config import Config
 
 # judgement: unreadable messages after which messages without a layout are skipped
@@ -102,7 +96,7 @@ class Reader:
         Returns (slot, block) pairs, one for each wheel of a message, none without a row. Raises
         BadData: the message type cannot have the value: no such field, not a number.
         """
-        other_imu, raws = None, raws if len(raws) <= MAX_SINGLE_READS else RawMessages.joined(raws)
+        other_imu, raws = None, raws if len(raws) <= SMALL_BLOCK else RawMessages.joined(raws)
         if self.frames is not None and len(raws):
             keep, other_imu = self.frames.separate(raws, received_ns, deserialize)
             if other_imu is not None:
@@ -167,7 +161,7 @@ class Reader:
     def _read_small_block(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
         """Return the columns of a few messages of one layout; [] if they have several or none."""
         layout = cdr.layout_of(self.msgtype, raws[0])
-        if len(raws) > MAX_SINGLE_READS or layout is None or not all(map(layout.fits, raws)):
+        if len(raws) > SMALL_BLOCK or layout is None or not all(map(layout.fits, raws)):
             return []
         columns = self._plan.columns
         if layout is not self._layout:

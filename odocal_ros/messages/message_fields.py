@@ -48,11 +48,7 @@ class MessageView:
             return 0
 
     def value(self, path: str) -> Any:
-        """
-        Return the value at a dotted path, with [i] in a list or [name] by the list ``name``.
-
-        Raises AttributeError, LookupError: it is missing.
-        """
+        """Return the value at a path, [name] by the list ``name``; AttributeError, LookupError."""
         value: Any = self.message
         owner = value      # of the list that ``value`` is
         for name, key in path_parts(path):
@@ -93,15 +89,11 @@ def path_parts(path: str) -> tuple[tuple[str, str], ...]:
 
 @dataclass(frozen=True)
 class Column:
-    """
-    Values to read from every message: one column of samples, or several.
-
-    width : number of values.   find_paths : returns their paths in a message, None if missing.
-    """
+    """Values to read from every message: one column of samples, or several."""
 
     dtype: type
-    width: int
-    find_paths: Callable[[View], Sequence[str] | None]
+    width: int      # number of values
+    find_paths: Callable[[View], Sequence[str] | None]      # in a message; None: they are missing
 
     def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the values of an object; None if they are missing."""

@@ -25,7 +25,7 @@ Table = NDArray[np.uint8]      # (n, size): a message in each row
 # judgement: layouts per message length; messages of further ones are read one by one
 MAX_LAYOUTS = 16
 # judgement: up to this number of messages, reading each one takes less time than a table
-MAX_SINGLE_READS = 8
+SMALL_BLOCK = 8
 FRAME_MESSAGES = 3     # judgement: messages that determine the frame; one may be damaged
 TEXT_OFFSET = cdr.FRAME_OFFSET - 4      # format: offset of the length of the frame_id
 
@@ -199,7 +199,7 @@ class FrameFilter:
 
     def _with_frame(self, raws: Sequence[bytes]) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
-        if len(raws) <= MAX_SINGLE_READS:
+        if len(raws) <= SMALL_BLOCK:
             return np.array([self._has_frame(raw) for raw in raws], bool)
         joined = RawMessages.joined(raws)
         # bytes of the encoding, then length and text of the frame_id

@@ -5,6 +5,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.settings.setting import setting
@@ -92,32 +93,26 @@ class UpdaterConfig:
     use_fqn: bool = setting(False, read_only=True, about='Use the full node name in /diagnostics.')
 
 
+def _lower_limit(value: str, unit: str) -> Any:
+    return setting(NAN, unit, about=f'Lower acceptance limit of {value}: value minus 2 sigma must '
+                   'not be below. NaN: no limit.')
+
+
+def _upper_limit(value: str, unit: str) -> Any:
+    return setting(NAN, unit, about=f'Upper acceptance limit of {value}: value plus 2 sigma must '
+                   'not be above. NaN: no limit.')
+
+
 @dataclass(frozen=True, kw_only=True)
 class AcceptConfig:
-    scale_factor_min: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Lower acceptance limit of the scale factor: value minus 2 sigma '
-        'must not be below. NaN: no limit.'))
-    scale_factor_max: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Upper acceptance limit of the scale factor: value plus 2 sigma '
-        'must not be above. NaN: no limit.'))
-    scale_ratio_min: float = setting(NAN, '1', about=(
-        'Lower acceptance limit of scale factor over nominal scale factor: value minus 2 sigma '
-        'must not be below. NaN: no limit.'))
-    scale_ratio_max: float = setting(NAN, '1', about=(
-        'Upper acceptance limit of scale factor over nominal scale factor: value plus 2 sigma '
-        'must not be above. NaN: no limit.'))
-    yaw_mounting_angle_min: float = setting(NAN, 'rad', about=(
-        'Lower acceptance limit of the yaw mounting angle: value minus 2 sigma '
-        'must not be below. NaN: no limit.'))
-    yaw_mounting_angle_max: float = setting(NAN, 'rad', about=(
-        'Upper acceptance limit of the yaw mounting angle: value plus 2 sigma '
-        'must not be above. NaN: no limit.'))
-    pitch_mounting_angle_min: float = setting(NAN, 'rad', about=(
-        'Lower acceptance limit of the pitch mounting angle: value minus 2 sigma '
-        'must not be below. NaN: no limit.'))
-    pitch_mounting_angle_max: float = setting(NAN, 'rad', about=(
-        'Upper acceptance limit of the pitch mounting angle: value plus 2 sigma '
-        'must not be above. NaN: no limit.'))
+    scale_factor_min: float = _lower_limit('the scale factor', 'm/pulse, m/rad or 1')
+    scale_factor_max: float = _upper_limit('the scale factor', 'm/pulse, m/rad or 1')
+    scale_ratio_min: float = _lower_limit('scale factor over nominal scale factor', '1')
+    scale_ratio_max: float = _upper_limit('scale factor over nominal scale factor', '1')
+    yaw_mounting_angle_min: float = _lower_limit('the yaw mounting angle', 'rad')
+    yaw_mounting_angle_max: float = _upper_limit('the yaw mounting angle', 'rad')
+    pitch_mounting_angle_min: float = _lower_limit('the pitch mounting angle', 'rad')
+    pitch_mounting_angle_max: float = _upper_limit('the pitch mounting angle', 'rad')
     strict: bool = setting(False, about='A result with a caution does not pass; it is undecided.')
 
     def __post_init__(self) -> None:

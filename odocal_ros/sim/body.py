@@ -100,12 +100,6 @@ def sprung_response(static_tilt: Floats, step: float) -> tuple[Floats, Floats]:
     return values, rates
 
 
-def lateral_velocity(speed: Profile, yaw_rate: Profile, sideslip: float, lean: Profile | None,
-                     t: Floats) -> Floats:
-    """Return the velocity to the left at times t, m/s: against the force of the tyres."""
-    return -sideslip * side_force(speed, yaw_rate, lean, t) * np.abs(speed(t))
-
-
 def rotation(motion: Motion, t: Floats) -> Floats:
     """Return the rotations from the body axes to the vehicle axes at (n,) times: (n, 3, 3)."""
     roll, pitch = (profile(t) for profile in motion.tilt)

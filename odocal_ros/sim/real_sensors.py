@@ -167,11 +167,7 @@ def positions(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, F
 
 def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
               time: float) -> tuple[Floats, Floats, Floats]:
-    """
-    Return positions filtered with weights of AGES and a time constant, s.
-
-    Before the first sample the vehicle is at rest.
-    """
+    """Return filtered positions, with weights of AGES and a time constant, s; first at rest."""
     past = [_antenna(motion, np.maximum(t - time * age, 0.0), options) for age in AGES]
     latitude, longitude, height = (
         sum(w * x for w, x in zip(weights, coordinate, strict=True))
@@ -233,12 +229,6 @@ def tunnel_errors(t: Floats, error: Floats, position: Floats, options: SimOption
         out[inside] = error[inside[0]] + np.cumsum(
             real.tunnel_odometer * steps + turned * sideways, axis=0)
     return out
-
-
-def true_variance(white: Floats, options: SimOptions) -> Floats:
-    """Return the variance of fix errors without bursts, (3,) m^2; white : that of white noise."""
-    slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
-    return white + slow * np.array([1.0, 1.0, UP_RATIO**2])
 
 
 def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:

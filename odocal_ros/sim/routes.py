@@ -245,11 +245,7 @@ def _tenth(seconds: float) -> float:
 
 def _remaining_time(name: str, duration: float, fixed: float, least: float = 10.0,
                     enough: float | None = None) -> float:
-    """
-    Return the time that remains besides the fixed parts, s.
-
-    Raises BadUsage: it is below ``least``; the error suggests ``enough`` s, if given.
-    """
+    """Return the time besides the fixed parts, s; raise BadUsage if it is below ``least``."""
     if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
                        f'give {enough or fixed + least:g} s or more')

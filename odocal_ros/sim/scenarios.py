@@ -162,8 +162,9 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     draws = size * make_rng(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
-        v = body.lateral_velocity(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
-        side = _sum(side, v)
+        # to the left, against the force of the tyres
+        force = body.side_force(route.speed, route.yaw_rate, lean, breaks)
+        side = _sum(side, -options.real.sideslip * force * np.abs(route.speed(breaks)))
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
         side, up = _sum(side, rate * np.cos(phi)), _sum(up, rate * np.sin(phi))

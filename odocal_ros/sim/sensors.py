@@ -226,8 +226,10 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
     variance_ratio = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
-    variance = real_sensors.true_variance(
-        _axis_sigmas(options) ** 2 * variance_ratio + stationary_sigma(options)**2, options)
+    slow_variance = sum(sigma**2 for sigma, _ in real.slow_errors)
+    # of east, north and up, without bursts
+    variance = (_axis_sigmas(options) ** 2 * variance_ratio + stationary_sigma(options)**2
+                + slow_variance * np.array([1.0, 1.0, real_sensors.UP_RATIO**2]))
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].planar:
         variance[2] = 0.0
