@@ -113,50 +113,55 @@ def _module_of(name: str) -> ModuleType:
 
 
 def main(argv: list[str] | None = None) -> int:
-    argv = sys.argv[1:] if argv is None else list(argv)
+    """Run a command and return its exit code; errors are lines on stderr."""
     if sys.stdout is None:       # closed by the parent process
         sys.stdout = open(os.devnull, 'w', encoding='utf-8')     # noqa: SIM115 until exit
     for stream in (sys.stdout, sys.stderr):      # a terminal without ± shows ? instead
         if hasattr(stream, 'reconfigure'):
             stream.reconfigure(errors='replace')
     try:
-        if argv and argv[0] not in COMMANDS and not argv[0].startswith('-'):
-            raise _Usage(f'odocal: no command {argv[0]!r}; {unknown_name(argv[0], COMMANDS)} '
-                         '(see odocal --help)')
-        parser = _parser(argv[0] if argv else '')
-        args = parser.parse_args(argv)
-        if args.command is None:
-            parser.print_help()
-            return WRONG_USE
-        code: int = args.run(args)
-        sys.stdout.flush()       # here, where a full disk can still be reported
-        return code
-    except OdocalError as error:
-        text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
-        for line in text.split('\n') if isinstance(error, BadTopics) else [text]:
-            warn(line)
-        return WRONG_USE
+        return _run(sys.argv[1:] if argv is None else list(argv))
     except KeyboardInterrupt as stopped:
         warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except OSError as error:       # a full disk, a closed stream
-        what = error.filename or 'output'
-        warn(f'odocal: {what}: {error.strerror or error}')
-        return WRONG_USE
-    except MemoryError:
-        warn('odocal: out of memory; close other programs, or replay a shorter bag or a section '
-             '(--leg A:B)')
-        return WRONG_USE
     except Exception as error:     # noqa: BLE001 users get a line and a file, no trace
-        import traceback
-        path = trace_file(''.join(traceback.format_exception(error)))
-        first = (str(error).splitlines() or [''])[0][:200]
-        warn(f'odocal: internal error ({type(error).__name__}: {first}); '
-             f'please report it with {path}')
-        return INTERNAL
+        for line in _error_lines(error):
+            warn(line)
+        return WRONG_USE if isinstance(error, OdocalError | OSError | MemoryError) else INTERNAL
+
+
+def _run(argv: list[str]) -> int:
+    if argv and argv[0] not in COMMANDS and not argv[0].startswith('-'):
+        raise _Usage(f'odocal: no command {argv[0]!r}; {unknown_name(argv[0], COMMANDS)} '
+                     '(see odocal --help)')
+    parser = _parser(argv[0] if argv else '')
+    args = parser.parse_args(argv)
+    if args.command is None:
+        parser.print_help()
+        return WRONG_USE
+    code: int = args.run(args)
+    sys.stdout.flush()       # here, where a full disk can still be reported
+    return code
+
+
+def _error_lines(error: Exception) -> list[str]:
+    """Return the text on an error; the trace of an internal error is in the file it names."""
+    if isinstance(error, OdocalError):
+        text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
+        return text.split('\n') if isinstance(error, BadTopics) else [text]
+    if isinstance(error, OSError):       # a full disk, a closed stream
+        return [f'odocal: {error.filename or "output"}: {error.strerror or error}']
+    if isinstance(error, MemoryError):
+        return ['odocal: out of memory; close other programs, or replay a shorter bag or a '
+                'section (--leg A:B)']
+    import traceback
+    path = trace_file(''.join(traceback.format_exception(error)))
+    first = (str(error).splitlines() or [''])[0][:200]
+    return [f'odocal: internal error ({type(error).__name__}: {first}); please report it with '
+            f'{path}']
 
 
 def trace_file(text: str) -> str:

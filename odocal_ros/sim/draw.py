@@ -59,15 +59,15 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
             seed, 'vehicle odometer').choice(3, p=vehicle.grade_values('odometers')))]
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == odometer_effect]
     real: dict[str, Any] = {}
-    present = []
+    present_effects = []
     for name in names:
         effect = (EFFECTS | RARE)[name](make_rng(seed, f'vehicle {name}'), vehicle)
         if effect.options or effect.real:
-            present.append(name)
+            present_effects.append(name)
         options |= effect.options
         real |= effect.real
     options |= fixed_options
-    return SimOptions(**options, real=RealEffects(**real | fixed_real)), tuple(present)
+    return SimOptions(**options, real=RealEffects(**real | fixed_real)), tuple(present_effects)
 
 
 def _ideal_vehicle(seed: int, kind: str, grade: str,

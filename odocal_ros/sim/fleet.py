@@ -3,7 +3,7 @@
 
 """A fleet with known truth: models, vehicles that differ, tyres changed, IMUs moved."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -54,7 +54,7 @@ class FleetVehicle:
     yaw: np.ndarray      # (bags,) rad
     pitch: float         # rad
     odometer_km: np.ndarray    # (bags,) on the dashboard
-    changes: tuple[FleetChange, ...] = field(default=())
+    changes: tuple[FleetChange, ...] = ()
 
     def has_broken_counter(self, bag: int) -> bool:
         """Return True if the odometer counter is broken in a bag."""
@@ -68,18 +68,20 @@ def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     for value, share in CHANGE_SHARES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
             changed[order.pop()] = value
-    return [_vehicle(k, bags, changed.get(k), make_rng(seed, f'fleet vehicle {k}'))
-            for k in range(vehicles)]
+    return [_vehicle(number, bags, changed.get(number), make_rng(seed, f'fleet vehicle {number}'))
+            for number in range(vehicles)]
 
 
-def _vehicle(k: int, bags: int, changed: str | None, rng: np.random.Generator) -> FleetVehicle:
-    model = MODELS[k % len(MODELS)]
+def _vehicle(number: int, bags: int, changed: str | None,
+             rng: np.random.Generator) -> FleetVehicle:
+    """Return a vehicle; changed : name of the value that changes before one of its bags."""
+    model = MODELS[number % len(MODELS)]
     walk = np.cumsum(WALK * math.sqrt(7) * rng.standard_normal(bags))
     # between vehicles of a model, 1 sigma: 0.3 % of the scale, 0.3 and 0.2 deg
     scale = model.scale * (1 + 0.003 * rng.standard_normal()) * np.exp(walk)
     yaw = np.full(bags, model.yaw + math.radians(0.3) * rng.standard_normal())
     pitch = model.pitch + math.radians(0.2) * rng.standard_normal()
-    km = 1000.0 + 400.0 * np.cumsum(rng.uniform(0.5, 1.5, bags))    # 400 km a week
+    odometer_km = 1000.0 + 400.0 * np.cumsum(rng.uniform(0.5, 1.5, bags))    # 400 km a week
     first_bag = int(rng.integers(1, max(2, bags - 1)))
     size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0))
     changes: tuple[FleetChange, ...] = ()
@@ -91,7 +93,8 @@ def _vehicle(k: int, bags: int, changed: str | None, rng: np.random.Generator) -
         yaw[first_bag:] += size
     if changed:
         changes = (FleetChange(first_bag, changed, 0.0 if changed == 'counter' else size),)
-    return FleetVehicle(f'{model.name}_{k + 1:03d}', model, scale, yaw, pitch, km, changes)
+    return FleetVehicle(f'{model.name}_{number + 1:03d}', model, scale, yaw, pitch, odometer_km,
+                        changes)
 
 
 def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOptions) -> SimOptions:

@@ -173,11 +173,13 @@ def inertial_v(state: State,
     along z at rest on the level.
     """
     C_nv, v_n = attitude(state), velocity_n(state)
-    s, c = np.sin(state.slope), np.cos(state.slope)
-    yr, ya, gr, ga = (state.yaw_rate, state.yaw_acceleration, state.slope_rate,
-                      state.slope_acceleration)
-    w_nv = np.stack([yr * s, -gr, yr * c], -1)
-    dw_nv = np.stack([ya * s + yr * c * gr, -ga, ya * c - yr * s * gr], -1)
+    sine, cosine = np.sin(state.slope), np.cos(state.slope)
+    yaw_rate, yaw_acceleration = state.yaw_rate, state.yaw_acceleration
+    # turn rate of v relative to n, in v, and its derivative
+    w_nv = np.stack([yaw_rate * sine, -state.slope_rate, yaw_rate * cosine], -1)
+    dw_nv = np.stack([yaw_acceleration * sine + yaw_rate * cosine * state.slope_rate,
+                      -state.slope_acceleration,
+                      yaw_acceleration * cosine - yaw_rate * sine * state.slope_rate], -1)
     a_v = np.concatenate([state.acceleration[:, None], state.sway_acceleration], axis=1)
     a_v = a_v + np.cross(w_nv, _velocity_v(state))
 

@@ -86,14 +86,14 @@ def straight(duration: float, rng: np.random.Generator) -> Route:
 
 def out_and_back(duration: float, rng: np.random.Generator) -> Route:
     """Return a straight out, a stop of 30 s, a U turn at 4 m/s, the same straight back."""
-    around = 5 + 2 + 14 + 2 + 10
-    cruise = _remaining_time('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
-    out = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
-    about = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
-    back = hold(cruise) + ramp(15, -15) + hold(60)
-    return _route([(out, hold(60 + 15 + cruise + 15 + 30)),
-                   (about, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
-                   (back, hold(cruise + 75))])
+    u_turn_s = 5 + 2 + 14 + 2 + 10
+    cruise = _remaining_time('out_and_back', duration, 60 + 15 + 15 + 30 + u_turn_s + 15 + 60) / 2
+    outbound = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
+    u_turn = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
+    inbound = hold(cruise) + ramp(15, -15) + hold(60)
+    return _route([(outbound, hold(60 + 15 + cruise + 15 + 30)),
+                   (u_turn, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
+                   (inbound, hold(cruise + 75))])
 
 
 def town(duration: float, rng: np.random.Generator) -> Route:

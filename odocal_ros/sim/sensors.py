@@ -51,8 +51,8 @@ def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
     grade, real = SIM_GRADES[options.imu_grade], options.real
     gyro, accel = (
-        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if given is None
-        else np.array(given) for name, sigma, given in (
+        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if value is None
+        else np.array(value) for name, sigma, value in (
             ('gyro', grade.gyro_bias, real.gyro_bias),
             ('accelerometer', grade.accel_bias, real.accel_bias)))
     return gyro, accel
@@ -63,9 +63,9 @@ def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
     grade, rate, seed = SIM_GRADES[options.imu_grade], options.imu_rate, options.seed
     gyro, accel = turn_on_biases(options)
 
-    def error(name: str, bias: Floats, walk: float, noise: float) -> Floats:
-        walked = random_walk(make_rng(seed, f'{name} walk'), walk, rate, (n, 3))
-        return bias + walked + white(make_rng(seed, f'{name} white'), noise, rate, (n, 3))
+    def error(name: str, bias: Floats, root_rate: float, root_psd: float) -> Floats:
+        walk = random_walk(make_rng(seed, f'{name} walk'), root_rate, rate, (n, 3))
+        return bias + walk + white(make_rng(seed, f'{name} white'), root_psd, rate, (n, 3))
     return (error('gyro', gyro, grade.gyro_bias_walk, grade.gyro_noise),
             error('accelerometer', accel, grade.accel_bias_walk, grade.accel_noise))
 
@@ -152,25 +152,25 @@ def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
 
 def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
              lean: Floats | float) -> Floats | Ints:
-    arm, scale = wheel.arm, wheel.scale
-    real, slipped = options.real, slip(state, options, wheel.stream)
-    grown = 1 + wheels.tyre_growth(state, real)
+    arm, scale, real = wheel.arm, wheel.scale, options.real
+    slip_path = slip(state, options, wheel.stream)
+    radius_ratio = 1 + wheels.tyre_growth(state, real)      # to a cold, slow tyre
     if options.odometer == 'speed':
         noise = options.speed_noise * make_rng(options.seed, 'speed').standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it
         slip_speed = wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + slip_speed
-                + np.gradient(slipped, state.t)) / grown
+                + np.gradient(slip_path, state.t)) / radius_ratio
         sent = wheels.low_passed(rate + noise, state.t, real.speed_filter)
         return wheels.quantized(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
             wheels.robot_path(state, options, wheel))
-    rolled = path + slipped + wheels.tyre_slip(state, real)
+    rolled = path + slip_path + wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + wheels.steered_path(state, arm)
-    if np.ndim(grown):
-        between = (grown + np.roll(grown, 1)) / 2
-        rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
+    if np.ndim(radius_ratio):
+        mean_ratio = (radius_ratio + np.roll(radius_ratio, 1)) / 2      # of each step
+        rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / mean_ratio)
     rolled = rolled / scale
     phase = make_rng(options.seed, f'pulse phase {wheel.stream}').uniform()   # angle of the disc
     if options.odometer == 'angle':

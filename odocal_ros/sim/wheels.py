@@ -106,13 +106,13 @@ def _widening(radius: Floats, width: float) -> Floats:
 
 def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     """Return the path rolled by a wheel of skid steering, mecanum or omni, m: (n,)."""
+    x, y, _ = wheel.arm - np.asarray(options.odometer_lever_arm)      # from the middle
     if options.drive == OMNI:       # it rolls clockwise about the middle, seen from above
-        x, y, _ = wheel.arm - np.asarray(options.odometer_lever_arm)
         radius = np.hypot(x, y)
         lateral = running_integral(state.t, state.sway[:, 0])
         out: Floats = (y * state.travel - x * lateral) / radius - radius * state.turned
         return out
-    side = -1.0 if wheel.name.split('_joint')[0].removesuffix('_wheel').endswith(SIDES[0]) else 1.0
+    side = -1.0 if y > 0 else 1.0       # left, right
     if options.drive == MECANUM:
         lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS
         rollers = side if wheel.name.startswith('front') else -side
@@ -127,13 +127,13 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
 
 def tyre_growth(state: State, real: RealEffects) -> Floats | float:
     """Return the relative growth of the rolling radius from a cold, slow tyre: (n,), or 0.0."""
-    grown: Floats | float = 0.0
+    growth: Floats | float = 0.0
     if real.speed_law:
-        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as defined in RealEffects
+        growth = growth + real.speed_law * (state.speed / 36.0)**2    # as defined in RealEffects
     if real.warming:
         steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
-        grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
-    return grown
+        growth = growth - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
+    return growth
 
 
 def slip_share(state: State, real: RealEffects) -> Floats:
@@ -153,14 +153,14 @@ def tyre_slip(state: State, real: RealEffects) -> Floats:
     return np.cumsum(slip_share(state, real) * np.diff(state.travel, prepend=state.travel[:1]))
 
 
-def leg_factor(state: State, real: RealEffects, slipped: Floats) -> float:
-    """Return the true path over the one counted by a cold wheel; slipped : (n,) m, at starts."""
-    if not (real.speed_law or real.warming or real.tyre_slip or slipped.any()):
+def leg_factor(state: State, real: RealEffects, start_slip: Floats) -> float:
+    """Return the true path over that counted by a cold wheel; start_slip : (n,) m, so far."""
+    if not (real.speed_law or real.warming or real.tyre_slip or start_slip.any()):
         return 1.0
     path_length = np.diff(state.travel)
-    slipped = np.diff(slipped + tyre_slip(state, real) if real.tyre_slip else slipped)
-    grown = tyre_growth(state, real) + np.zeros_like(state.t)
-    counted = (path_length + slipped) / (1 + (grown[1:] + grown[:-1]) / 2)
+    slip = np.diff(start_slip + tyre_slip(state, real) if real.tyre_slip else start_slip)
+    growth = tyre_growth(state, real) + np.zeros_like(state.t)
+    counted = (path_length + slip) / (1 + (growth[1:] + growth[:-1]) / 2)
     return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
