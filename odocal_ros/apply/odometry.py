@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.apply.odometry_start import find_start
 from odocal_ros.apply.pose import Pose
-from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
+from odocal_ros.apply.reckoning import DeadReckoning, ODOMETER_SILENCE
 from odocal_ros.apply.stamp_screen import PERMANENT_ROWS, StampScreen, STEP_ROWS
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
@@ -84,7 +84,7 @@ class Odometry:
         self.wheels = Wheels(self.vehicle, self.config, self._notes)
         self.imu = ImuStream(self.config, self._notes)
         self._screens: dict[str, StampScreen] = {}
-        self._path: Reckoning | None = None
+        self._path: DeadReckoning | None = None
 
     def feed(self, slot: str,
              block: samples.ImuSamples | samples.OdometerSamples | list[samples.Reading],
@@ -137,7 +137,7 @@ class Odometry:
             self.restart(self._path.failed)
         return poses
 
-    def _start_path(self) -> Reckoning | None:
+    def _start_path(self) -> DeadReckoning | None:
         """Return the path from a start, None while there are too few samples."""
         start = find_start(self.imu, self.wheels, self.vehicle, self.config, self.grade)
         if start is None:
@@ -147,5 +147,5 @@ class Odometry:
             self._first_lead_s = lead
         # after one clock was set, the stamps have an additional offset that is not calibrated
         delay = float(np.hypot(self.config.odometer.time_sigma, lead - self._first_lead_s))
-        return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._notes,
+        return DeadReckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._notes,
                          delay)

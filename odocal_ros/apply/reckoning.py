@@ -55,8 +55,8 @@ GRAVITY_N = np.array([0.0, 0.0, GRAVITY])
 TILT_LOST = 0.5           # rad; judgement: larger sigmas are beyond a linearised correction
 
 
-class Reckoning:
-    """Path from a start; ``failed`` is the cause why it cannot continue, empty if it can."""
+class DeadReckoning:
+    """Path from a start; ``failed`` is the cause if it cannot continue, else empty."""
 
     def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,
                  config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from odocal_ros.data.samples import Reading
 
 LATEST_STAMP_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, minus a time_offset
-STAMP_LIMIT_NS = 200_000_000    # judgement: lag below the least one; age before the newest stamp
+STAMP_LIMIT_NS = 200_000_000    # judgement: lead over the least lag; age before the newest stamp
 CLOCK_SET_ROWS = 10    # judgement: consecutive rows beyond STAMP_LIMIT_NS, then the clock was set
 LAG_ROWS = 1000        # judgement: accepted rows over which the least lag increases again
 # judgement: consecutive rows of a clock step; of a permanent one
@@ -64,23 +64,23 @@ class StampScreen:
                 self.dropped += 1
                 continue
             lag = received - stamp
-            ahead = 0.0 if self.lag_ns is None else self.lag_ns - lag
-            behind = self._newest_ns - stamp
-            if ahead > STAMP_LIMIT_NS * self.rate or behind > STAMP_LIMIT_NS:
+            lead_ns = 0.0 if self.lag_ns is None else self.lag_ns - lag
+            age_ns = self._newest_ns - stamp
+            if lead_ns > STAMP_LIMIT_NS * self.rate or age_ns > STAMP_LIMIT_NS:
                 self.jump_row = self.jump_row if self._refused_rows else k
                 self._refused_rows += 1
-                self.dropped += behind != 0      # a repeated row is no fault
-                self.excess_s = (-behind if behind > STAMP_LIMIT_NS else ahead) * 1e-9
+                self.dropped += age_ns != 0      # a repeated row is no fault
+                self.excess_s = (-age_ns if age_ns > STAMP_LIMIT_NS else lead_ns) * 1e-9
                 self.clock_jumped |= self._refused_rows >= CLOCK_SET_ROWS
-            elif behind < 0:
+            elif age_ns < 0:
                 self._refused_rows, self._newest_ns = 0, stamp
                 accepted.append(row)
-                if self.lag_ns is None or ahead > 0:
+                if self.lag_ns is None or lead_ns > 0:
                     self.lag_ns = lag
                 else:
-                    self.lag_ns -= ahead / LAG_ROWS
+                    self.lag_ns -= lead_ns / LAG_ROWS
             else:
-                self.dropped += behind > 0
+                self.dropped += age_ns > 0
             if not self._refused_rows:
                 self._update_median_lag(lag)
         self._update_rate(rows[-1][1] if rows else 0)

@@ -31,7 +31,7 @@ SIDES = ('scale_factor_left', 'scale_factor_right')
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """A calibrated vehicle; v are its axes (forward, left, up), b those of the IMU."""
+    """A calibrated vehicle; frame v: forward, left, up; frame b: that of the IMU."""
 
     scale: float            # m per unit of the odometer; of two wheels: of their mean
     scale_sigma: float      # relative
@@ -83,10 +83,10 @@ class Vehicle:
 def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     """Return the vehicle; BadConfig without a scale factor, or with more than two wheels."""
     def estimate_of(name: str, default: float, sigma: float = 0.0) -> tuple[float, float]:
-        e = estimates.get(name)
-        if e is None or e.value is None:
+        estimate = estimates.get(name)
+        if estimate is None or estimate.value is None:
             return default, sigma
-        return e.value, sigma if e.sigma is None else e.sigma
+        return estimate.value, sigma if estimate.sigma is None else estimate.sigma
 
     if len(config.odometer.wheels) > len(SIDES):
         raise BadConfig(f'odometer.wheels has {len(config.odometer.wheels)} wheels; the limit of '

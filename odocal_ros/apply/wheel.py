@@ -135,15 +135,11 @@ class Wheel:
             self._value = value
             is_count = isinstance(value, int) and self.form.quantity != 'rate'
             self.quantum = abs(self.scale) if is_count else 0.0
-            self._append(t, 0.0)
+            self.t.append(t)
+            self.s.append(0.0)
             return
         before = self._value
-        if self.form.quantity == 'rate':      # speeds do not show lost rows
-            self._row_times.next_time(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
-        else:
-            limit = FASTEST * STAMP_BURST + self.quantum
-            step = min(max(self._raw_travel(value, before, 0.0) * self.scale, -limit), limit)
-            t = self._row_times.next_time(t, self.s[-1] + step, self.speed, self.quantum)
+        t = self._sampling_time(t, value, before)
         dt = t - self.t[-1]
         self._rows += 1
         step = self._raw_travel(value, before, dt) * self.scale
@@ -154,14 +150,7 @@ class Wheel:
         row_speed = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         deviation = abs(row_speed - self.speed) * dt
         if self._is_implausible(t, dt, step, row_speed, deviation):
-            self.notes.append(f'the counter jumps by {step:+z.1f} m in {dt:.2f} s: a reset or an '
-                             f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
-            if abs(row_speed * dt) <= self._step_limit(dt):      # else it is certainly not travel
-                self._refused_error += row_speed * dt - self.speed * dt
-            step = self.speed * dt
-            # uniform error up to the travel at this speed and acceleration
-            lost = (abs(self.speed) + HARD_BRAKING * dt) * dt
-            self._add_variance((lost**2 + self.quantum**2) / 3)
+            step = self._interpolated_travel(dt, step, row_speed)
             value = before if self.form.quantity == 'rate' else value
         else:
             self._update_speed(dt, step, row_speed, deviation)
@@ -174,7 +163,28 @@ class Wheel:
         self._value = value
         if not has_gap:
             self.mean_interval += (dt - self.mean_interval) * (0.1 if self.mean_interval else 1.0)
-        self._append(t, self.s[-1] + step)
+        self.t.append(t)
+        self.s.append(self.s[-1] + step)
+
+    def _sampling_time(self, t: float, value: float, before: float) -> float:
+        """Return the time of a row without the jitter of its arrival t, s; of a speed, t."""
+        if self.form.quantity == 'rate':      # speeds do not show lost rows
+            self._row_times.next_time(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
+            return t
+        limit = FASTEST * STAMP_BURST + self.quantum
+        step = min(max(self._raw_travel(value, before, 0.0) * self.scale, -limit), limit)
+        return self._row_times.next_time(t, self.s[-1] + step, self.speed, self.quantum)
+
+    def _interpolated_travel(self, dt: float, step: float, row_speed: float) -> float:
+        """Return the travel, m, that replaces that of an implausible row; add its variance."""
+        self.notes.append(f'the counter jumps by {step:+z.1f} m in {dt:.2f} s: a reset or an '
+                         f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
+        if abs(row_speed * dt) <= self._step_limit(dt):      # else it is certainly not travel
+            self._refused_error += row_speed * dt - self.speed * dt
+        # uniform error up to the travel at this speed and acceleration
+        lost = (abs(self.speed) + HARD_BRAKING * dt) * dt
+        self._add_variance((lost**2 + self.quantum**2) / 3)
+        return self.speed * dt
 
     def _is_implausible(self, t: float, dt: float, step: float, row_speed: float,
                         deviation: float) -> bool:
@@ -267,10 +277,6 @@ class Wheel:
         """Add a variance, m^2, to the travel after the last row."""
         self.uncertain.append((self.t[-1] + 1e-6, variance))
 
-    def _append(self, t: float, s: float) -> None:
-        self.t.append(t)
-        self.s.append(s)
-
     def _raw_travel(self, value: float, before: float, dt: float) -> float:
         """Return the travel from a value to the next, in units of the odometer."""
         if self.form.quantity == 'rate':
@@ -283,7 +289,7 @@ class Wheel:
         return step
 
     def _travel_in_gap(self, dt: float, step: float) -> float:
-        """Return the travel to add for a gap, m; add variance for speeds and increments."""
+        """Return the travel, m, that ``step`` lacks for a gap of dt s; note it, add variance."""
         if self.form.quantity == 'cumulative':
             self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
                              'distributed evenly')

@@ -61,6 +61,7 @@ class Wheels:
         self._waiting = []
 
     def _feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
+        """Add rows after the first IMU message, whose stamp is t = 0."""
         if slot not in self._wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._set_scales(form)
@@ -70,7 +71,8 @@ class Wheels:
                    [value for _, _, value in rows])
         self._notes += wheel.notes
         wheel.notes.clear()
-        self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
+        wheels = self._wheels.values()
+        self.quantum = math.hypot(*(one.quantum for one in wheels)) / len(wheels)
 
     def _set_scales(self, form: OdometerForm) -> None:
         """Set the scales of left and right wheel, if there are two and they are calibrated."""
@@ -81,16 +83,16 @@ class Wheels:
 
     def are_complete(self) -> bool:
         """Return True if all expected wheels have rows."""
-        return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
+        return bool(self._wheels) and all(wheel.t for wheel in self._wheels.values()) and (
             not self._has_two_topics or len(self._wheels) == 2)
 
     def end_time(self) -> float:
         """Return the time up to which all wheels have rows, s."""
-        return min(w.t[-1] for w in self._wheels.values())
+        return min(wheel.t[-1] for wheel in self._wheels.values())
 
     def begin_time(self) -> float:
         """Return the time from which all wheels have rows, s."""
-        return max(w.t[0] for w in self._wheels.values())
+        return max(wheel.t[0] for wheel in self._wheels.values())
 
     def travel_at(self, t: float) -> float:
         """Return the travel at a time, m."""
@@ -99,25 +101,26 @@ class Wheels:
     def variance_between(self, t_from: float, t_to: float) -> float:
         """Return the variance of uncertain travel (faults, gaps) between two times, m^2."""
         wheels = self._wheels.values()
-        return sum(w.variance_between(t_from, t_to) for w in wheels) / len(wheels)**2
+        return sum(wheel.variance_between(t_from, t_to) for wheel in wheels) / len(wheels)**2
 
     def variances(self, t: float, T: float) -> tuple[float, float]:
         """Return the variances of the travel at t, and of the travel in the T s before, m^2."""
-        wheels, n = self._wheels.values(), len(self._wheels)**2
+        wheels, squared_count = self._wheels.values(), len(self._wheels)**2
         rounding = self.quantum**2 / 6
-        jitter = sum(w.jitter_variance(t, T) for w in wheels) / n
-        interpolation = sum(w.interpolation_variance(t) for w in wheels) / n
+        jitter = sum(wheel.jitter_variance(t, T) for wheel in wheels) / squared_count
+        interpolation = sum(wheel.interpolation_variance(t) for wheel in wheels) / squared_count
         return rounding + interpolation + jitter / 2, rounding + jitter
 
     @property
     def delay_s(self) -> float:
         """Return the sigma of the constant delay of the rows, s."""
-        return max(w.delay_s for w in self._wheels.values())
+        return max(wheel.delay_s for wheel in self._wheels.values())
 
     def are_still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times and no counter hangs."""
-        return all(not w.is_hung and abs(w.travel_at(t_to) - w.travel_at(t_from))
-                   <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
+        return all(not wheel.is_hung and abs(wheel.travel_at(t_to) - wheel.travel_at(t_from))
+                   <= REST_TRAVEL / 2 + STILL_COUNTS * wheel.quantum
+                   for wheel in self._wheels.values())
 
     def forget(self, t: float) -> None:
         """Drop the rows before a time, s."""

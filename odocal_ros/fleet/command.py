@@ -9,6 +9,7 @@ Imports of Dask and the pipeline are inside functions, so that --help stays quic
 
 import argparse
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 import re
 import sys
@@ -78,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     check_installed()
     from odocal_ros.fleet.bag_jobs import bag_jobs, make_output_folder
     from odocal_ros.fleet.bags import find_bags
-    from odocal_ros.fleet.engine import dashboard, engine
+    from odocal_ros.fleet.engine import engine
     from odocal_ros.fleet.fleet_results import exit_code, run_settings, summary_text, write_outcome
     from odocal_ros.fleet.kpi import write_kpi
     from odocal_ros.output.value_text import counted
@@ -94,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     make_output_folder(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
-            address = dashboard(client)
+            address = client.dashboard_link if find_spec('bokeh') else ''    # bokeh draws it
             warn(f'odocal: {counted(len(jobs), "bag")} of '
                  f'{counted(len({b.vehicle for b in bags}), "vehicle")}'
                  + f'; dashboard: {address}' * bool(address))

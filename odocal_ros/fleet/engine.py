@@ -80,11 +80,6 @@ def _workers(memory: int) -> int:
     return max(1, min(len(os.sched_getaffinity(0)), free // memory))
 
 
-def dashboard(client: Any) -> str:
-    """Return the address of the dashboard, '' without one or without bokeh, which draws it."""
-    return client.dashboard_link if find_spec('bokeh') else ''
-
-
 def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
                  keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
     """

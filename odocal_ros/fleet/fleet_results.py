@@ -58,6 +58,7 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
 def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                      files: bool) -> list[dict[str, Any]]:
     """Return the vehicles' rows, the worst first; write tables, and results if ``files``."""
+    import pyarrow.parquet as pq
     parts = folder / f'.parts.{uuid.uuid4().hex}'
     parts.mkdir(parents=True)
     try:
@@ -72,8 +73,9 @@ def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
             rows_by_group[k] = rows
         vehicles = tables.compare_with_model(
             [row for k in sorted(rows_by_group) for row in rows_by_group[k]])
-        tables.write_table(folder / tables.LEGS, tables.leg_schema(),
-                           tables.part_batches(sorted(parts.glob('*.parquet'))))
+        tables.write_table(folder / tables.LEGS, tables.leg_schema(), (
+            pq.ParquetFile(part).read(use_threads=False)
+            for part in sorted(parts.glob('*.parquet'))))
         tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
                            tables.vehicle_batches(vehicles))
         return vehicles

@@ -104,13 +104,6 @@ def vehicle_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
         yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
 
 
-def part_batches(parts: Sequence[Path]) -> Iterator[Any]:
-    """Yield the tables of files."""
-    import pyarrow.parquet as pq
-    for part in parts:
-        yield pq.ParquetFile(part).read(use_threads=False)
-
-
 def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
     """Write tables one after the other to one file, atomically."""
     import pyarrow as pa

@@ -72,11 +72,6 @@ class ValueHistory:
     by_distance: History = History()      # over 1000 km, of the scale only
 
     @property
-    def first_after_change(self) -> list[int]:
-        """Return the number of the first leg after each change."""
-        return [self.legs[change.leg] for change in self.by_date.changes]
-
-    @property
     def outlier_legs(self) -> list[int]:
         """Return the numbers of the single outlier legs."""
         return [self.legs[k] for k in self.by_date.outliers]
@@ -175,7 +170,8 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, legs, config) for name in MAIN_VALUES}
     # first legs of the periods without changes
-    starts = sorted({0}.union(*(values.first_after_change for values in histories.values())))
+    starts = sorted({0, *(values.legs[change.leg] for values in histories.values()
+                          for change in values.by_date.changes)})
     current = legs[starts[-1]:]
     calibration = combine([driven.leg for driven in current], config, imu=known_imu(config))
     rejected = legs[1 + max((k for k, driven in enumerate(legs)

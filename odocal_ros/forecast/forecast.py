@@ -19,7 +19,7 @@ UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000
 PREDICTED_REST_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
 # estimates in ~/status, and the unit at the end of their keys
-RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
+RUNNING_UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
 
 class Abandoned(Exception):
@@ -38,8 +38,12 @@ class ParameterForecast:
     value_text: str = ''    # the value so far, as text, if it is determined before the end
     manoeuvre: str = ''     # required manoeuvres, besides distance
 
-    def as_text(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
-        """Return the forecast as text, sigmas times ``factor`` in ``unit``, ``since`` m later."""
+    def as_text(self, name: str, unit: str, factor: float, driven_m: float = 0.0) -> str:
+        """
+        Return the forecast as text.
+
+        unit, factor : of the printed sigmas.   driven_m : m since the forecast.
+        """
         if unit == 'ppm':
             factor, unit = relative_unit(self.sigma or 0.0, self.limit)
         limit = three_digits(float(f'{self.limit * factor:.2g}'))
@@ -55,7 +59,7 @@ class ParameterForecast:
             return f'{estimate}: {self.why}'
         if self.remaining_m == 0.0:
             return f'OK: {estimate} (limit {limit})'
-        remaining_m = self.remaining_m - since
+        remaining_m = self.remaining_m - driven_m
         action = (f'drive {_rounded_up(remaining_m)} m more' if remaining_m > 0 else 'drive on') \
             + f' to reach the limit of {limit_with_unit}'
         if sigma is None:
@@ -94,9 +98,9 @@ class Forecast:
 
     def as_text(self, distance_m: float = 0.0) -> str:
         """Return reached and unreachable limits, and the distances from distance_m, as text."""
-        since = max(0.0, distance_m - self.distance_m)
-        return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, since),
-                          self.yaw.as_text('yaw', 'deg', math.degrees(1), since)])
+        driven_m = max(0.0, distance_m - self.distance_m)
+        return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, driven_m),
+                          self.yaw.as_text('yaw', 'deg', math.degrees(1), driven_m)])
 
     @property
     def complete(self) -> bool:
@@ -106,11 +110,13 @@ class Forecast:
     @property
     def manoeuvres(self) -> list[str]:
         """Return the required manoeuvres, besides distance."""
-        return list(dict.fromkeys(p.manoeuvre for p in (self.scale, self.yaw) if p.manoeuvre))
+        return list(dict.fromkeys(parameter.manoeuvre for parameter in (self.scale, self.yaw)
+                                  if parameter.manoeuvre))
 
-    def ended(self) -> 'Forecast':
+    def without_predictions(self) -> 'Forecast':
         """Return the running estimate only, for a leg that has ended."""
-        scale, yaw = (ParameterForecast(None, one.limit, None) for one in (self.scale, self.yaw))
+        scale, yaw = (ParameterForecast(None, parameter.limit, None)
+                      for parameter in (self.scale, self.yaw))
         return Forecast(scale, yaw, estimates=self.estimates, until_ns=self.until_ns)
 
     def age_s(self, stamp_ns: int) -> float:
@@ -123,13 +129,19 @@ def combine_sections(earlier: Forecast | None, newest: Forecast | None) -> Forec
     """Return the forecast of two sections of a leg, each quantity from the better one."""
     if earlier is None or newest is None:
         return newest or earlier
-    values = {name: min((f.estimates[name] for f in (newest, earlier) if name in f.estimates),
-                        key=lambda e: math.inf if e.value is None or e.sigma is None else e.sigma)
-              for name in {**earlier.estimates, **newest.estimates}}
-    pitch = min((f.pitch for f in (newest, earlier) if f.pitch is not None), default=None)
+    sections = newest, earlier
+    estimates = {name: min((section.estimates[name] for section in sections
+                            if name in section.estimates), key=_sigma_or_infinity)
+                 for name in {**earlier.estimates, **newest.estimates}}
+    pitch = min((section.pitch for section in sections if section.pitch is not None), default=None)
     return replace(newest, scale=_combine_parameter(earlier.scale, newest.scale),
-                   yaw=_combine_parameter(earlier.yaw, newest.yaw), pitch=pitch, estimates=values,
-                   wheels=newest.wheels or earlier.wheels)
+                   yaw=_combine_parameter(earlier.yaw, newest.yaw), pitch=pitch,
+                   estimates=estimates, wheels=newest.wheels or earlier.wheels)
+
+
+def _sigma_or_infinity(estimate: Estimate) -> float:
+    """Return the sigma of an estimate, infinite without value or sigma."""
+    return math.inf if estimate.value is None or estimate.sigma is None else estimate.sigma
 
 
 def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) -> ParameterForecast:
@@ -146,13 +158,15 @@ def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str,
     """Return the keys of ``~/status``; age_s : of the newest sample of the forecast."""
     keys = _running_keys(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
-        one = ParameterForecast(None, 0.0, None) if forecast is None else getattr(forecast, name)
+        parameter = ParameterForecast(None, 0.0, None) if forecast is None else (
+            getattr(forecast, name))
+        sigma, metres = parameter.sigma, parameter.remaining_m
         keys |= {
-            f'predicted_{name}_sigma_{unit}': '' if one.sigma is None else one.sigma * factor,
-            f'metres_to_go_{name}': '' if one.remaining_m is None else one.remaining_m,
-            f'largest_error_source_{name}': one.sources[0][0] if one.sources else '',
+            f'predicted_{name}_sigma_{unit}': '' if sigma is None else sigma * factor,
+            f'metres_to_go_{name}': '' if metres is None else metres,
+            f'largest_error_source_{name}': parameter.sources[0][0] if parameter.sources else '',
             f'predicted_{name}_sources_{unit}': ', '.join(
-                f'{source} {three_digits(sigma * factor)}' for source, sigma in one.sources)}
+                f'{source} {three_digits(size * factor)}' for source, size in parameter.sources)}
     return keys
 
 
@@ -161,12 +175,12 @@ def _running_keys(forecast: Forecast | None, age_s: float) -> dict[str, str | fl
     estimates = {} if forecast is None else forecast.estimates
     keys: dict[str, str | float] = {}
     methods = []
-    for name, unit in RUNNING.items():
+    for name, unit in RUNNING_UNITS.items():
         estimate = estimates.get(name, Estimate(None, None, ''))
         known = estimate.value is not None
         methods += [estimate.method] * known
-        for end, value in (('', estimate.value), ('_sigma', estimate.sigma if known else None)):
-            keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
+        for suffix, value in (('', estimate.value), ('_sigma', estimate.sigma if known else None)):
+            keys[f'estimate_{name}{suffix}{unit}'] = math.nan if value is None else value
     return keys | {'estimate_method': ', '.join(dict.fromkeys(methods)),
                    'estimate_age_s': math.nan if forecast is None else age_s}
 
@@ -185,7 +199,7 @@ def three_digits(value: float) -> str:
 def main_sources(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
     """Return (name, sigma) of the main error sources of a parameter, the largest first."""
     row = method.parameters.index(parameter)
-    sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
+    sizes = {source.name: float(np.linalg.norm(source.effects[row])) for source in method.sources}
     min_variance = SOURCE_SHARE * sum(size**2 for size in sizes.values())
     return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > min_variance),
                         key=lambda source: -source[1]))

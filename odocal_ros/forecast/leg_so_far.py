@@ -55,7 +55,7 @@ class ImuGaps:
         self._edges_ns: list[int] = []      # stamps before and after each gap
 
     def feed(self, block: ImuSamples) -> int:
-        """Take IMU rows; return the stamp after a gap, 0 without a gap."""
+        """Take IMU rows; return the stamp after the last gap among them, 0 without a gap."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):
             return 0

@@ -169,8 +169,9 @@ def ideal_planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Fl
     turn = increments[:, 2]
     heading = running_sum(turn)
     chord = (increments[:, 0] + 1j * increments[:, 1]) * np.sinc(turn / (2 * np.pi))
-    z = running_sum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2))
-    state = np.column_stack([z.real, z.imag, heading, 0 * heading, 0 * heading])
+    position = running_sum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2))
+    no_drift = np.zeros((len(heading), 2))
+    state = np.column_stack([position.real, position.imag, heading, no_drift])
     node = _position_nodes(motion, robot)
     gyro = turn if robot.imu else np.empty(0)
     run = Run(motion.t, wheels, node, state[node, :2], np.full(len(node), robot.white), gyro)
@@ -216,8 +217,8 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -
 
 def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
     """Return the noise levels that a fit would estimate, at the mean path of a wheel."""
-    d = motion.increments
-    straight, turning = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2]) * robot.width / 2
+    forward, left, turn = motion.increments.T
+    straight, turning = np.hypot(forward, left), np.abs(turn) * robot.width / 2
     path = straight + turning
     moving = path > 0
     spins = moving & (straight < turning)
@@ -272,15 +273,15 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
     Ideal wheels have no noise from which the smoother could estimate slip. Least squares: right
     minus left wheel path is ratio times path plus width times turn.
     """
-    d = motion.increments[motion.moving[1:], ::2]
-    covariance = np.linalg.pinv(d.T @ d) * 2 * robot.slip**2 * MOTION_STEP
+    path_and_turn = motion.increments[motion.moving[1:], ::2]      # (n, 2) m, rad
+    covariance = np.linalg.pinv(path_and_turn.T @ path_and_turn) * 2 * robot.slip**2 * MOTION_STEP
     ratio, width = np.sqrt(np.diag(covariance))
     estimates = dict(method.estimates)
     for name, slip_sigma in (('scale_factor_left', ratio / 2), ('scale_factor_right', ratio / 2),
                              ('track_width', width)):
-        one = estimates[name]
-        if one.sigma is not None:
-            estimates[name] = replace(one, sigma=float(np.hypot(one.sigma, slip_sigma)))
+        estimate = estimates[name]
+        if estimate.sigma is not None:
+            estimates[name] = replace(estimate, sigma=float(np.hypot(estimate.sigma, slip_sigma)))
     return replace(method, estimates=estimates, details=method.details | {
         'ratio_sigma': float(ratio)})
 

@@ -82,7 +82,7 @@ def ideal_samples(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> IdealS
     """
     config = sigmas.config
     spans = np.array(drive.standstills(config.leg.standstill)).reshape(-1, 2)
-    at_start = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
+    at_start = [span for span in spans if span[0] <= 0.5 and span[1] >= -BEFORE_MARK]
     t_begin = max(min(0.0, float(at_start[-1][0])), -config.leg.preroll) if at_start else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
     highest_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
@@ -146,6 +146,7 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
 
 
 def _true_state(motion: _Motion, key: Ints) -> State:
+    """Return the state at the keyframes, rows ``key``, with all errors and biases zero."""
     N = len(key)
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
                  np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),
@@ -241,7 +242,7 @@ class Plan:
     @property
     def methods_used(self) -> tuple[str, ...]:
         """Return the methods that will give any parameter of interest."""
-        names = (self.method_of(p) for p in self.two_point.method.parameters)
+        names = (self.method_of(parameter) for parameter in self.two_point.method.parameters)
         return tuple(dict.fromkeys(name for name in names if name))
 
     @property
@@ -255,7 +256,8 @@ class Plan:
         """Return the predicted reasons of a method; for two_point also those of its alignment."""
         if name != 'two_point':
             return self.methods[name].reasons
-        return tuple(r for r in self.two_point.reasons if r not in self.two_point.drive_reasons)
+        return tuple(reason for reason in self.two_point.reasons
+                     if reason not in self.two_point.drive_reasons)
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
@@ -269,11 +271,12 @@ class Plan:
         for name in self.methods:
             relevant = relevant_reasons(self.reasons_of(name), name, self.estimates)
             if name == 'smoother':
-                relevant = tuple(r for r in self.reasons_of(name) if r in relevant
-                                 or r.code.name.endswith('_NOT_DETERMINED'))
+                relevant = tuple(reason for reason in self.reasons_of(name) if reason in relevant
+                                 or reason.code.name.endswith('_NOT_DETERMINED'))
             elif name not in self.methods_used:
-                relevant = tuple(r for r in relevant if r.code.severity is Verdict.REJECTED)
-            reasons += [r for r in relevant if r not in reasons]
+                relevant = tuple(reason for reason in relevant
+                                 if reason.code.severity is Verdict.REJECTED)
+            reasons += [reason for reason in relevant if reason not in reasons]
         return tuple(reasons)
 
 

@@ -39,7 +39,7 @@ class Clocks:
         # until a later IMU block arrives
         self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
         self._waiting: dict[str, tuple[int, int]] = {}
-        self._ahead_s: dict[str, deque[float]] = {}
+        self._leads_s: dict[str, deque[float]] = {}      # of the stamps over those of the IMU
 
     def feed(self, slot: str, block: Samples) -> None:
         """Take a block of a topic."""
@@ -56,23 +56,23 @@ class Clocks:
         # messages that queue for a node in simulated time arrive late, those of the IMU more than
         # others: then it is not known which of them belong together
         queued = self._simulated and np.ptp(received - stamps) > CLOCK_DIFFERENCE_LIMIT * 1e9
-        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
-            row = row_ns - first_received
-            if row > received.max():
+        for name, (arrival_ns, stamp_ns) in list(self._waiting.items()):
+            arrival = arrival_ns - first_received
+            if arrival > received.max():
                 continue
             del self._waiting[name]
-            if row >= received.min() and not queued:
-                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
-                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
+            if arrival >= received.min() and not queued:
+                lead_s = (stamp_ns - first_stamp - np.interp(arrival, received, stamps)) * 1e-9
+                self._leads_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(lead_s))
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
         """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
         result = []
-        for slot, ahead in self._ahead_s.items():
+        for slot, leads_s in self._leads_s.items():
             offset = stamp_offsets(config)[slot]
             # latency makes a row look older: a clock is behind only if all its rows are; latency
             # of IMU rows makes others look newer: a clock is ahead if most of its rows are
-            difference = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
+            difference = max(min(max(leads_s) + offset, 0.0), float(np.median(leads_s)) + offset)
             if abs(difference) > CLOCK_DIFFERENCE_LIMIT:
                 result.append((slot, difference))
         return result
@@ -148,7 +148,7 @@ class OdometerProgress:
 
 
 class FixPath:
-    """Distance along the fixes while the counter moves; steps below the noise are ignored."""
+    """Path length of the fixes while the odometer moves; steps below the noise are ignored."""
 
     def __init__(self) -> None:
         self.total = self.top = 0.0      # m, m/s

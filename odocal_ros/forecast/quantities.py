@@ -167,8 +167,8 @@ class Quantity:
     label: str
     estimates: tuple[str, ...]
     relative: bool
-    of_two_wheels: bool = False
-    of_imu: bool = False      # a mounting angle: not estimated by the planar estimator
+    needs_two_wheels: bool = False
+    is_mounting_angle: bool = False      # not estimated by the planar estimator
 
     def limit(self, config: Config) -> float:
         """Return the limit of the sigma, relative to the value or rad."""
@@ -180,8 +180,8 @@ class Quantity:
 
 QUANTITIES = {
     'scale': Quantity('scale', ('scale_factor',), True),
-    'yaw': Quantity('yaw', ('yaw_mounting_angle',), False, of_imu=True),
-    'pitch': Quantity('pitch', ('pitch_mounting_angle',), False, of_imu=True),
+    'yaw': Quantity('yaw', ('yaw_mounting_angle',), False, is_mounting_angle=True),
+    'pitch': Quantity('pitch', ('pitch_mounting_angle',), False, is_mounting_angle=True),
     'left_right': Quantity('left and right wheel', ('scale_factor_left', 'scale_factor_right'),
                            True, True),
     'track_width': Quantity('track width', ('track_width',), True, True),
@@ -206,16 +206,17 @@ def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
         return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch') if rejected else (), NO)
     sigmas = {name: None if rejected else forecast.sigma(name)
               for name, quantity in QUANTITIES.items()
-              if not (quantity.of_two_wheels and (not two_wheels or forecast.wheels is None)
-                      or quantity.of_imu and PLANAR in forecast.methods)}
+              if not (quantity.needs_two_wheels and (not two_wheels or forecast.wheels is None)
+                      or quantity.is_mounting_angle and PLANAR in forecast.methods)}
     return _check_sigmas(sigmas, config)
 
 
 def check_calibration(calibration: Calibration, config: Config,
                       two_wheels: bool) -> dict[str, str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
-    names_with_reason = {REASON_ESTIMATES[r.code] for r in calibration.reasons
-                         if r.code in REASON_ESTIMATES and r.code.severity is not Verdict.ACCEPTED}
+    names_with_reason = {
+        REASON_ESTIMATES[reason.code] for reason in calibration.reasons
+        if reason.code in REASON_ESTIMATES and reason.code.severity is not Verdict.ACCEPTED}
     return check_estimates(calibration.estimates, config, two_wheels,
                            calibration.verdict is not Verdict.REJECTED, names_with_reason)
 
@@ -228,17 +229,17 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
     valid : False: no value is usable.   names_with_reason : estimates with a reason against their
     use.
     """
-    planar = any(e.method == PLANAR for e in estimates.values())
+    planar = any(estimate.method == PLANAR for estimate in estimates.values())
     sigmas: dict[str, float | None] = {}
     unusable = set()
     for name, quantity in QUANTITIES.items():
-        parts = [estimates.get(part) for part in quantity.estimates]
-        if quantity.of_imu and planar:
+        parts = [estimates.get(part_name) for part_name in quantity.estimates]
+        if quantity.is_mounting_angle and planar:
             continue
-        if quantity.of_two_wheels and not two_wheels and not any(
-                e is not None and e.value is not None for e in parts):
+        if quantity.needs_two_wheels and not two_wheels and not any(
+                part is not None and part.value is not None for part in parts):
             continue
-        sigmas[name] = max(_sigma_or_infinity(e, quantity.relative) for e in parts)
+        sigmas[name] = max(_sigma_or_infinity(part, quantity.relative) for part in parts)
         if not valid or names_with_reason & set(quantity.estimates):
             unusable.add(name)
     return _check_sigmas(sigmas, config) | dict.fromkeys(unusable, NO)
@@ -253,7 +254,7 @@ def quantities_text(ok: dict[str, str]) -> str:
     """Return the quantities as text, empty if all are unknown."""
     parts = []
     for value, text in ((YES, 'OK'), (NO, 'not OK')):
-        labels = [QUANTITIES[name].label for name, v in ok.items() if v == value]
+        labels = [QUANTITIES[name].label for name, answer in ok.items() if answer == value]
         if labels:
             parts.append(f'{text}: {", ".join(labels)}')
     return '; '.join(parts)

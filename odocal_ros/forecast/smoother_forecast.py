@@ -79,15 +79,15 @@ def without_accelerometer_values(forecast: Forecast) -> Forecast:
 def add_running_estimate(forecast: Forecast, running: RunningEstimate, config: Config) -> Forecast:
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
-    faults = [r for r in method.reasons
-              if r.code.severity is Verdict.REJECTED and r.code not in REASON_ESTIMATES]
+    faults = [reason for reason in method.reasons if reason.code.severity is Verdict.REJECTED
+              and reason.code not in REASON_ESTIMATES]
     if faults:      # its values are useless then
         return replace(forecast, faults=tuple(faults))
     if method.verdict is not Verdict.REJECTED:
         forecast = replace(forecast, methods=forecast.methods | {'smoother': method})
     estimates, _ = choose(forecast.methods, config.method)
-    by_smoother = {name for name, e in estimates.items()
-                   if e.value is not None and e.method == 'smoother'}
+    by_smoother = {name for name, estimate in estimates.items()
+                   if estimate.value is not None and estimate.method == 'smoother'}
     scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
     if SCALE in by_smoother or scale.sigma is None:
         scale = _forecast_scale(running, scale.limit)
@@ -110,29 +110,31 @@ def forecast_wheels(method: MethodResult) -> WheelsForecast | None:
 
 def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast:
     """Return the forecast of the scale, whose sigma falls with the path length."""
-    e = running.method.estimates[SCALE]
+    scale = running.method.estimates[SCALE]
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
     power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
     metres = _remaining_distance(running, sigma / limit, power)
-    value = '' if e.value is None or e.sigma is None else format_value(e.value, e.sigma)
-    if value and e.unit != '1':
-        value += f' {e.unit}'
+    value = '' if scale.value is None or scale.sigma is None else format_value(
+        scale.value, scale.sigma)
+    if value and scale.unit != '1':
+        value += f' {scale.unit}'
     return ParameterForecast(sigma, limit, metres, main_sources(running.method, SCALE),
                              UNREACHABLE, value)
 
 
 def _slow_share(running: RunningEstimate) -> float:
     """Return the share of slow errors in the contribution of fixes to the scale's variance."""
-    variances = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
-                 if s.name in ('fixes', 'slow_fix_errors')}
+    variances = {source.name: float((source.effects[0]**2).sum())
+                 for source in running.method.sources
+                 if source.name in ('fixes', 'slow_fix_errors')}
     total = sum(variances.values())
     return variances.get('slow_fix_errors', 0.0) / total if total else 0.0
 
 
 def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
     """Return the forecast of the yaw: its information is proportional to running.agility."""
-    e = running.method.estimates[YAW]
+    yaw = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
     ratio, manoeuvre = sigma / limit, ''
     if ratio > 1:
@@ -140,8 +142,8 @@ def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
         stops = math.ceil(max(running.agility, of_one_stop / 2) * (ratio**2 - 1) / of_one_stop)
         times = 'often' if stops > MAX_STOPS else f'{stops} time{"s" * (stops > 1)}'
         manoeuvre = f'for the yaw: stop and start {times}, or make as many turns'
-    value = '' if e.value is None or e.sigma is None else format_value(
-        math.degrees(e.value), math.degrees(e.sigma))
+    value = '' if yaw.value is None or yaw.sigma is None else format_value(
+        math.degrees(yaw.value), math.degrees(yaw.sigma))
     return ParameterForecast(sigma, limit, _remaining_distance(running, ratio, 2.0),
                              main_sources(running.method, YAW), '', value, manoeuvre)
 
@@ -173,9 +175,9 @@ def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> 
     method = result.methods[PLANAR]
     if result.track_n is None:
         raise BadData(method.reasons[0].text)
-    faults = tuple(r for r in (*result.reasons, *method.reasons)
-                   if r.code.severity is Verdict.REJECTED
-                   and r.code not in {*REASON_ESTIMATES, *TEMPORARY_CODES})
+    faults = tuple(reason for reason in (*result.reasons, *method.reasons)
+                   if reason.code.severity is Verdict.REJECTED
+                   and reason.code not in {*REASON_ESTIMATES, *TEMPORARY_CODES})
     estimates, _ = choose(result.methods, config.method)
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),

@@ -26,8 +26,8 @@ from odocal_ros.screening.late_rows import ON_TIME_WINDOW, sampling_times
 # that the time of an update is bounded
 FIRST_CELL_NS = 100_000_000
 MAX_CELLS = 16_000
-SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: rows that much later have no effect
-RHYTHM_NS = 3 * SETTLED_NS       # judgement: rows that much earlier determine the rhythm
+FINAL_AGE_NS = round(ON_TIME_WINDOW * 1e9)    # definition: later rows have no effect
+INTERVAL_SPAN_NS = 3 * FINAL_AGE_NS    # judgement: earlier rows that determine the interval
 UNROLLED = data.OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
 
 
@@ -39,7 +39,7 @@ class ThinnedLeg:
         # by slot: rows of finished cells; samples of the unfinished cell; width of cells; newest
         # counts; last count as received, (1,), and as unrolled
         self._cells: dict[str, Any] = {}
-        self._open: dict[str, Any] = {}
+        self._unfinished: dict[str, Any] = {}
         self._width_ns: dict[str, int] = {}
         self._recent: dict[str, RecentCounts] = {}
         self._last: dict[str, tuple[Values, int | float]] = {}
@@ -51,19 +51,20 @@ class ThinnedLeg:
         if not len(samples.stamp_ns):
             return
         if slot == 'fix':
-            before = self._open.get('fix', data.take(samples, slice(0, 0))).stamp_ns[-1:]
+            before = self._unfinished.get('fix', data.take(samples, slice(0, 0))).stamp_ns[-1:]
             self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
         if isinstance(samples, data.OdometerSamples) and self.form.quantity != 'rate':
             recent = self._recent.setdefault(slot, RecentCounts())
             samples = recent.feed(self._unrolled(slot, samples))
             if not len(samples.stamp_ns):
                 return
-        rows = data.join([self._open[slot], samples]) if slot in self._open else samples
+        rows = samples if slot not in self._unfinished else data.join(
+            [self._unfinished[slot], samples])
         width_ns = self._width_ns.setdefault(slot, FIRST_CELL_NS)
         cell = rows.stamp_ns // width_ns
         changes = np.flatnonzero(np.diff(cell)) + 1
         first_open = int(changes[-1]) if len(changes) else 0
-        self._open[slot] = data.take(rows, slice(first_open, None))
+        self._unfinished[slot] = data.take(rows, slice(first_open, None))
         if not first_open:
             return
         averaged = self._averaged(slot)
@@ -90,8 +91,8 @@ class ThinnedLeg:
     def _counts(self, slot: str) -> data.OdometerSamples:
         """Return the cells of a counter, also of rows whose times are not final."""
         rows = self._recent[slot].rest()
-        if slot in self._open:
-            rows = data.join([self._open[slot], rows])
+        if slot in self._unfinished:
+            rows = data.join([self._unfinished[slot], rows])
         width_ns = self._width_ns.get(slot, FIRST_CELL_NS)
         cells = _cell_rows(rows, rows.stamp_ns // width_ns, ())
         finished: data.OdometerSamples | None = self._cells.get(slot)
@@ -105,6 +106,7 @@ class ThinnedLeg:
         return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
 
     def _averaged(self, slot: str) -> tuple[str, ...]:
+        """Return the names of the columns of a topic that are averaged in a cell."""
         rates = ('value',) if self.form.quantity == 'rate' else ()
         return {'imu': ('w_i', 'f_i'), **dict.fromkeys(WHEELS, rates)}.get(slot, ())
 
@@ -158,11 +160,11 @@ class RecentCounts:
     def feed(self, rows: data.OdometerSamples) -> data.OdometerSamples:
         """Take rows, and return those whose times are final."""
         rows = rows if self._rows is None else data.join([self._rows, rows])
-        settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
-        settled = max(settled, self._returned)
-        final = data.take(_at_sampling_times(rows), slice(self._returned, settled))
-        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - RHYTHM_NS))
-        self._rows, self._returned = data.take(rows, slice(first, None)), settled - first
+        final_count = max(self._returned, int(np.searchsorted(
+            rows.stamp_ns, rows.stamp_ns[-1] - FINAL_AGE_NS)))
+        final = data.take(_at_sampling_times(rows), slice(self._returned, final_count))
+        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[final_count] - INTERVAL_SPAN_NS))
+        self._rows, self._returned = data.take(rows, slice(first, None)), final_count - first
         return final
 
     def rest(self) -> data.OdometerSamples:

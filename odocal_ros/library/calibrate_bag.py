@@ -10,17 +10,7 @@ from typing import Any
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadTopics, BadUsage, OdocalError
-from odocal_ros.library.arguments import (
-    config_of,
-    Leg,
-    legs_of,
-    LegSpan,
-    Listener,
-    Notes,
-    paths_of,
-    Settings,
-    topics_of,
-)
+from odocal_ros.library import arguments
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.find_legs import coverage_reasons, missing_stop_reasons, OPEN_LEG
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
@@ -39,9 +29,10 @@ class LegDropped(BadUsage):
 
 
 def calibrate_bag(path: Path | str | Sequence[Path | str],
-                  topics: Mapping[str, str] | None = None, config: Settings = None,
-                  legs: Iterable[Leg] | Leg | None = None, *, holdout: bool = False,
-                  listener: Listener | None = None) -> Calibration:
+                  topics: Mapping[str, str] | None = None, config: arguments.Settings = None,
+                  legs: Iterable[arguments.Leg] | arguments.Leg | None = None, *,
+                  holdout: bool = False,
+                  listener: arguments.Listener | None = None) -> Calibration:
     """
     Calibrate from a recorded bag, or from several of one vehicle.
 
@@ -59,15 +50,15 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     from odocal_ros.output.program_files import with_imu_frame
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
-    notes = Notes(listener or Listener())
-    arguments = _Arguments(topics_of(topics), config, legs_of(legs), holdout)
-    imu = known_imu(config_of(config))
-    paths, repeated = unique_paths(paths_of(path))
+    notes = arguments.Notes(listener or arguments.Listener())
+    request = _Request(arguments.topics_of(topics), config, arguments.legs_of(legs), holdout)
+    imu = known_imu(arguments.config_of(config))
+    paths, repeated = unique_paths(arguments.paths_of(path))
     for duplicate in repeated:
         notes.note(f'{duplicate} is given twice; it is read once')
     if len(paths) > 1:
-        check_all_bags(paths, lambda bag: _check_bag(bag, arguments))
-    bags = _calibrate_bags(paths, arguments, notes)
+        check_all_bags(paths, lambda bag: _check_bag(bag, request))
+    bags = _calibrate_bags(paths, request, notes)
     settings = bags[-1].config
     first, *others = [flat(bag.config) for bag in bags]      # each journal has settings
     # as text: an unset one is NaN, which is not equal to itself
@@ -83,22 +74,22 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 
 
 @dataclass(frozen=True)
-class _Arguments:
+class _Request:
     """The arguments of ``calibrate_bag``, checked."""
 
     topics: dict[str, str]
-    config: Settings
-    legs: list[LegSpan | str]
+    config: arguments.Settings
+    legs: list[arguments.LegSpan | str]
     holdout: bool
 
 
-def _check_bag(path: Path, arguments: _Arguments) -> None:
+def _check_bag(path: Path, request: _Request) -> None:
     """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
     journal = journal_notes(path)
-    settings = config_of(arguments.config, journal.settings if journal else None)
+    settings = arguments.config_of(request.config, journal.settings if journal else None)
     with open_bag(path) as bag:
-        readers_of(bag, arguments.topics, settings, journal)
+        readers_of(bag, request.topics, settings, journal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +104,15 @@ class _BagLegs:
     legs: list[LegResult]
 
 
-def _calibrate_bags(paths: list[Path], arguments: _Arguments, listener: Notes) -> list[_BagLegs]:
+def _calibrate_bags(paths: list[Path], request: _Request,
+                    listener: arguments.Listener) -> list[_BagLegs]:
     """Return the results of each bag; a journal whose leg was dropped is skipped, if not alone."""
     bags: list[_BagLegs] = []
     dropped = None
     for path in paths:
         try:
             unit = bags[0].unit if bags else None
-            bags.append(_calibrate_one_bag(path, arguments, unit, listener))
+            bags.append(_calibrate_one_bag(path, request, unit, listener))
         except LegDropped as error:
             dropped = error
             if len(paths) > 1:
@@ -134,10 +126,10 @@ def _calibrate_bags(paths: list[Path], arguments: _Arguments, listener: Notes) -
     return bags
 
 
-def _calibrate_one_bag(path: Path, arguments: _Arguments, previous_unit: str | None,
-                       listener: Notes) -> _BagLegs:
+def _calibrate_one_bag(path: Path, request: _Request, previous_unit: str | None,
+                       listener: arguments.Listener) -> _BagLegs:
     """Read a bag and calibrate its legs; previous_unit: of the scale in the bags before."""
-    bag = read_bag(path, arguments.topics, arguments.config, listener=listener)
+    bag = read_bag(path, request.topics, request.config, listener=listener)
     unit = bag.form.scale_unit
     if previous_unit and unit != previous_unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '
@@ -145,22 +137,23 @@ def _calibrate_one_bag(path: Path, arguments: _Arguments, previous_unit: str | N
                        f'{UNIT_TEXTS[previous_unit]}: they cannot be combined; calibrate them '
                        'separately, or name topics of one kind')
     return _BagLegs(path, {'bag': bag.name, 'sha256': bag.sha256, 'topics': bag.topics},
-                    bag.config, bag.imu_frame, unit, _calibrate_legs(bag, arguments, listener))
+                    bag.config, bag.imu_frame, unit, _calibrate_legs(bag, request, listener))
 
 
-def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> list[LegResult]:
+def _calibrate_legs(bag: Recording, request: _Request,
+                    listener: arguments.Listener) -> list[LegResult]:
     """Return the results of the legs of a bag: requested, marked by the node, or searched."""
-    if bag.dropped and not arguments.legs:
+    if bag.dropped and not request.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')
-    marks = () if arguments.legs else bag.marks
+    marks = () if request.legs else bag.marks
     if any(not stop for _, stop in marks):
         listener.note(f'{bag.name}: {OPEN_LEG}')
-    spans = bag.spans(arguments.legs)
-    is_searched = not (marks or arguments.legs)      # between standstills
+    spans = bag.spans(request.legs)
+    is_searched = not (marks or request.legs)      # between standstills
     coverage = coverage_reasons(bag.recorder) if is_searched else ()
     notes = [bag.notes + coverage + note for note in missing_stop_reasons(spans, marks)]
-    results = _calibrate_spans(bag, spans, notes, arguments.holdout, listener)
+    results = _calibrate_spans(bag, spans, notes, request.holdout, listener)
     if bag.config.leg.automatic and is_searched:
         return _usable_automatic_legs(results, listener)
     return results
@@ -168,7 +161,7 @@ def _calibrate_legs(bag: Recording, arguments: _Arguments, listener: Notes) -> l
 
 def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
                      notes: list[tuple[Reason, ...]], holdout: bool,
-                     listener: Notes) -> list[LegResult]:
+                     listener: arguments.Listener) -> list[LegResult]:
     """Return the results of the legs between stamps, ns, each with its notes."""
     from odocal_ros.pipeline.calibrate import calibrate_parts
     results = []
@@ -185,7 +178,8 @@ def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
     return results
 
 
-def _usable_automatic_legs(results: list[LegResult], listener: Notes) -> list[LegResult]:
+def _usable_automatic_legs(results: list[LegResult],
+                           listener: arguments.Listener) -> list[LegResult]:
     """Return the usable legs, as the node does; note the others. All if none is usable."""
     from odocal_ros.pipeline.automatic import rejecting_reason
     causes = [rejecting_reason(leg) for leg in results]

@@ -49,7 +49,9 @@ def simulate_fleet(out: Path, options: SimOptions, vehicles: int, bags: int, *,
             recorded = with_broken_counter(drive) if vehicle.has_broken_counter(bag) else drive
             name = f'{vehicle.name}/bag_{bag + 1:02d}'
             write_bag(out / name, drive_topics(recorded), storage, compression, force)
-            rows.append(_manifest_row(vehicle, name, bag))
+            rows.append({'vehicle': vehicle.name, 'bag': name,
+                         'config': f'{vehicle.model.name}.yaml', 'model': vehicle.model.name,
+                         'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'})
             drives.append(drive)
         if number < len(MODELS):      # the first vehicle of each model
             node = {'/**/calibrator': {'ros__parameters': settings(drives[0], None)}}
@@ -61,11 +63,6 @@ def simulate_fleet(out: Path, options: SimOptions, vehicles: int, bags: int, *,
     write_yaml(out / TRUTH, {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
     write_text(manifest, csv_text(rows))      # last: it marks a complete fleet
     return manifest
-
-
-def _manifest_row(vehicle: FleetVehicle, name: str, bag: int) -> dict[str, str]:
-    return {'vehicle': vehicle.name, 'bag': name, 'config': f'{vehicle.model.name}.yaml',
-            'model': vehicle.model.name, 'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}
 
 
 def _truth(vehicle: FleetVehicle, drives: list[Drive]) -> dict[str, Any]:

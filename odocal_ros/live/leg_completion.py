@@ -214,7 +214,8 @@ class LegCompletion:
 
     def _end_leg(self, mark_ns: int) -> None:
         view = self.view()
-        self._view_at_stop = replace(view, forecast=view.forecast and view.forecast.ended())
+        self._view_at_stop = replace(
+            view, forecast=view.forecast and view.forecast.without_predictions())
         self.session.stop(mark_ns)
         self._running_estimate.end()
         self._close_by_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)

@@ -34,7 +34,7 @@ class Row:
     accept: tuple[float, float] | None = None
 
     @property
-    def sigmas_off(self) -> float | None:
+    def error_in_sigmas(self) -> float | None:
         """Return the error divided by its sigma, None without value or sigma."""
         if self.value is None or self.sigma is None:
             return None
@@ -48,7 +48,7 @@ class Row:
         if self.accept is not None:
             return self.accept[0] <= self.value <= self.accept[1]
         limit = 4.0    # sigmas: exceeded by chance in one of 16 000
-        return self.sigmas_off is not None and abs(self.sigmas_off) <= limit
+        return self.error_in_sigmas is not None and abs(self.error_in_sigmas) <= limit
 
 
 def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[Row]:
@@ -67,7 +67,8 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
 def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
          factor: float) -> Row:
     entry = result[name]
-    value, sigma = (None if entry[k] is None else entry[k] * factor for k in ('value', 'sigma'))
+    value, sigma = (None if entry[key] is None else entry[key] * factor
+                    for key in ('value', 'sigma'))
     unit = 'deg' if factor != 1.0 else entry['unit'] or ''
     accept = truth.get('accept')
     return Row(f'{name.replace("_", " ")}{f", {unit}" if unit not in ("", "1") else ""}', value,
@@ -76,12 +77,13 @@ def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
 
 
 def table(compared: list[Row]) -> str:
+    """Return values, truth and errors in sigmas as text."""
     lines = [f'{"":<28}{"found":<32}{"truth":<20}off by']
     for row in compared:
         if row.value is None:
             lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
             continue
-        error_text = '' if row.sigmas_off is None else f'{row.sigmas_off:+z.1f} sigma'
+        error_text = '' if row.error_in_sigmas is None else f'{row.error_in_sigmas:+z.1f} sigma'
         lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<32}{_truth(row):<20}'
                      f'{error_text:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
     return '\n'.join(lines)

@@ -40,13 +40,14 @@ def _screen(comparison: 'Comparison') -> list[str]:
     from odocal_ros.output.stored import estimate_text as value_text
     from odocal_ros.output.value_text import counted, table_lines
     stored = comparison.stored
-    width = max(len(s.name) for s in stored)
-    lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '
-             f'{counted(len(s.legs), "leg")}' for i, s in enumerate(stored, 1)]
+    width = max(len(calibration.name) for calibration in stored)
+    lines = [f'{number:>3}  {one.name:<{width}}  {one.created}  {one.verdict.value}, '
+             f'{counted(len(one.legs), "leg")}' for number, one in enumerate(stored, 1)]
     for change in comparison.changes:
         rows: list[tuple[str, ...]] = [
-            (f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
-             _cell(change, e.to_previous, stored)) for e in change.entries]
+            (f'{entry.index + 1:>2}', value_text(entry.estimate),
+             _cell(change, entry.to_first, stored), _cell(change, entry.to_previous, stored))
+            for entry in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         if len(stored) == 2:       # both are the same
             rows = [row[:3] for row in rows]

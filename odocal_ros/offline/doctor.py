@@ -60,14 +60,15 @@ def _version(name: str, absent: str = MISSING) -> str:
 
 
 def _ros() -> list[tuple[str, str]]:
+    """Return path of rclpy and name of the ROS middleware, or why the node cannot run."""
     if find_spec('rclpy') is None:
         return [('rclpy', 'none: the node cannot run here, bags can be replayed')]
     # in a separate process: a crash does not end this one
-    found = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
-    if found.returncode:
-        return [('rclpy', f'BROKEN: {(found.stderr.strip().splitlines() or ["?"])[-1]}')]
-    where, rmw = found.stdout.splitlines()
-    return [('rclpy', where), ('rmw', rmw)]
+    process = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
+    if process.returncode:
+        return [('rclpy', f'BROKEN: {(process.stderr.strip().splitlines() or ["?"])[-1]}')]
+    path, rmw = process.stdout.splitlines()
+    return [('rclpy', path), ('rmw', rmw)]
 
 
 def _folder_text(folder: Path) -> str:

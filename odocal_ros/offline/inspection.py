@@ -25,7 +25,8 @@ from odocal_ros.messages.message_fields import IMU, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.transforms import add_static_readers, STATIC
 from odocal_ros.offline import odometer_search, survey, wheel_survey
-from odocal_ros.offline.inspection_drive import inspect_drive, missing_input_reasons
+from odocal_ros.offline.inspection_drive import DriveInspection, inspect_drive
+from odocal_ros.offline.missing_inputs import missing_input_reasons
 from odocal_ros.offline.suggest import likely_mapping, replay_command, replay_refusal
 from odocal_ros.offline.survey import fix_path, FixPath, Match
 from odocal_ros.output.files import plain
@@ -48,7 +49,7 @@ class _TopicSamples:
     def __init__(self, reader: Reader) -> None:
         self.reader, self.recorder, self.error = reader, LegRecorder(), ''
         has_list = reader.msgtype in wheel_survey.FIELDS
-        self.values = wheel_survey.Values(reader.msgtype) if has_list else None
+        self.values = wheel_survey.ListCollector(reader.msgtype) if has_list else None
         self.form_by_fixes: OdometerForm | None = None
 
     @property
@@ -79,6 +80,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     collectors = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
     # these readers store samples and return none, so that the second argument is not called
     bag.read({**samples_by_topic, **collectors, **_static_readers(samples_by_topic, bag)}, print)
+    # first by names and types only; again after the comparison with the fixes
     mapping, config = likely_mapping(bag.topics, config, overrides)
     imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
     turn_rate = survey.turn_rate_to_left(imu.recorder.rows('imu')) if imu else None
@@ -96,11 +98,6 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         if fixes and (fields := collectors.get(facts['name'])) and not fields.error:
             facts['fields'] = fields.facts(fixes)
     odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
-    content = _bag_facts(bag, path) | {
-        'topics': topics, 'mapping': mapping, 'not_following': sorted(not_following),
-        'mounting': None, 'drive': None, 'standstills': [], 'legs': [], 'each_stop': [],
-        'straight': []}
-    findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
     no_topic_follows = 'odometer' not in overrides and matches and not any(
         match.follows for match in matches.values())
     if (mapping.get('odometer') not in samples_by_topic or no_topic_follows) and (
@@ -113,17 +110,21 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     config = with_settings(initial_config, dict(map(parse_set, options)))
     if options:
         _read_again(bag, samples_by_topic, mapping['odometer'], config, topics)
+    drive = DriveInspection()
     if {'imu', 'odometer'} <= mapping.keys():
-        options += inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config,
-                                 content, findings)
+        drive = inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config)
+    options += drive.options
+    content = {**_bag_facts(bag, path), 'topics': topics, 'mapping': mapping,
+               'not_following': sorted(not_following), **drive.content}
     if 'fix' in mapping:
         config = settings_by_frame(samples_by_topic[mapping['fix']].recorder.rows('fix'), config)
-    findings += missing_input_reasons(content, mapping, config)
-    content['findings'] = _finding_facts(findings, config, options)
-    content['replay_error'] = replay_refusal(bag.topics, initial_config, overrides)
-    content['command'] = replay_command(path, bag.topics, initial_config, overrides, mapping,
-                                      options)
-    return dict(plain(content))
+    findings = [*(note for note in bag.notes if isinstance(note, Reason)), *drive.findings,
+                *missing_input_reasons(content, mapping, config)]
+    return dict(plain(content | {
+        'findings': _finding_facts(findings, config, options),
+        'replay_error': replay_refusal(bag.topics, initial_config, overrides),
+        'command': replay_command(path, bag.topics, initial_config, overrides, mapping,
+                                  options)}))
 
 
 def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
@@ -217,7 +218,7 @@ def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
     motions : motion of each value of topics of lists. A topic of one number that follows the path
     only with another meaning gets this meaning.
     """
-    following = {name: any(one['scale'] for one in values)
+    following = {name: any(value['scale'] for value in values)
                  for name, values in motions.items() if values}
     matches = {name: Match(float(follows), 0.0, follows) for name, follows in following.items()}
     for name, topic_samples in samples_by_topic.items():
@@ -249,7 +250,7 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
             facts['chosen'] = form.selection_text
         if facts['name'] == mapping.get('odometer') and is_unconfigured:
             named = topic_samples.reader.wheels if form.sides_known else ()
-            rolling = {one['key'] for one in values if one['rolls']}
+            rolling = {value['key'] for value in values if value['rolls']}
             if len(named) > 1 and rolling.issuperset(named):
                 options += [f'odometer.{side}={key}' for side, key in zip(
                     SIDES, named, strict=True)]

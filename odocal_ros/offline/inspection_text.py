@@ -38,18 +38,18 @@ def _head(content: dict[str, Any]) -> list[str]:
 
 
 def _topics(content: dict[str, Any], roles: dict[str, str]) -> list[str]:
-    wide = max((len(topic['name']) for topic in content['topics']), default=0)
-    short = {topic['type']: topic['type'].replace('/msg/', '/') for topic in content['topics']}
-    kinds = max(map(len, short.values()), default=0)
+    name_width = max((len(topic['name']) for topic in content['topics']), default=0)
+    types = {topic['type']: topic['type'].replace('/msg/', '/') for topic in content['topics']}
+    type_width = max(map(len, types.values()), default=0)
     lines = []
     for topic in content['topics']:
-        name, kind = one_line(topic['name']), one_line(short[topic['type']])
+        name, msgtype = one_line(topic['name']), one_line(types[topic['type']])
         rate = '' if topic['count'] < 2 else (
             f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] else f'{"unknown":>8} Hz')
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
         if str(LOCAL_STATUS) in topic.get('fix', {}).get('status', ()):
             role += ' (position reference)' if role else 'position reference, if GNSS is not used'
-        lines.append(f'  {name:{wide}}  {kind:{kinds}} '
+        lines.append(f'  {name:{name_width}}  {msgtype:{type_width}} '
                      f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())
     return ['topics', *lines]
 
@@ -71,8 +71,8 @@ def _field_statements(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator
                  if field['quantity'] == 'rate' else f'grows with distance, '
                  f'{field["scale"]:.3g} {unit}' + ' (counts since the previous message)' * (
                      field['quantity'] == 'increment'))
-        yield (f'{topic["name"]}.{field["path"]} {grows}: '
-               f'{for_shell([w for s in field["settings"] for w in ("--set", s)])}')
+        options = [word for setting in field['settings'] for word in ('--set', setting)]
+        yield f'{topic["name"]}.{field["path"]} {grows}: {for_shell(options)}'
     if not fields['found']:
         yield (f'no numeric field grows with the distance between the fixes ({fields["tried"]} '
                'tried)')

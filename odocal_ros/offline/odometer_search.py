@@ -44,7 +44,7 @@ STANDARD_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msg
                      'diagnostic_msgs')
 
 
-class Fields:
+class FieldCollector:
     """Collects all numbers in evenly selected messages of one topic, as a reader of a bag."""
 
     unreadable = 0       # an unreadable topic is no error
@@ -53,16 +53,15 @@ class Fields:
         self.count, self.error = count, ''
         self.paths: list[str] = []
         self.is_integer: list[bool] = []
-        self._stride, self._messages_seen, self._times, self._values = 1, 0, array('q'), array('d')
+        self._stride, self._message_count, self._times, self._values = 1, 0, array('q'), array('d')
         self._t_ns, self._travel = np.empty(0, np.int64), dict[str, Floats]()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
-        """Take every n-th message."""
-        first = -self._messages_seen % self._stride
-        self._messages_seen += len(raws)
-        k = first
-        while k < len(raws) and not self.error:
+        """Store the numbers of every n-th message; return no samples."""
+        k = -self._message_count % self._stride
+        self._message_count += len(raws)
+        while k < len(raws) and not self.error:      # the first message sets the stride
             self._take(raws[k], int(received_ns[k]), deserialize)
             k += self._stride
         return []
@@ -99,12 +98,12 @@ class Fields:
         keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
         self._t_ns = t_ns[keep]
         fields = zip(self.paths, self.is_integer, values[keep].T, strict=True)
-        tested = [_best_meaning(name, is_integer, self._t_ns, value, path, self._stride)
-                  for name, is_integer, value in fields]
-        self._travel = {one[0]['path']: one[1] for one in tested if one}
-        found = sorted((one[0] for one in tested if one), key=rank)
-        return {'tried': len(self.paths), 'found': [field | {
-            'settings': _settings(field, f'odometer.field={field["path"]}')} for field in found]}
+        matching = [match for name, is_integer, value in fields if (match := _best_meaning(
+            name, is_integer, self._t_ns, value, path, self._stride)) is not None]
+        self._travel = {field['path']: travel for field, travel in matching}
+        return {'tried': len(self.paths), 'found': [
+            field | {'settings': _settings(field, f'odometer.field={field["path"]}')}
+            for field in sorted((field for field, _ in matching), key=rank)]}
 
     def settings(self, found: Sequence[dict[str, Any]],
                  turn_rate: tuple[Ints, Floats] | None) -> list[str]:
@@ -130,8 +129,8 @@ class Fields:
 
 def _settings(field: dict[str, Any], *names: str) -> list[str]:
     """Return the settings that name a field, then those for its meaning."""
-    usual = 'cumulative' if field['is_integer'] else 'rate'
-    return [*names, *[f'odometer.quantity={field["quantity"]}'] * (field['quantity'] != usual),
+    default = 'cumulative' if field['is_integer'] else 'rate'
+    return [*names, *[f'odometer.quantity={field["quantity"]}'] * (field['quantity'] != default),
             *[f'odometer.wrap={field["wrap"]}'] * (field['wrap'] > 0),
             *['odometer.reversed=true'] * (field['scale'] < 0)]
 
@@ -149,13 +148,14 @@ def _numbers(message: object, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield path and value of a number, of each number of an array, or of a nested message."""
     if isinstance(value, (bool, str, bytes)):
         return
     if isinstance(value, (int, float, np.number)):
         yield path, value
     elif isinstance(value, (list, np.ndarray)):
-        for k, one in enumerate(value[:MAX_ELEMENTS]):
-            yield from _numbers_of(one, f'{path}[{k}]')
+        for k, element in enumerate(value[:MAX_ELEMENTS]):
+            yield from _numbers_of(element, f'{path}[{k}]')
     else:
         yield from _numbers(value, f'{path}.')
 
@@ -167,7 +167,7 @@ def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes:
 
     The scale is in m per unit, or m/s for a rate.
     """
-    found: list[tuple[dict[str, Any], Floats]] = []
+    matching: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
     for quantity in _quantities(path):
         counts = is_integer and quantity == 'cumulative'
@@ -177,10 +177,10 @@ def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes:
         s = s * stride if quantity == 'increment' else s
         match = fixes.match(t_ns, s)
         if match.follows:
-            found.append(({
+            matching.append(({
                 'path': path, 'is_integer': is_integer, 'quantity': quantity, 'wrap': wrap,
                 'scale': match.scale, 'explained': match.explained}, s))
-    return max(found, key=lambda one: one[0]['explained'], default=None)
+    return max(matching, key=lambda entry: entry[0]['explained'], default=None)
 
 
 def _quantities(name: str) -> tuple[str, str]:
@@ -196,7 +196,7 @@ def _rollover(value: Floats) -> int:
 
 
 def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
-                    requested: Collection[str]) -> dict[str, Fields]:
+                    requested: Collection[str]) -> dict[str, FieldCollector]:
     """
     Return a collector for each topic whose fields could be an odometer.
 
@@ -207,7 +207,7 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
     usable = {*requested, *without_estimates(possible)}
     found = [name for name, info in topics.items()
              if info.count and name not in known and name in usable]
-    return {name: Fields(topics[name].count) for name in found[:MAX_TOPICS]}
+    return {name: FieldCollector(topics[name].count) for name in found[:MAX_TOPICS]}
 
 
 def _may_be_odometer(info: TopicInfo) -> bool:
@@ -252,12 +252,12 @@ def topics_not_following(matches: Mapping[str, Match]) -> set[str]:
 
 def drop_weak_fields(fields: Sequence[dict[str, Any]]) -> None:
     """Remove fields that explain much less of the variance than the best of all topics."""
-    best = max((one['explained'] for facts in fields for one in facts['found']), default=0.0)
+    best = max((field['explained'] for facts in fields for field in facts['found']), default=0.0)
     # removes all false signals of benchmarks/odometer_fields.py but energy with fixes of 2.5 m
     variance_factor, least = 3.0, 0.01
     for facts in fields:
-        facts['found'] = [one for one in facts['found']
-                          if 1 - one['explained'] <= variance_factor * (1 - best) + least]
+        facts['found'] = [field for field in facts['found']
+                          if 1 - field['explained'] <= variance_factor * (1 - best) + least]
 
 
 def best_topic(topics: Sequence[dict[str, Any]], requested: str) -> dict[str, Any] | None:

@@ -10,15 +10,8 @@ from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
+from odocal_ros.output import value_text as texts
 from odocal_ros.output.tables import budget_lines
-from odocal_ros.output.value_text import (
-    duration_text,
-    length_text,
-    MAIN_VALUES,
-    relative_text,
-    table_row,
-    wrapped,
-)
 
 
 def screen(planned: Planned) -> str:
@@ -40,16 +33,16 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
              f'{1000 * robot.slip:.2g} mm/√s', '']
     heads = ['scale', 'right / left', *(SHOWN[name] for name in names[1:])]
     widths = (28, *(max(len(head) + 3, 11) for head in heads))
-    lines.append(table_row(('predicted sigma', *heads), widths))
-    for one in runs:
-        name = f'{one.name}, {one.motion.distance:.0f} m, {one.motion.t[-1]:.0f} s'
-        sigmas = [one.sigma(n) for n in (names[0], 'ratio', *names[1:])]
-        lines.append(table_row((name, *(_indoor_sigma(sigma, head) for sigma, head in zip(
+    lines.append(texts.table_row(('predicted sigma', *heads), widths))
+    for run in runs:
+        name = f'{run.name}, {run.motion.distance:.0f} m, {run.motion.t[-1]:.0f} s'
+        sigmas = [run.sigma(quantity) for quantity in (names[0], 'ratio', *names[1:])]
+        lines.append(texts.table_row((name, *(_indoor_sigma(sigma, head) for sigma, head in zip(
             sigmas, heads, strict=True))), widths))
-    missing = {r.text: r for one in runs for r in one.method.reasons
-               if len(runs) == 1 and r.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE'))}
-    for r in missing.values():
-        lines += ['', *wrapped(f'{r}. {r.remedy}')]
+    missing = {reason.text: reason for run in runs for reason in run.method.reasons if len(
+        runs) == 1 and reason.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE'))}
+    for reason in missing.values():
+        lines += ['', *texts.wrapped(f'{reason}. {reason.remedy}')]
     return '\n'.join(lines)
 
 
@@ -62,11 +55,13 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
 def _drive_lines(plan: Planned) -> list[str]:
     sigmas, two_point = plan.sigmas, plan.two_point
     alignment, tau = two_point.alignment, sigmas.correlation_time
-    stands = [f'standing {duration_text(s)}' if s else 'in motion' for s in two_point.standing]
+    rests = [f'standing {texts.duration_text(rest)}' if rest else 'in motion'
+             for rest in two_point.standing]
     noise = f'correlation time {tau:g} s' if tau else 'white'
-    lines = [f'{length_text(two_point.distance)} in {duration_text(two_point.duration)}, '
-             f'{stands[0]} at the start mark, {stands[1]} at the end mark; '
-             f'marks {length_text(two_point.chord)} apart',
+    lines = [f'{texts.length_text(two_point.distance)} in '
+             f'{texts.duration_text(two_point.duration)}, {rests[0]} at the start mark, '
+             f'{rests[1]} at the end mark; '
+             f'marks {texts.length_text(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {alignment.heading_source} '
              f'(sigma {math.degrees(alignment.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m '
              f'at {sigmas.fix_rate:.3g} Hz, {noise}']
@@ -82,15 +77,16 @@ def _drive_lines(plan: Planned) -> list[str]:
 
 def _sigma_lines(plan: Plan) -> list[str]:
     rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
-        (name, *(_sigma_text(p, method.estimates[p].sigma) for p in MAIN_VALUES))
+        (name, *(_sigma_text(parameter, method.estimates[parameter].sigma)
+                 for parameter in texts.MAIN_VALUES))
         for name, method in plan.methods.items())]
-    return [*(table_row(row, (20, 14, 16, 16)) for row in rows),
+    return [*(texts.table_row(row, (20, 14, 16, 16)) for row in rows),
             f'  (result: {_method_text(plan)})']
 
 
 def _method_text(plan: Plan) -> str:
     by_method: dict[str | None, list[str]] = {}
-    for parameter, label in MAIN_VALUES.items():
+    for parameter, label in texts.MAIN_VALUES.items():
         by_method.setdefault(plan.method_of(parameter), []).append(label)
     return ', '.join(f'{" and ".join(labels) if len(by_method) > 1 else "all values"} '
                      f'{"from " + method if method else "unknown"}'
@@ -100,7 +96,7 @@ def _method_text(plan: Plan) -> str:
 def _sigma_text(parameter: str, sigma: float | None) -> str:
     if sigma is None:
         return 'unknown'
-    return (relative_text(sigma) if parameter == SCALE
+    return (texts.relative_text(sigma) if parameter == SCALE
             else f'{significant(math.degrees(sigma))} deg')
 
 
@@ -110,7 +106,8 @@ def _budget_lines(plan: Plan) -> list[str]:
     min_share = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
         method = plan.methods[name]
-        hidden = [p for p in MAIN_VALUES if method.estimates[p].sigma is None]
+        hidden = [parameter for parameter in texts.MAIN_VALUES
+                  if method.estimates[parameter].sigma is None]
         lines = budget_lines(method.details.get('budget'), 1.0, min_share, hidden)
         if lines and len(plan.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
@@ -121,16 +118,16 @@ def _budget_lines(plan: Plan) -> list[str]:
 def _improvement_lines(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(plan.improvements, plan, parameter), MAIN_VALUES[parameter]
+        best, word = ranked(plan.improvements, plan, parameter), texts.MAIN_VALUES[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
-        lines += [f'    {c.text:<58}{_sigma_text(parameter, plan.sigma(parameter)):>10} -> '
-                  f'{_sigma_text(parameter, c.sigmas[parameter])}' for c in best[:4]]
+        lines += [f'    {change.text:<58}{_sigma_text(parameter, plan.sigma(parameter)):>10} -> '
+                  f'{_sigma_text(parameter, change.sigmas[parameter])}' for change in best[:4]]
     return lines
 
 
 def _reason_lines(plan: Plan) -> list[str]:
     lines = []
     for reason in plan.reasons:
-        lines += wrapped(f'{reason}. {reason.remedy}', hanging='   ', width=96)
+        lines += texts.wrapped(f'{reason}. {reason.remedy}', hanging='   ', width=96)
     return ['', *lines] if lines else []

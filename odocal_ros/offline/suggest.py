@@ -35,8 +35,8 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
             pair := _left_right_pair(topics, [
-                t for t in candidates(topics, 'odometer', config, chosen)
-                if t not in not_following])):
+                topic for topic in candidates(topics, 'odometer', config, chosen)
+                if topic not in not_following])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         chosen['odometer'], chosen['odometer_right'] = pair
     for slot in required_slots(config):
@@ -59,7 +59,7 @@ def _sort_keys(slot: str, info: TopicInfo, not_following: Collection[str]) -> di
     usual_name = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     name, kind = info.name.lower(), 0
     fits = int('rtk' in name if slot == 'fix'
-               else not any(w in name for w in OTHER_DEVICE_WORDS))
+               else not any(word in name for word in OTHER_DEVICE_WORDS))
     if 'odometer' in slot:
         fits = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
         kind = next(i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype)
@@ -79,7 +79,7 @@ def _sorted_topics(topics: dict[str, TopicInfo], slot: str, names: Iterable[str]
 def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
                      mapping: dict[str, str], not_following: Collection[str]) -> list[str]:
     """Return the other candidates for a slot, the most likely first."""
-    used_topics = {s: t for s, t in mapping.items() if s != slot}
+    used_topics = {other: topic for other, topic in mapping.items() if other != slot}
     others = set(candidates(topics, slot, config, used_topics)) - {mapping[slot]}
     return _sorted_topics(topics, slot, others, not_following)
 

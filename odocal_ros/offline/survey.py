@@ -154,7 +154,8 @@ def fix_facts(samples: FixSamples) -> dict[str, Any]:
 
 def _grid_step(latitude: Floats) -> float | None:
     """Return the resolution of latitudes, m, if it is coarser than 5 mm, else None."""
-    steps = np.abs(np.diff(np.unique(latitude))) * 6.37e6
+    earth_radius = 6.37e6    # m
+    steps = np.abs(np.diff(np.unique(latitude))) * earth_radius
     steps = steps[steps > 1e-6]        # smaller ones are rounding errors of the number format
     if len(steps) < 10 or np.median(steps) < 0.005:
         return None
@@ -189,18 +190,18 @@ class FixPath:
             return NO_MATCH
         inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
         step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
-        length, run = self.length[inside], np.abs(step)
-        moved = (run > MIN_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
-        if len(length) < MIN_STEPS or not moved.any() or not np.isfinite(run).all():
+        length, travelled = self.length[inside], np.abs(step)
+        moved = (travelled > MIN_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
+        if len(length) < MIN_STEPS or not moved.any() or not np.isfinite(travelled).all():
             return NO_MATCH
-        error = np.abs(length - np.median(length[moved] / run[moved]) * run)
+        error = np.abs(length - np.median(length[moved] / travelled[moved]) * travelled)
         outliers = 0.05      # share of cells with a reset of a counter or a jump of the fixes
         kept = error <= np.quantile(error, 1 - outliers)
-        length, run, step = length[kept], run[kept], step[kept]
-        if not run.any() or not np.ptp(length):
+        length, travelled, step = length[kept], travelled[kept], step[kept]
+        if not travelled.any() or not np.ptp(length):
             return NO_MATCH
-        scale = float(length.sum() / run.sum())
-        residual_variance = float(np.mean((length - scale * run)**2))
+        scale = float(length.sum() / travelled.sum())
+        residual_variance = float(np.mean((length - scale * travelled)**2))
         explained = 1 - residual_variance / float(np.var(length))
         follows = explained >= EXPLAINED or (
             explained >= EXPLAINED_OF_NOISE and residual_variance <= self.sigma**2)
@@ -265,9 +266,9 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     suitable = np.triu((chord >= straight * path_length - located.fix_sigma)
                        & (path_length >= shortest)
                        & (chord <= path_length / straight + 4 * located.fix_sigma))
-    found: list[tuple[float, float]] = []
+    sections: list[tuple[float, float]] = []
     while suitable.any():
         i, j = np.unravel_index(np.argmax(np.where(suitable, path_length, 0)), suitable.shape)
-        found.append((float(t[i]), float(t[j])))
+        sections.append((float(t[i]), float(t[j])))
         suitable[:j + 1, i:] = False            # all sections that overlap it
-    return found
+    return sections

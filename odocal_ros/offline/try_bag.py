@@ -45,8 +45,8 @@ MISSING = {'imu': 'record sensor_msgs/Imu', 'odometer': 'select an odometer of a
 def _missing_action(slot: str, topics: Collection[dict[str, Any]]) -> str:
     """Return the action for a slot without a topic; topics : name, type and count of each."""
     from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
-    empty = topics_without_messages({one['name']: (one['type'], one['count']) for one in topics},
-                                    slot)
+    empty = topics_without_messages(
+        {topic['name']: (topic['type'], topic['count']) for topic in topics}, slot)
     if not empty:
         return MISSING[slot]
     return f'{", ".join(empty)} has no messages. {NO_MESSAGES_REMEDY.rstrip(".")}'

@@ -26,7 +26,7 @@ FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('da
           'std_msgs/msg/Int64MultiArray': ('data',)}
 
 
-class Values:
+class ListCollector:
     """Collects all values of a topic of lists, messages in order."""
 
     def __init__(self, msgtype: str) -> None:
@@ -39,7 +39,7 @@ class Values:
         for layout, rows, table in tables(self.msgtype, raws):
             if layout is None:
                 continue
-            field = next((f for f in FIELDS[self.msgtype] if layout.count(f)), '')
+            field = next((name for name in FIELDS[self.msgtype] if layout.count(name)), '')
             if not field:
                 continue
             n = layout.count(field)
@@ -72,15 +72,16 @@ class Values:
         t = (stamp_ns - stamp_ns[0]) * 1e-9
         s = _travelled(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
-        unlimited = 4 * np.pi    # rad: a joint with a larger range turns without limit
+        # rad: a joint with a larger range turns without limit
+        min_span = 4 * np.pi if self.msgtype == JOINTS else 0
         min_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
-        min_span = unlimited if self.msgtype == JOINTS else 0
         rolls = (span > min_span) & (span > min_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
-        matches = [path.match(received_ns, x) for x in s.T] if path else []
+        matches = [path.match(received_ns, travel) for travel in s.T] if path else []
         if any(match.follows for match in matches):
             rolls = np.array([match.follows for match in matches])
-        scales = [m.scale if m.follows else None for m in matches] or [None] * len(keys)
+        scales = [match.scale if match.follows else None for match in matches] or (
+            [None] * len(keys))
         sides = find_sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
         return [{'key': key, 'field': field, 'unit': unit, 'distance': float(path_length[k]),
@@ -105,42 +106,41 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
 
     t, s : (n,) s and (n, k) travel.   rolls : (k,) wheels.   imu : s, and rad/s to the left.
     """
-    k = len(rolls)
-    sides_found = [''] * k
+    sides = [''] * len(rolls)
     cell = 0.5    # s, interval in which turn and travel are compared
     # with damaged stamps a recording may seem to last for years
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MAX_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
-        return sides_found
+        return sides
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
     turn = np.diff(np.interp(grid, imu[0], turned))
     turn = turn - np.median(turn)
-    step = np.stack([np.diff(np.interp(grid, t, s[:, j])) for j in range(k)])
-    scale = np.abs(step).sum(axis=1, keepdims=True)
+    step = np.stack([np.diff(np.interp(grid, t, travel)) for travel in s.T])
+    path_length = np.abs(step).sum(axis=1, keepdims=True)
     with np.errstate(invalid='ignore', divide='ignore'):
-        step = step / scale
-    others = step[rolls].mean(axis=0)
-    correlation_limit = 0.5    # limit of the correlation with the gyro for a side
-    for j in np.flatnonzero(rolls):
-        excess = step[j] - others
+        step = step / path_length
+    mean_step = step[rolls].mean(axis=0)
+    correlation_limit = 0.5    # with the gyro; smaller: the side is unknown
+    for k in np.flatnonzero(rolls):
+        excess = step[k] - mean_step
         power = float(np.sqrt((excess @ excess) * (turn @ turn)))
         correlation = float(excess @ turn) / power if power else 0.0
         if abs(correlation) > correlation_limit:
-            sides_found[j] = 'right' if correlation > 0 else 'left'
-    return sides_found
+            sides[k] = 'right' if correlation > 0 else 'left'
+    return sides
 
 
 def single_wheel_setting(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]:
     """Return the setting for one wheel, if the values chosen by name do not grow with distance."""
-    grows = [f for f in facts if f['scale']]
-    if not grows or chosen and {f['key'] for f in grows}.issuperset(chosen):
+    growing = [value for value in facts if value['scale']]
+    if not growing or chosen and {value['key'] for value in growing}.issuperset(chosen):
         return ()
-    return (f'odometer.field={grows[0]["field"]}[{grows[0]["key"]}]',)
+    return (f'odometer.field={growing[0]["field"]}[{growing[0]["key"]}]',)
 
 
 def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
     """Return the settings for the wheels found in the data, as many on either side; or none."""
-    left, right = ([f['key'] for f in facts if f['side'] == side] for side in SIDES)
+    left, right = ([value['key'] for value in facts if value['side'] == side] for side in SIDES)
     if len(left) != len(right) or not left:
         return ()
     if len(left) > 1:
@@ -154,10 +154,11 @@ def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
 def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
     """Return the motion of each value as a line of text."""
     lines = []
-    for one in facts:
-        side = f'; {one["side"]} side (matches gyro)' if one['side'] else ''
-        scale = f', {one["scale"]:.3g} m/{one["unit"].rstrip("s")}' if one['scale'] else ''
-        kind = f'a wheel{scale}{side}' if one['rolls'] else 'no wheel'
-        lines.append(f'{one["key"]} travels {one["distance"]:.5g} {one["unit"]} in total, range '
-                     f'{one["span"]:.5g} {one["unit"]}: {kind}')
+    for value in facts:
+        unit = value['unit']
+        side = f'; {value["side"]} side (matches gyro)' if value['side'] else ''
+        scale = f', {value["scale"]:.3g} m/{unit.rstrip("s")}' if value['scale'] else ''
+        kind = f'a wheel{scale}{side}' if value['rolls'] else 'no wheel'
+        lines.append(f'{value["key"]} travels {value["distance"]:.5g} {unit} in total, range '
+                     f'{value["span"]:.5g} {unit}: {kind}')
     return lines

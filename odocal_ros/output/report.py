@@ -14,17 +14,10 @@ from typing import Any
 
 from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, REASON_ESTIMATES
-from odocal_ros.output import report_tables as tables
+from odocal_ros.output import report_tables as tables, value_text as texts
 from odocal_ros.output.plot_style import apply_style, Drawing
 from odocal_ros.output.summary import driven_text, MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
-from odocal_ros.output.value_text import (
-    duration_text,
-    finite_estimate,
-    iso,
-    join_same_reasons,
-    length_text,
-)
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
@@ -111,7 +104,7 @@ def _main_reason(reasons: tuple[Reason, ...]) -> Reason | None:
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
-    joined = join_same_reasons(reasons)
+    joined = texts.join_same_reasons(reasons)
     groups = [(verdict.value, title, [reason for reason in joined
                                       if reason.code.severity is verdict])
               for verdict, title in TITLES.items()]
@@ -168,10 +161,10 @@ def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
     rows, findings = tables.unused_data(leg)
     methods = _by_number_of_values(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
-            'start': date_text(iso(leg.start_ns)), 'stop': date_text(iso(leg.stop_ns)),
+            'start': date_text(texts.iso(leg.start_ns)), 'stop': date_text(texts.iso(leg.stop_ns)),
             'figures': figures,
-            'facts': (('distance', length_text(leg.distance)),
-                      ('duration', duration_text(leg.duration)),
+            'facts': (('distance', texts.length_text(leg.distance)),
+                      ('duration', texts.duration_text(leg.duration)),
                       ('IMU samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
@@ -190,5 +183,5 @@ def _smoother_details(leg: result.LegResult) -> dict[str, Any]:
 
 def _relative_scale_sigma(leg: result.LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
-    scale = finite_estimate(leg_estimates(leg), 'scale_factor')
+    scale = texts.finite_estimate(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None

@@ -44,7 +44,7 @@ class ValueDecision:
     low: float        # limits, in the unit of the estimate; infinite: none
     high: float
     decision: Decision
-    required_sigma: float | None = None    # with which it would pass; None: with no sigma
+    required_sigma: float | None = None    # the value passes with it; None: with no sigma
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of calibration.json."""
@@ -66,7 +66,7 @@ class Acceptance:
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of calibration.json."""
         return {'decision': self.decision.value, 'why': self.why, 'remedy': self.remedy,
-                'values': {one.name: one.as_dict() for one in self.values}}
+                'values': {entry.name: entry.as_dict() for entry in self.values}}
 
 
 def decide(value: float, sigma: float, low: float, high: float) -> Decision:
@@ -89,17 +89,18 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
                    for name, (low, high) in config.accept.limits.items())
     if not values:
         return None
-    worst = max((one.decision for one in values), key=list(Decision).index)
+    worst = max((entry.decision for entry in values), key=list(Decision).index)
     is_withheld = calibration.verdict is Verdict.REJECTED or (
         config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
     if calibration.verdict is Verdict.REJECTED or (is_withheld and worst is Decision.PASS):
-        why = next(r for r in calibration.reasons if r.code.severity is calibration.verdict)
-        return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: {why}',
-                          why.remedy)
+        reason = next(reason for reason in calibration.reasons
+                      if reason.code.severity is calibration.verdict)
+        return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: {reason}',
+                          reason.remedy)
     if worst is not Decision.UNDECIDED:
         return Acceptance(worst, values)
-    explanations = [_explain_undecided(one, calibration.reasons) for one in values
-                    if one.decision is Decision.UNDECIDED]
+    explanations = [_explain_undecided(entry, calibration.reasons) for entry in values
+                    if entry.decision is Decision.UNDECIDED]
     return Acceptance(worst, values, '; '.join(why for why, _ in explanations),
                       ' '.join(dict.fromkeys(remedy for _, remedy in explanations)))
 
@@ -122,7 +123,8 @@ def _explain_undecided(undecided: ValueDecision, reasons: tuple[Reason, ...]) ->
     name, estimate = undecided.name.replace('_', ' '), undecided.estimate
     if estimate.value is None or estimate.sigma is None:
         about = 'scale_factor' if undecided.name == 'scale_ratio' else undecided.name
-        reason = next((r for r in reasons if REASON_ESTIMATES.get(r.code) == about), None)
+        reason = next((reason for reason in reasons
+                       if REASON_ESTIMATES.get(reason.code) == about), None)
         if undecided.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[undecided.name]).remedy

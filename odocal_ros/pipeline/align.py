@@ -36,7 +36,7 @@ from odocal_ros.settings.config import Config
 
 MIN_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])      # begin and end, s
-# (yaw, sigma) rad, or None and the reason
+# (yaw, sigma), rad, and '', or None and the reason
 HeadingOrRefusal = tuple[tuple[float, float] | None, str]
 
 
@@ -86,8 +86,9 @@ def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
 
 
 def choose_standstill(spans: Iterable[Span]) -> Span | None:
-    """Return the last standstill that begins at or before the start mark (t = 0), or None."""
-    before = [s for s in spans if s[0] <= 0.5]
+    """Return the last standstill that begins at the start mark (t = 0) or before, or None."""
+    latest_begin = 0.5    # s: a standstill that begins right after the start mark
+    before = [span for span in spans if span[0] <= latest_begin]
     return before[-1] if before else None
 
 
@@ -111,18 +112,18 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
         return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
-    pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
-    if pick.sum() < 2:      # the IMU ends at the mark, which IMU_GAP reports
-        pick = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
-    _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    ends = t[pick][[0, -1]]
-    speed = (inputs.travel.at(ends + 0.5) - inputs.travel.at(ends - 0.5)) * metres_per_unit
-    inside = np.clip(ends + 0.5, *inputs.travel.t[[0, -1]]) - np.clip(
-        ends - 0.5, *inputs.travel.t[[0, -1]])
-    level = level_in_motion(t[pick], inputs.f_b[pick], q_0b,
-                            speed / np.maximum(inside, 1e-3), latitude, grade)
+    rows = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
+    if rows.sum() < 2:      # the IMU ends at the mark, which IMU_GAP reports
+        rows = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
+    _, q_0b = attitude(t[rows], inputs.w_b[rows], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    # mean speeds over 1 s at both ends, or the part of it in which the odometer has rows
+    begin, end = (np.clip(t[rows][[0, -1]] + half, *inputs.travel.t[[0, -1]])
+                  for half in (-0.5, 0.5))
+    travel = (inputs.travel.at(end) - inputs.travel.at(begin)) * metres_per_unit
+    level = level_in_motion(t[rows], inputs.f_b[rows], q_0b,
+                            travel / np.maximum(end - begin, 1e-3), latitude, grade)
     reason = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
-                    f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
+                    f'over {t[rows][-1] - t[rows][0]:.0f} s of driving, gyro bias unknown '
                     f'(± {np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
     return level, (reason,)
 
@@ -140,8 +141,8 @@ def _noise_reasons(noise: float, grade: nominal.Grade) -> tuple[Reason, ...]:
 
 def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
     """Return the white noise of gyro and accelerometer, per sqrt(Hz), of the noisiest axis."""
-    pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
-    t, signals = inputs.t_imu[pick], {'gyro': inputs.w_b[pick], 'accel': inputs.f_b[pick]}
+    rows = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
+    t, signals = inputs.t_imu[rows], {'gyro': inputs.w_b[rows], 'accel': inputs.f_b[rows]}
     if len(t) < MIN_AT_REST:
         return {}
     root_hz = np.sqrt((len(t) - 1) / (t[-1] - t[0]))
@@ -187,11 +188,11 @@ def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: fl
 
 
 def _configured_heading(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
+    """Return yaw and sigma at the level's epoch by ``alignment.heading``, which is at the mark."""
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(rotations.yaw_from_heading(config.alignment.heading))
-    # the heading holds at the mark: subtract the turn since the standstill, and the direction of
-    # north there
+    # subtract the turn since the standstill, and the direction of north there
     turn = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
     turn += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
     return (float(rotations.wrap(mark_yaw - turn)), config.alignment.heading_sigma), ''
@@ -199,11 +200,11 @@ def _configured_heading(inputs: Inputs, level: Level, config: Config) -> Heading
 
 def _turn_since(inputs: Inputs, level: Level) -> float:
     """Return the turn from the epoch of a level to the start mark, rad."""
-    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
-    if pick.sum() < 2:
+    rows = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
+    if rows.sum() < 2:
         return 0.0
-    rate = (inputs.w_b[pick] - level.mean_rate_b)
-    _, q = attitude(inputs.t_imu[pick], rate, rotations.quat_from_matrix(level.C_Lb), np.zeros(3))
+    rate = inputs.w_b[rows] - level.mean_rate_b
+    _, q = attitude(inputs.t_imu[rows], rate, rotations.quat_from_matrix(level.C_Lb), np.zeros(3))
     C = rotations.matrix_from_quat(q[-1])
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
@@ -234,6 +235,7 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
 
 def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
                             config: Config) -> HeadingOrRefusal:
+    """Return yaw and sigma by the Earth rate at a standstill."""
     if inputs.is_local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
@@ -258,21 +260,21 @@ def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fix
     """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = make_alignment(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
-    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
-    t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
+    rows = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
+    t, q_nb = attitude(inputs.t_imu[rows], inputs.w_b[rows] - trial.gyro_bias, trial.q_nb,
                        origin.earth_rate_n)
     track = dead_reckon(t, q_nb, inputs.travel)
     selected = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
     if selected.sum() >= 2:
-        fixed = fixes_n[selected, :2] - fixes_n[selected][0, :2]
-        reckoned = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
-        reckoned = reckoned - reckoned[0]
+        by_fixes = fixes_n[selected, :2] - fixes_n[selected][0, :2]
+        dead_reckoned = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
+        dead_reckoned = dead_reckoned - dead_reckoned[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
         min_distance = max(COURSE_DISTANCE, 8 * sigma_fix)
-        distance = np.hypot(*reckoned.T)
+        distance = np.hypot(*dead_reckoned.T)
         if (distance >= min_distance).any():
             k = int(np.argmax(distance >= min_distance))
-            yaw = np.arctan2(*fixed[k, ::-1]) - np.arctan2(*reckoned[k, ::-1])
+            yaw = np.arctan2(*by_fixes[k, ::-1]) - np.arctan2(*dead_reckoned[k, ::-1])
             return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / distance[k]), ()
         cause = f'less than {min_distance:.0f} m from the start within {course_time:.0f} s'
     else:

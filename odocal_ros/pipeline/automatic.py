@@ -25,10 +25,9 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.odometer_rows import StepReader
 from odocal_ros.settings.config import Config
 
-SECOND = 10**9    # definition: ns
-LEG_END_REST_NS = 10 * SECOND    # judgement: standstill that ends a leg, for position and biases
-PARKED_NS = 120 * SECOND         # judgement: a longer standstill ends a leg of any length
-START_REST_NS = 1 * SECOND       # judgement: standstill before the first count of a start
+LEG_END_REST_NS = 10 * 10**9    # judgement: standstill that ends a leg, for position and biases
+PARKED_NS = 120 * 10**9         # judgement: a longer standstill ends a leg of any length
+START_REST_NS = 10**9           # judgement: standstill before the first count of a start
 
 
 @dataclass
@@ -40,11 +39,11 @@ class Span:
 
 
 class LegSearch:
-    """Search for legs in rows, in blocks of any size; ``spans`` are found, the open one last."""
+    """Search for legs in blocks of rows of any size; ``spans``: the legs, the open one last."""
 
     def __init__(self, config: Config) -> None:
         self._steps: StepReader | None = None
-        self._still = 0.0      # scale units, travel that is no motion
+        self._rest_travel = 0.0      # odometer units, travel that is no motion
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(LEG_END_REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)
@@ -59,7 +58,7 @@ class LegSearch:
         self._gaps: deque[tuple[int, int]] = deque()         # of the IMU: both edges
         self._imu_ns = 0              # newest stamp of the IMU
         self._travel = 0.0
-        self._anchor: tuple[int, float] | None = None        # stamp, travel of the last motion
+        self._last_motion: tuple[int, float] | None = None   # stamp, travel
         self._newest_ns = 0           # newest odometer row evaluated
         self._from_ns = 0             # no leg begins before
         self._needs_rest = False      # the next leg begins after a standstill
@@ -78,7 +77,7 @@ class LegSearch:
             self._add_imu_stamps(block.stamp_ns)
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or StepReader(form)
-            self._still = self._steps.rest_travel
+            self._rest_travel = self._steps.rest_travel
             steps, stamps, _ = self._steps.read(block)
             travel = self._travel + np.cumsum(steps)
             if len(travel):
@@ -103,43 +102,43 @@ class LegSearch:
             return
         first_ns = max(self._first_ns.values())
         while self._waiting and self._waiting[0][0] <= self._imu_ns:
-            t, s = self._waiting.popleft()
-            if t > self._newest_ns and t >= first_ns:
-                self._newest_ns = t
-                self._evaluate_row(t, s)
+            stamp_ns, travel = self._waiting.popleft()
+            if stamp_ns > self._newest_ns and stamp_ns >= first_ns:
+                self._newest_ns = stamp_ns
+                self._evaluate_row(stamp_ns, travel)
 
-    def _evaluate_row(self, t: int, s: float) -> None:
-        """Begin or end a leg by an odometer row: stamp, ns, and travel."""
-        while self._gaps and self._gaps[0][0] < t:
+    def _evaluate_row(self, stamp_ns: int, travel: float) -> None:
+        """Begin or end a leg by an odometer row."""
+        while self._gaps and self._gaps[0][0] < stamp_ns:
             last, resumed = self._gaps.popleft()
             self._end_leg(last)
-            self._anchor, self._from_ns = None, max(self._from_ns, resumed)
-        if t < self._from_ns:
+            self._last_motion, self._from_ns = None, max(self._from_ns, resumed)
+        if stamp_ns < self._from_ns:
             return
-        if self._anchor is None:
-            self._anchor = t, s
-        elif abs(s - self._anchor[1]) > self._still:
-            self._handle_motion(t, self._anchor[0])
-            self._anchor = t, s
+        if self._last_motion is None:
+            self._last_motion = stamp_ns, travel
+        elif abs(travel - self._last_motion[1]) > self._rest_travel:
+            self._handle_motion(stamp_ns, self._last_motion[0])
+            self._last_motion = stamp_ns, travel
         else:
-            self._handle_standstill(t, self._anchor[0])
+            self._handle_standstill(stamp_ns, self._last_motion[0])
 
-    def _handle_motion(self, t: int, since_ns: int) -> None:
-        """Begin or end a leg at motion at t after a standstill since ``since_ns``."""
-        self._handle_standstill(t - START_REST_NS, since_ns)
-        rested = t - since_ns >= self._standstill_ns
-        leg, motion_ns = self.open_span, max(t - START_REST_NS, since_ns, self._from_ns)
+    def _handle_motion(self, stamp_ns: int, since_ns: int) -> None:
+        """Begin or end a leg at a motion after a standstill since ``since_ns``."""
+        self._handle_standstill(stamp_ns - START_REST_NS, since_ns)
+        rested = stamp_ns - since_ns >= self._standstill_ns
+        leg, motion_ns = self.open_span, max(stamp_ns - START_REST_NS, since_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, since_ns):
             self._end_leg(motion_ns)
-        elif leg is not None and t - leg.start_ns >= self._longest_ns:
-            self._end_leg(t)
-            motion_ns = t
+        elif leg is not None and stamp_ns - leg.start_ns >= self._longest_ns:
+            self._end_leg(stamp_ns)
+            motion_ns = stamp_ns
         if self.open_span is None and not self._needs_rest:
             self.spans.append(Span(motion_ns))
 
-    def _handle_standstill(self, t: int, since_ns: int) -> None:
-        """End a leg at a standstill from ``since_ns`` to t that is long enough."""
-        duration_ns = t - since_ns
+    def _handle_standstill(self, stamp_ns: int, since_ns: int) -> None:
+        """End a leg at a standstill from ``since_ns`` on that is long enough."""
+        duration_ns = stamp_ns - since_ns
         self._needs_rest = self._needs_rest and duration_ns < self._standstill_ns
         leg = self.open_span
         if leg is not None and (duration_ns >= PARKED_NS or duration_ns >= self._rest_ns
@@ -147,6 +146,7 @@ class LegSearch:
             self._end_leg(since_ns + self._rest_ns)
 
     def _long_enough(self, leg: Span, until_ns: int) -> bool:
+        """Return True if a leg has half of its longest duration."""
         return 2 * (until_ns - leg.start_ns) >= self._longest_ns
 
     def _end_leg(self, stop_ns: int) -> None:
@@ -161,8 +161,9 @@ def rejecting_reason(result: LegResult) -> Reason | None:
     """Return the rejecting reason of a dropped automatic leg, None if it is kept."""
     if result.verdict is not Verdict.REJECTED:
         return None
-    all_reasons = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
-    return next((r for r in all_reasons if r.code.severity is Verdict.REJECTED),
+    all_reasons = (*result.reasons, *(reason for method in result.methods.values()
+                                      for reason in method.reasons))
+    return next((reason for reason in all_reasons if reason.code.severity is Verdict.REJECTED),
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 

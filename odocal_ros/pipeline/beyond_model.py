@@ -37,21 +37,25 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
         return method
     relative = dict.fromkeys(wheel_factors(method.estimates),
                              relative['scale_factor']) | dict(relative)
-    effects = np.array([[relative.get(p, 0.0)] for p in method.parameters])
-    estimates = {p: replace(e, sigma=float(np.hypot(e.sigma, relative[p] * e.value)))
-                 if p in relative and e.value is not None and e.sigma is not None else e
-                 for p, e in method.estimates.items()}
-    row = {p: relative.get(p, 0.0) * (method.estimates[p].value or 0.0)
-           for p in method.parameters} | {'shared': shared}
-    sigma_reasons = [r for r in check_limits(estimates, prepared.nominal_scale, prepared.config)
-                     if r.code is Code.SCALE_SIGMA_TOO_LARGE]
+    effects = np.array([[relative.get(parameter, 0.0)] for parameter in method.parameters])
+    estimates = dict(method.estimates)
+    for parameter, of_value in relative.items():
+        estimate = estimates.get(parameter)
+        if estimate and estimate.value is not None and estimate.sigma is not None:
+            estimates[parameter] = replace(estimate, sigma=float(np.hypot(
+                estimate.sigma, of_value * estimate.value)))
+    row = {parameter: relative.get(parameter, 0.0) * (method.estimates[parameter].value or 0.0)
+           for parameter in method.parameters} | {'shared': shared}
+    sigma_reasons = [reason for reason in check_limits(estimates, prepared.nominal_scale,
+                                                       prepared.config)
+                     if reason.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
         details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
         marginal=method.marginal and method.marginal.with_leg_errors(
             {'scale_factor': relative['scale_factor']}),
-        reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
-                 *sigma_reasons))
+        reasons=(*(reason for reason in method.reasons
+                   if reason.code is not Code.SCALE_SIGMA_TOO_LARGE), *sigma_reasons))
 
 
 def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
@@ -75,10 +79,10 @@ def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     dropped_codes = {Code.PITCH_NOT_DETERMINED} | (
         set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
     return replace(
-        method, reasons=tuple(r for r in method.reasons if r.code not in dropped_codes),
-        estimates={
-            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
-            for name, e in method.estimates.items()})
+        method, reasons=tuple(reason for reason in method.reasons
+                              if reason.code not in dropped_codes),
+        estimates=method.estimates | {'pitch_mounting_angle': replace(
+            method.estimates['pitch_mounting_angle'], value=None, sigma=None)})
 
 
 def half_step(inputs: Inputs) -> float:

@@ -61,30 +61,39 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
         (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and name in leg.methods], config, earlier, has_local_positions(used))
         for name in method_names}
-    with_marginal = {name for leg in used for name, m in leg.methods.items() if m.marginal}
+    with_marginal = {name for leg in used for name, method in leg.methods.items()
+                     if method.marginal}
     estimates, estimating_methods = choose(methods, config.method)
     reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
                            earlier is not None)
     if estimating_methods:
-        known = {(r.code, r.text) for r in reasons}
-        rejecting = {r.code for r in reasons if r.code.severity is Verdict.REJECTED}
+        method_reasons = [
+            reason for name in estimating_methods
+            for reason in relevant_reasons(methods[name].reasons, name, estimates)
+            if len(legs) == 1 or reason.code in ACROSS_LEGS_CODES
+            or name in with_marginal and reason.code in COMBINED_CODES]
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
-        own_reasons = [r for name in estimating_methods
-                       for r in relevant_reasons(methods[name].reasons, name, estimates)
-                       if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
-                       or name in with_marginal and r.code in COMBINED_CODES]
-        reasons += [r for r in (*own_reasons, *check_limits(estimates, nominal, config))
-                    if (r.code, r.text) not in known and r.code not in rejecting]
-        reasons = list(dict.fromkeys(reasons))
+        reasons = _join_reasons(reasons, (*method_reasons,
+                                          *check_limits(estimates, nominal, config)))
     reasons += inconsistent_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in usable])
     if len(usable) < config.verdict.min_legs and usable:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(usable)} usable leg'
                               f'{"s" * (len(usable) > 1)}; required: {config.verdict.min_legs}'))
-    if not estimating_methods and not any(r.code.severity is Verdict.REJECTED for r in reasons):
+    if not estimating_methods and not any(
+            reason.code.severity is Verdict.REJECTED for reason in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
                        _information_for_later_legs(methods, usable, carried))
+
+
+def _join_reasons(reasons: Sequence[Reason], further: Sequence[Reason]) -> list[Reason]:
+    """Return reasons, and further ones that are not known and whose code does not reject yet."""
+    known = {(reason.code, reason.text) for reason in reasons}
+    rejecting = {reason.code for reason in reasons if reason.code.severity is Verdict.REJECTED}
+    return list(dict.fromkeys([*reasons, *(
+        reason for reason in further
+        if (reason.code, reason.text) not in known and reason.code not in rejecting)]))
 
 
 def _precedes(carried: CarriedInformation, legs: Sequence[LegResult]) -> bool:
@@ -109,13 +118,15 @@ def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Seq
 
 def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
     """Return legs that share over a tenth of their time with an earlier one: not independent."""
-    start, stop = (np.array([getattr(leg, at) for leg in legs], np.int64)
-                   for at in ('start_ns', 'stop_ns'))
-    overlaps = np.zeros(len(legs), bool)
-    for i in range(len(legs)):
-        shared = np.minimum(stop[i], stop[:i]) - np.maximum(start[i], start[:i])
-        overlaps[i] = (~overlaps[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
-    return [leg for leg, is_excluded in zip(legs, overlaps.tolist(), strict=True) if is_excluded]
+    max_share = 0.1    # of the time of a leg
+    independent: list[LegResult] = []
+    overlapping: list[LegResult] = []
+    for leg in legs:
+        shared_ns = [min(leg.stop_ns, earlier.stop_ns) - max(leg.start_ns, earlier.start_ns)
+                     for earlier in independent]
+        is_overlapping = any(ns > max_share * (leg.stop_ns - leg.start_ns) for ns in shared_ns)
+        (overlapping if is_overlapping else independent).append(leg)
+    return overlapping
 
 
 def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequence[int],
@@ -123,18 +134,18 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
                     carried: CarriedInformation | None = None,
                     local: bool = False) -> MethodResult:
     """Return the result of a method for several legs by time, and carried ones if possible."""
-    if carried and all(r.marginal for r in results):
-        unknown = {parameter: Estimate(None, None, e.unit)
-                   for parameter, e in results[0].estimates.items()}
+    if carried and all(result.marginal for result in results):
+        unknown = {parameter: Estimate(None, None, estimate.unit)
+                   for parameter, estimate in results[0].estimates.items()}
         results = [MethodResult(name, (), unknown, marginal=carried.marginal), *results]
         numbers = [0, *(numbers or range(1, len(results)))]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
-    if len(results) > 1 and all(r.marginal for r in results):
+    if len(results) > 1 and all(result.marginal for result in results):
         from odocal_ros.estimator.several import combine_legs
         return combine_legs(results, times_ns, config, numbers, local)
     ago_ns = max(times_ns) - np.asarray(times_ns)
-    walked = config.verdict.scale_drift_per_day**2 * ago_ns / DAY_NS
-    return combine_method(name, results, walked)
+    drift_variances = config.verdict.scale_drift_per_day**2 * ago_ns / DAY_NS
+    return combine_method(name, results, drift_variances)
 
 
 def _combine_method(name: str, leg_results: Sequence[tuple[MethodResult, int, int]],
@@ -145,58 +156,65 @@ def _combine_method(name: str, leg_results: Sequence[tuple[MethodResult, int, in
 
     leg_results : result, start time, ns, and number of each leg.
     """
-    usable = [one for one in leg_results if one[0].verdict is not Verdict.REJECTED]
+    usable = [(result, time_ns, number) for result, time_ns, number in leg_results
+              if result.verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(usable or leg_results), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,
                                carried if usable else None, local)
     if usable or len(results) == 1:
         return combined
-    rejections = dict.fromkeys(r for one in results for r in one.reasons
-                               if r.code.severity is Verdict.REJECTED)
+    rejections = dict.fromkeys(reason for result in results for reason in result.reasons
+                               if reason.code.severity is Verdict.REJECTED)
     return replace(combined, reasons=(*combined.reasons, *rejections))
 
 
 def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
                  overlapping: Sequence[LegResult], estimating_methods: Sequence[str],
                  estimates: Mapping[str, Estimate],
-                 carried: bool) -> list[Reason]:
-    """Return the legs' own reasons, numbered if there are several."""
-    is_single = len(legs) == 1 and not carried
+                 has_earlier: bool) -> list[Reason]:
+    """
+    Return the reasons of the legs, numbered if there are several.
+
+    has_earlier : the result includes information of earlier legs.
+    """
+    is_single = len(legs) == 1 and not has_earlier
     reasons = []
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         methods = [leg.methods[name] for name in estimating_methods if name in leg.methods]
-        own_reasons = [*leg.reasons, *(r for m in methods
-                                       for r in relevant_reasons(_additional_reasons(m, leg),
-                                                                 m.name, estimates)
-                                       if is_single or r.code not in SINGLE_LEG_CODES
-                                       and not (m.marginal and r.code in COMBINED_CODES))]
+        leg_reasons = [*leg.reasons, *(
+            reason for method in methods for reason in relevant_reasons(
+                _additional_reasons(method, leg), method.name, estimates)
+            if is_single or reason.code not in SINGLE_LEG_CODES
+            and not (method.marginal and reason.code in COMBINED_CODES))]
         if leg in overlapping:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
         elif usable and leg not in usable:
-            all_reasons = [*leg.reasons,
-                           *(r for m in leg.methods.values() for r in _additional_reasons(m, leg))]
+            all_reasons = [*leg.reasons, *(reason for method in leg.methods.values()
+                                           for reason in _additional_reasons(method, leg))]
             reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
                                   + _rejection_text(all_reasons)))
         else:
-            refused = [m for m in methods if usable and m.verdict is Verdict.REJECTED]
-            reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
-                               + _rejection_text(m.reasons)) for m in refused]
-            reasons += [replace(r, text=prefix + r.text) for r in own_reasons
-                        if not any(r in m.reasons for m in refused)
-                        and not (refused and r.code is Code.METHOD_REJECTED)]
+            rejected = [method for method in methods
+                        if usable and method.verdict is Verdict.REJECTED]
+            reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {method.name}: '
+                               + _rejection_text(method.reasons)) for method in rejected]
+            reasons += [replace(reason, text=prefix + reason.text) for reason in leg_reasons
+                        if not any(reason in method.reasons for method in rejected)
+                        and not (rejected and reason.code is Code.METHOD_REJECTED)]
     return reasons
 
 
 def _additional_reasons(method: MethodResult, leg: LegResult) -> list[Reason]:
     """Return a method's reasons, except those whose code already rejects the leg."""
-    known = {r.code for r in leg.reasons if r.code.severity is Verdict.REJECTED}
-    return [r for r in method.reasons if r.code not in known]
+    known = {reason.code for reason in leg.reasons if reason.code.severity is Verdict.REJECTED}
+    return [reason for reason in method.reasons if reason.code not in known]
 
 
 def _rejection_text(reasons: Sequence[Reason]) -> str:
     """Return the texts of the rejecting reasons."""
-    return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.severity is Verdict.REJECTED))
+    return '; '.join(dict.fromkeys(reason.text for reason in reasons
+                                   if reason.code.severity is Verdict.REJECTED))
 
 
 def _imu_rotation(estimates: Mapping[str, Estimate], C_bi: Floats | None,

@@ -13,13 +13,7 @@ from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.two_point import (
-    Chord,
-    fit,
-    refusal_reasons,
-    refused_result,
-    solve,
-)
+from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_result, solve
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.pipeline.prepared_leg import (

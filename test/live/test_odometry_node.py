@@ -32,15 +32,15 @@ BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: the same for b
 RESULT = {'result.valid': True, 'result.scale_factor': 1.0, 'result.scale_factor_sigma': 0.001}
 # the first path that has poses ends in an error
 FAILS = """
-from odocal_ros.apply.reckoning import Reckoning
-_poses, _failed = Reckoning.poses, []
+from odocal_ros.apply.reckoning import DeadReckoning
+_poses, _failed = DeadReckoning.poses, []
 def poses(self, *args):
     found = _poses(self, *args)
     if found and not _failed:
         _failed.append(None)
         1 / 0
     return found
-Reckoning.poses = poses
+DeadReckoning.poses = poses
 """
 
 

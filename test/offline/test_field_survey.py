@@ -19,7 +19,7 @@ from odocal_ros.bagio.encode import counter, fix, imu, velocity
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import inspection_text
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.odometer_search import drop_weak_fields, Fields
+from odocal_ros.offline.odometer_search import drop_weak_fields, FieldCollector
 
 pytestmark = pytest.mark.slow
 MOTOR = 'float32 rpm\nfloat64 angle\n'
@@ -202,12 +202,12 @@ def test_the_number_of_searched_fields_and_messages_is_limited():
         requests.append(raw)
         return message
     n = 100_000
-    fields = Fields(n)
+    fields = FieldCollector(n)
     for k in range(10):
         fields.rows([raw] * (n // 10), range(k * n // 10, (k + 1) * n // 10), deserialize)
     assert len(fields.paths) == 8 + 16 + 2 * 16
     assert len(requests) < 400_000 / len(fields.paths) + 1
-    image = Fields(5)
+    image = FieldCollector(5)
     image.rows([bytes(2**20)] * 5, range(5), deserialize)
     assert image.error == 'no numeric field'
 
