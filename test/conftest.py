@@ -98,11 +98,11 @@ def data_dir() -> Recordings:
     return Recordings()
 
 
-@pytest.fixture(scope='session')
-def made():
-    """Return the straight drive; a module with another drive has its own fixture."""
+@pytest.fixture(scope='module')
+def made(request):
+    """Return the drive with the options ``MADE`` of a module, by default the straight one."""
     import drives
-    return drives.drive(**drives.STRAIGHT)
+    return drives.drive(**getattr(request.module, 'MADE', drives.STRAIGHT))
 
 
 @pytest.fixture

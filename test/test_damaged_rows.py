@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 import warnings
 
-from drives import drive, reason_texts, seconds, settings, with_columns
+from drives import reason_texts, seconds, settings, with_columns
 import numpy as np
 import pytest
 
@@ -20,11 +20,7 @@ from odocal_ros.screening.glitches import near_impossible_groups
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
+MADE = {'scenario': 'town', 'duration': 120.0, 'imu_grade': 'industrial', 'seed': 4}
 
 
 @pytest.fixture(scope='module')

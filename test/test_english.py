@@ -105,22 +105,19 @@ def remarks():
     return found
 
 
-def test_printed_text_is_plain():
+def test_printed_texts_and_html_pages_are_plain():
     found = [f'{where}: {words}: {text[:90]}' for where, text in printed()
              if (words := unused(text))]
     assert not found, '\n'.join(found)
+    for page in (ROOT / 'odocal_ros').rglob('*.html'):
+        text = re.sub(r'\{[{%].*?[%}]\}|<[^>]*>', ' ', page.read_text(encoding='utf-8'))
+        assert not unused(text), page.name
 
 
 def test_differences_have_no_negative_zero():
     found = [module.name for module in (ROOT / 'odocal_ros').rglob('*.py')
              if re.search(r':\+\.\d+f\}', module.read_text(encoding='utf-8'))]
     assert not found      # +z.1f prints +0.0 for -0.01
-
-
-def test_pages_in_html_are_plain():
-    for page in (ROOT / 'odocal_ros').rglob('*.html'):
-        text = re.sub(r'\{[{%].*?[%}]\}|<[^>]*>', ' ', page.read_text(encoding='utf-8'))
-        assert not unused(text), page.name
 
 
 @pytest.mark.parametrize('page', [*PAGES, *SETTING_FILES], ids=lambda page: page.name)

@@ -39,13 +39,10 @@ def leaves(layout):
     return leaves(layout['first']) + leaves(layout['second'])
 
 
-def test_rviz_layout_uses_classes_of_rviz():
+def test_rviz_shows_both_paths_latched_by_its_own_classes():
     classes = [c for c in all_values(layout_names.rviz(), 'Class') if c]
     assert len(classes) > 8
     assert set(classes) <= RVIZ
-
-
-def test_rviz_shows_both_paths_in_their_own_frame_latched():
     options = layout_names.rviz()['Visualization Manager']['Global Options']
     assert options['Fixed Frame'] == SETTINGS['frames.local'].default
     paths = [d for d in layout_names.rviz_displays() if d['Class'].endswith('/Path')]

@@ -159,15 +159,12 @@ def test_each_parameter_exists_in_the_other_system():
     assert set(re.findall(r'`(extrinsic\w+)`', PAGE)) == LIDAR_INERTIAL
 
 
-def test_a_twist_config_has_the_fifteen_states():
+def test_the_recipes_have_fifteen_states_and_a_radius_with_the_travel_of_the_factor():
     ros, _ = blocks()
     config = ros[0]['ekf_filter_node']['ros__parameters']['twist0_config']
     assert [i for i, fused in enumerate(config) if fused] == [6, 7, 11]       # vx, vy, vyaw
     assert len(config) == 15
-
-
-def test_the_radius_gives_the_travel_of_the_factor():
-    """By the equation of ArduPilot: distance = 2 pi counts / CPR * radius."""
+    # by the equation of ArduPilot: distance = 2 pi counts / CPR * radius
     _, (settings,) = blocks()
     travel = 2 * math.pi / float(settings['WENC_CPR']) * float(settings['WENC_RADIUS'])
     assert abs(travel - 0.0213) < 1e-7

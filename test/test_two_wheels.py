@@ -15,12 +15,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.wheel_travel import correct_rollovers
 
-ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(**ROUTE)
+MADE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
 
 
 def screened(leg, made, **more):
@@ -53,7 +48,7 @@ def test_a_hidden_span_is_found_and_unwrapped_exactly(made, clean, span, signed)
     assert not len(inputs.uncertain_t)
 
 
-def test_a_hidden_span_is_reported_with_wheel_and_first_time(made):
+def test_a_hidden_span_of_one_or_both_wheels_is_reported_and_unwrapped(made, clean):
     leg = with_columns(made.leg(), 'odometer', value=lambda a: a % 32768)
     rolled = np.flatnonzero(np.diff(leg.odometer.value) < 0)
     _, said = screened(leg, made)
@@ -61,9 +56,6 @@ def test_a_hidden_span_is_reported_with_wheel_and_first_time(made):
     assert text.startswith("the left wheel's counter")
     assert f't = {seconds(leg, leg.odometer)[rolled[0] + 1]:.2f} s' in text
     assert f'{len(rolled)} jump' in text
-
-
-def test_a_hidden_span_of_both_wheels_is_unwrapped_in_both(made, clean):
     leg = with_columns(with_right(made, lambda a: a % 4096), 'odometer', value=lambda a: a % 4096)
     inputs, _ = screened(leg, made)
     assert np.array_equal(inputs.travel.s, clean.travel.s)
@@ -103,7 +95,7 @@ def test_one_rollover_between_dense_rows_is_unwrapped(made, span, found, per_row
 
 
 def test_angles_wrapped_at_a_turn_are_unwrapped():
-    made = drive(**ROUTE | {'odometer': 'angle', 'odometer_rate': 50.0})
+    made = drive(**MADE | {'odometer': 'angle', 'odometer_rate': 50.0})
     inputs, said = screened(with_right(made, lambda a: np.angle(np.exp(1j * a))), made)
     clean, _ = screened(made.leg(), made)
     assert 'rolls over at 2 pi' in said[Code.COUNTER_ROLLOVER]
@@ -138,14 +130,11 @@ def test_a_count_and_a_speed_have_no_mean(made):
     assert_allclose(inputs.travel.s[-1], np.diff(made.odometer.value).sum())
 
 
-def test_a_right_wheel_without_messages_is_dead(made):
+def test_a_right_wheel_without_messages_or_numbers_is_dead(made):
     silent = without(made.leg(), 'odometer_right')
     _, said = screened(silent, made, odometer__left='topic', odometer__right='topic')
     assert 'right wheel has no message' in said[Code.WHEEL_DEAD]
     assert not screened(silent, made)[1]     # one odometer
-
-
-def test_a_right_wheel_that_sends_no_number_is_dead(made):
     inputs, said = screened(with_right(made, lambda a: a * np.nan), made)
     assert 'right wheel has no usable value' in said[Code.WHEEL_DEAD]
     assert inputs.travels == ()

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, delayed_in_bursts, drive, seconds, settings, thinned
+from drives import changed, delayed_in_bursts, seconds, settings, thinned
 import numpy as np
 import pytest
 
@@ -21,11 +21,7 @@ from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.core
 SECOND = 10**9
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(scenario='town', duration=180.0, imu_grade='industrial', seed=4)
+MADE = {'scenario': 'town', 'duration': 180.0, 'imu_grade': 'industrial', 'seed': 4}
 
 
 def without(samples, leg, begin_s, end_s):

@@ -51,7 +51,7 @@ def chunk(k, size=100_000):
     return pack(1, [k * SECOND], [os.urandom(size)])
 
 
-def test_the_preroll_keeps_its_duration_and_all_static_transforms():
+def test_the_preroll_keeps_its_duration_and_all_static_transforms_up_to_a_size(monkeypatch):
     preroll = PreRoll()
     preroll.feed('fix_static', journal_writer.ALWAYS_NS, chunk(0, 100), 10 * SECOND)
     for k in range(100):
@@ -63,9 +63,6 @@ def test_the_preroll_keeps_its_duration_and_all_static_transforms():
     preroll.clear()     # time jumped back; static transforms are not sent again
     static, = preroll.chunks()
     assert preroll.size == static.size
-
-
-def test_the_preroll_has_a_limit_in_bytes(monkeypatch):
     monkeypatch.setattr(journal_writer, 'PREROLL_BYTES', 1_050_000)
     preroll = PreRoll()
     preroll.feed('fix', SECOND, chunk(1, 100), 600 * SECOND)

@@ -99,7 +99,7 @@ def values_of(**values):
     return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
 
 
-def test_a_change_of_a_fixed_parameter_is_refused_with_the_command_to_set_it():
+def test_a_change_of_a_fixed_or_result_parameter_is_refused_with_the_remedy():
     text = change_refusal(Config(), RESULTS, values_of(odometer__type='std_msgs/msg/Int64'))
     assert text == ('odometer.type is fixed at start-up: restart the node with '
                     '"--ros-args -p odometer.type:=VALUE"')
@@ -108,10 +108,7 @@ def test_a_change_of_a_fixed_parameter_is_refused_with_the_command_to_set_it():
                                              imu__lever_arm=[0.0, 0.0, 0.0]))
     assert 'imu.lever_arm is fixed' in change_refusal(Config(), RESULTS,
                                                       values_of(imu__lever_arm=[0.0, 0.0, 1.0]))
-
-
-def test_a_result_parameter_is_refused_unless_it_has_the_present_value():
-    """``ros2 param load`` of the file that the node wrote is accepted."""
+    # ``ros2 param load`` of the file that the node wrote is accepted
     here = RESULTS | {'result.scale_factor': 0.05}
     assert not change_refusal(Config(), here, values_of(result__scale_factor=0.05,
                                           result__yaw_mounting_angle=math.nan))

@@ -132,17 +132,6 @@ def test_other_encodings_give_the_same_bits():
     assert plain[1] == pytest.approx(read(reader(), slashed)[1], abs=1e-9)
 
 
-def test_a_single_transform_gives_the_position_of_a_pose():
-    place = np.array([[1.0, 2.0, 0.5], [-3.0, 4.0, 0.0]])
-    sent = [(NS * k, message(make.transform(NS * k, p, 'robot', 'world')))
-            for k, p in enumerate(place, 1)]
-    _, found = read(reader(**{'reference.frames': ['world', 'robot']}), sent, None)
-    poses = make_reader('fix', 'geometry_msgs/msg/PoseStamped', Config()).rows(
-        [make.cdr(make.pose(NS * k, p)) for k, p in enumerate(place, 1)], [NS, 2 * NS], None)
-    assert found.tobytes() == np.stack([getattr(poses[0][1], name) for name in (
-        'latitude', 'longitude', 'height')]).tobytes()
-
-
 def test_gaps_give_no_positions_and_repetitions_no_duplicates():
     gap = [(at, m) for at, m in MOVING if m.transforms[0].child_frame_id != 'base_link'
            or not 2 * NS < at < 3 * NS]

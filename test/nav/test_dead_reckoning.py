@@ -18,9 +18,8 @@ from odocal_ros.nav.dead_reckoning import (
     section_ratio,
     Track,
 )
-from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, quat_from_rotvec
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_rotvec
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.screening.screen import screen
 
@@ -47,26 +46,6 @@ def test_dead_reckoning_error_is_of_second_order(n):
                                     rel=1e-9)
 
 
-ANGLE = st.floats(-3.0, 3.0)
-
-
-def test_eleven_kilometres_agree_with_the_geodesic():
-    geod = pytest.importorskip('pyproj').Geod(ellps='WGS84')
-    s = np.linspace(0, 11_200, 1121)
-    lon, lat, back = geod.fwd(np.full_like(s, 116.0), np.full_like(s, 40.0),
-                              np.full_like(s, 45.0), s)
-    yaw = np.pi / 2 - np.deg2rad(np.append(45.0, back[1:] + 180.0))
-    lat, lon = np.deg2rad(lat), np.deg2rad(lon)
-    origin = Origin(lat[0], lon[0], 0.0)
-    C_nb = (C_en(lat[0], lon[0]).T @ C_en(lat, lon)
-            @ matrix_from_rpy(np.stack([0 * yaw, 0 * yaw, yaw], -1)))
-    track = dead_reckon(s, quat_from_matrix(C_nb), Travel(s, s, 0.0))
-    end = origin.to_geodetic(track.P[-1] @ X)
-    # the road bends by 10 m / R an epoch: (1.6e-6)^2 / 12 of 11 km is 2e-9 m; 1121 roundings of
-    # 1e-12 m, and pyproj's own 1e-8 m (its degrees carry 1.4e-14)
-    assert_allclose(origin.to_n(end), origin.to_n(np.array([lat[-1], lon[-1], 0.0])), atol=2e-8)
-    # the height error of a plane through the start: s^2 / 2 R, nearly 10 m
-    assert (track.P[-1] @ X)[2] == pytest.approx(-11_200**2 / 2 / 6.378e6, rel=0.01)
 
 
 @pytest.mark.parametrize('place', [(0.7, 2.0, 50.0), (-1.2, np.pi, 0.0), (np.pi / 2, 0.3, 10.0)])

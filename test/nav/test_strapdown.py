@@ -121,23 +121,6 @@ def test_coning_error_is_of_fourth_order_and_with_two_samples_of_second(stamped,
         ratio, rel=0.05)
 
 
-@pytest.mark.parametrize(('coning_term', 'times'), [(True, 1), (False, 2)])
-def test_drift_of_the_two_sample_form_in_closed_form(coning_term, times):
-    """
-    It fakes a turn about the cone's axis at RATE sin^2 CONE (RATE h)^2 / 12.
-
-    A trapezoid makes increments (RATE h)^2 / 12 too short, and the area that they go round by
-    twice that of RATE sin^2 CONE / 2. Without the coning term as much again is lost within steps.
-    """
-    t = even(400)
-    truth, w = coning(t)
-    h = t[1]
-    phi = (w[:-1] + w[1:]) * h / 2 + coning_term * np.cross(w[:-1], w[1:]) * h**2 / 12
-    drift = angle(quat_multiply(truth[0], prefix_product(quat_from_rotvec(phi))[-1]), truth[-1])
-    # (RATE h)^2 = 0.2 % and CONE^2 = 0.25 % are left out
-    assert drift == pytest.approx(times * RATE * np.sin(CONE)**2 * (RATE * h)**2 / 12, rel=0.01)
-
-
 def test_drift_of_the_four_sample_form_in_closed_form():
     """
     The same with x = RATE h: RATE sin^2 CONE x^4 / 90.

@@ -102,7 +102,7 @@ def moving(drive, stamp):
     return np.ptp(drive.odometer.value[near]) > 2
 
 
-def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
+def test_standstills_give_one_leg_or_several_if_requested(out_and_back):
     recorder, bag = recorded(out_and_back)
     (leg,) = find_legs.find_legs(recorder, bag, [], [], Config())
     # the opening standstill ends, and the closing one begins, within the detector's window
@@ -110,6 +110,12 @@ def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
     assert leg[1] >= out_and_back.truth.stop_ns - 2 * S
     assert not moving(out_and_back, leg[0] - S)
     assert not moving(out_and_back, leg[1])
+    recorder, bag = recorded(out_and_back)
+    legs = find_legs.find_legs(recorder, bag, ['each-stop'], [], Config())
+    assert len(legs) == 2
+    assert legs[0][1] == legs[1][0]
+    for edge in (e for leg in legs for e in leg):
+        assert not moving(out_and_back, edge - S)
 
 
 def test_stamps_without_common_time_are_refused(out_and_back):
@@ -141,15 +147,6 @@ def test_a_topic_that_covers_half_of_the_recording_is_reported(out_and_back, slo
         missing = float(reason.text.split(' s ')[0].split()[-1])
         assert missing == pytest.approx(half_s, abs=2.0)      # fixes come each second
         assert f'{"ends" if early else "begins"} {missing:.0f} s' in reason.text
-
-
-def test_each_stop_splits_the_recording_at_standstills(out_and_back):
-    recorder, bag = recorded(out_and_back)
-    legs = find_legs.find_legs(recorder, bag, ['each-stop'], [], Config())
-    assert len(legs) == 2
-    assert legs[0][1] == legs[1][0]
-    for edge in (e for leg in legs for e in leg):
-        assert not moving(out_and_back, edge - S)
 
 
 def test_marks_take_precedence_over_standstills_and_options_over_marks(out_and_back):

@@ -23,15 +23,11 @@ from odocal_ros.reasons import Code, Verdict
 pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 GAP = (200.0, 203.0)
+MADE = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'consumer', 'seed': 8}
 
 
 def parts_of(leg):
     return parts_between(leg, imu_gaps(leg, 0.5))
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(scenario='town', duration=300.0, imu_grade='consumer', seed=8)
 
 
 def silent(leg, *gaps):

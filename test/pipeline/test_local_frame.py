@@ -39,11 +39,7 @@ NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 SMOOTHER = {'heading_sigma': None, 'method': 'smoother'}
 CAR = {'scenario': 'town', 'duration': 240.0, 'imu_grade': 'consumer', 'fix_noise': 'rtk',
        'seed': 5}
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(**CAR)
+MADE = CAR
 
 
 def posed(made, latitude_deg=math.nan, position=None):

@@ -21,11 +21,7 @@ from odocal_ros.reasons import Code, Verdict
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
 ASKED = {'method': 'smoother', 'heading_sigma': None}      # no external heading
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(scenario='town', duration=240.0, imu_grade='industrial', seed=11)
+MADE = {'scenario': 'town', 'duration': 240.0, 'imu_grade': 'industrial', 'seed': 11}
 
 
 @pytest.fixture(scope='module')

@@ -17,17 +17,13 @@ from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
+MADE = ROUTE | {'seed': 7}
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; seeds are fixed
 WHEELS = ('scale_factor', 'scale_factor_left', 'scale_factor_right')
 
 
 def settings(made, **changes):
     return drives.settings(made, **{'method': 'smoother'} | changes)
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(**ROUTE, seed=7)
 
 
 @pytest.fixture(scope='module')

@@ -19,12 +19,8 @@ from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
 SLIP_M, SLIP_S = 0.5, 200.0
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(scenario='town', duration=300.0, imu_grade='industrial', odometer_rate=50.0,
-                 seed=8)
+MADE = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'odometer_rate': 50.0,
+        'seed': 8}
 
 
 def spun(made, samples):

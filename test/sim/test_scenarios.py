@@ -35,19 +35,6 @@ def chord(state):
     return np.hypot(north, east)
 
 
-def test_scenario_paper_is_the_drive_of_the_paper():
-    motion, state = states('paper')
-    assert motion.duration == 930
-    assert motion.distance == pytest.approx(11_200, abs=1e-9)
-    assert state.speed[[0, 2990, 3400, 8600, 9000, 9300]] == pytest.approx([0, 0, 20, 20, 0, 0])
-    assert state.acceleration[3100] == 0.5
-    assert np.ptp(state.yaw) == 0
-    options = resolved(SimOptions(scenario='paper'))
-    assert options.nominal_scale == pytest.approx(1.2 * options.scale)
-    assert options.imu_grade == 'navigation'
-    assert np.degrees(options.yaw) == pytest.approx(1)
-
-
 def test_scenario_straight_is_the_straight_run_of_the_method():
     motion, state = states('straight')
     assert motion.duration == 720
