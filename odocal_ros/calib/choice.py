@@ -18,10 +18,11 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 
 METHOD_ORDER = ('smoother', 'two_point')
 PLANAR = 'planar'        # the only method of legs that the others cannot compute
-ALWAYS_COMPUTED = 'two_point'     # the operator's own marks: computed and shown for every setting
-# requested: the method that gives the values
+ALWAYS_COMPUTED = 'two_point'     # for comparison, with every setting: by the operator's marks
+# setting ``method``: the method that gives the values, if it has another name
 VALUES_FROM = {'patent': 'smoother', 'wheels': 'smoother'}
-# not taken from end points if the smoother refuses it: they have only the accelerometer's level
+# method and parameter: without a value there, no other method gives one. The pitch of two_point
+# is based on the level by the accelerometer alone
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # value that a reason is about: left out if another method gives the value
 REASON_ESTIMATES = {
@@ -43,15 +44,21 @@ COMPARED = {
     'pitch_mounting_angle': ('pitch', 'heights at the marks, hills, or an accelerometer bias')}
 
 
-def deciding_methods(method_setting: str | tuple[str, ...], shown: bool = False) -> tuple[str,
-                                                                                          ...]:
-    """Return the methods that may give the result, the best first; shown: and those to compare."""
+def deciding_methods(method_setting: str | tuple[str, ...],
+                     compared: bool = False) -> tuple[str, ...]:
+    """
+    Return the methods that may give the result, the best first.
+
+    method_setting : the setting ``method``, or the methods.   compared : also the methods that are
+    computed only for comparison.
+    """
     if not isinstance(method_setting, str):
         return method_setting
     if method_setting in ('auto', 'all'):
         return METHOD_ORDER
     method_setting = VALUES_FROM.get(method_setting, method_setting)
-    return tuple(dict.fromkeys((method_setting, ALWAYS_COMPUTED))) if shown else (method_setting,)
+    return tuple(dict.fromkeys((method_setting, ALWAYS_COMPUTED))) if compared else (
+        method_setting,)
 
 
 def choose(methods: Mapping[str, MethodResult],
@@ -59,8 +66,8 @@ def choose(methods: Mapping[str, MethodResult],
     """
     Return each parameter from the first method that has it and is not rejected.
 
-    Also the methods that gave a value; if none did, the first usable one.   methods : by name.
-    method_setting : the setting ``method``, or the methods that may give values.
+    Also returns the names of the methods that gave a value; if none did, of the first usable one.
+    methods : by name.   method_setting : the setting ``method``, or the methods.
     """
     results = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))
                if name in methods]
@@ -73,23 +80,26 @@ def choose(methods: Mapping[str, MethodResult],
                                  and (first.method, name) != REFUSED_FOR_ALL):
                 estimates[name] = Estimate(estimate.value, estimate.sigma, estimate.unit,
                                            method.name)
-    giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
-    return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
+    sources = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
+    return estimates, tuple(sources) or tuple(m.name for m in usable[:1])
 
 
 def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting: str
                             | tuple[str, ...],
                             stated_codes: Iterable[Code] = ()) -> list[Reason]:
-    """Return METHOD_REJECTED of rejected methods before a usable one, except stated_codes."""
+    """
+    Return METHOD_REJECTED for each rejected method that is better than a usable one.
+
+    Not if the cause is one of ``stated_codes``, or missing data, such as of a second wheel.
+    """
     results = [methods[name] for name in deciding_methods(method_setting) if name in methods]
-    sound = [i for i, m in enumerate(results) if m.verdict is not Verdict.REJECTED]
-    why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
-           for m in results[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
-    # a method without its data (a second wheel) is not reported
-    return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r}',
-                   f'{r.remedy} The values come from another method, which may not detect this '
-                   'problem.')
-            for name, r in why if r.code not in (Code.NO_METHOD, *stated_codes)]
+    usable = [i for i, m in enumerate(results) if m.verdict is not Verdict.REJECTED]
+    causes = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
+              for m in results[:max(usable, default=0)] if m.verdict is Verdict.REJECTED]
+    return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {cause}',
+                   f'{cause.remedy} The values come from another method, which may not detect '
+                   'this problem.')
+            for name, cause in causes if cause.code not in (Code.NO_METHOD, *stated_codes)]
 
 
 def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
@@ -100,23 +110,24 @@ def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
 def relevant_reasons(reasons: Iterable[Reason], method: str,
                      estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
     """Return a method's reasons, without those about values that another method gives."""
-    return tuple(r for r in reasons if r.code not in REASON_ESTIMATES or (
-        estimate := estimates.get(REASON_ESTIMATES[r.code])) is None or estimate.method == method)
+    def is_relevant(parameter: str) -> bool:
+        return parameter not in estimates or estimates[parameter].method == method
+    return tuple(r for r in reasons if is_relevant(REASON_ESTIMATES.get(r.code, '')))
 
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     """
-    Return METHODS_DISAGREE, with the likely cause, where two methods that are not rejected differ.
+    Return METHODS_DISAGREE for each parameter in which the two methods of METHOD_ORDER differ.
 
-    By more than REMARK_SIGMAS of both together, for each parameter.
+    They differ by more than REMARK_SIGMAS of both together; a rejected method is not compared.
     """
-    sound = [methods[n] for n in METHOD_ORDER if n in methods
-             and methods[n].verdict is not Verdict.REJECTED]
-    if len(sound) < len(METHOD_ORDER):
+    usable = [methods[n] for n in METHOD_ORDER if n in methods
+              and methods[n].verdict is not Verdict.REJECTED]
+    if len(usable) < len(METHOD_ORDER):
         return []
-    (first, second), reasons = sound, []
-    for name, (word, cause) in COMPARED.items():
-        a, b = (m.estimates.get(name) for m in sound)
+    (first, second), reasons = usable, []
+    for name, (label, cause) in COMPARED.items():
+        a, b = (m.estimates.get(name) for m in usable)
         if a is None or b is None or a.value is None or b.value is None \
                 or a.sigma is None or b.sigma is None:
             continue
@@ -127,6 +138,6 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
             text = (format_change(difference / a.value) if name == 'scale_factor' else
                     f'{math.degrees(difference):+z.3f} deg')
             reasons.append(Reason(
-                Code.METHODS_DISAGREE, f'{word}: {second.name} and {first.name} differ by {text}, '
-                f'{abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
+                Code.METHODS_DISAGREE, f'{label}: {second.name} and {first.name} differ by '
+                f'{text}, {abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
     return reasons

@@ -4,7 +4,7 @@
 """
 Combination of the results of one method on several legs of a vehicle, by a weighted mean.
 
-Errors of single legs average down, errors shared by all legs do not: docs/method.md, (T15), (T16).
+Errors of single legs average down, errors shared by all legs do not: docs/method.md (T15), (T16).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,23 +23,23 @@ DIFFERING_SOURCES = {'initial_level'}
 
 
 def combine_method(name: str, results: Sequence[MethodResult],
-                   walked: Floats | None = None) -> MethodResult:
+                   walk_variance: Floats | None = None) -> MethodResult:
     """
     Return the minimum variance means of the values of one method on J legs.
 
     The scale is that of the last leg. The sigma includes shared errors once. Scatter beyond the
     sigmas widens them (LEGS_DISAGREE).
 
-    name : the method.   results : one for each leg, at least one.   walked : (J,) variance of the
-    random walk of ln K from each leg to the last; None: constant.
+    name : the method.   results : one for each leg, at least one.   walk_variance : (J,) variance
+    of the random walk of ln K from each leg to the last; None: constant.
     """
     if len(results) == 1:
         return results[0]
     parameters = results[0].parameters
-    walked = np.zeros(len(results)) if walked is None else walked
+    walk_variance = np.zeros(len(results)) if walk_variance is None else walk_variance
     reasons: tuple[Reason, ...] = ()
     estimates: dict[str, Estimate] = {}
-    sources: dict[str, list[tuple[int, Floats]]] = {}
+    effects: dict[str, dict[int, Floats]] = {}      # of each source, by row of the parameter
     for i, parameter in enumerate(parameters):
         determined = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
         unit = results[0].estimates[parameter].unit
@@ -47,42 +47,47 @@ def combine_method(name: str, results: Sequence[MethodResult],
             estimates[parameter] = Estimate(None, None, unit)
             continue
         value, variance, shared, scatter_reasons = _combine(
-            parameter, i, [results[k] for k in determined], walked[determined])
+            parameter, i, [results[k] for k in determined], walk_variance[determined])
         reasons += scatter_reasons
-        scale = value if parameter.startswith('scale_factor') else 1.0     # of ln K to K
-        sigma = abs(scale) * float(np.sqrt(variance + sum(v @ v for v in shared.values())))
+        derivative = value if parameter.startswith('scale_factor') else 1.0     # of K by ln K
+        sigma = abs(derivative) * float(np.sqrt(variance + sum(e @ e for e in shared.values())))
         estimates[parameter] = Estimate(value, sigma, unit)
         unshared = np.sqrt(variance) * np.eye(len(parameters))[i]
         for source, effect in (shared | {'legs': unshared}).items():
-            sources.setdefault(source, []).append((i, effect))
-    estimates |= _scale_ratio(results, estimates) | newest_leg_values(results, estimates)
-    stacked = _stacked(sources, len(parameters))
-    details = known_budget(stacked, parameters, estimates) if sources else {}
-    return MethodResult(name, reasons, estimates, parameters, stacked,
+            effects.setdefault(source, {})[i] = effect
+    estimates |= _scale_ratio(results, estimates) | last_leg_values(results, estimates)
+    sources = _make_sources(effects, len(parameters))
+    details = known_budget(sources, parameters, estimates) if sources else {}
+    return MethodResult(name, reasons, estimates, parameters, sources,
                         {'legs_used': len(results)} | details)
 
 
-def newest_leg_values(results: Sequence[MethodResult],
-                      estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def last_leg_values(results: Sequence[MethodResult],
+                    combined: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """
-    Return values that apply to single legs, such as gyro biases, of the last leg that has them.
+    Return values that apply to single legs, such as gyro biases, from the last leg with a value.
 
-    estimates : combined values, which are left out. The heading error in older results applies to
-    the start of a leg: a combination has none.
+    combined : values that are left out, as they apply to all legs. The heading error in older
+    results applies to the start of a leg: a combination has none.
     """
-    newest: dict[str, Estimate] = {}
+    values: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):
         if name == 'heading_error':
             e = Estimate(None, None, e.unit)
-        if name not in estimates and name != 'scale_ratio' and (
-                name not in newest or e.value is not None):
-            newest[name] = e
-    return newest
+        if name not in combined and name != 'scale_ratio' and (
+                name not in values or e.value is not None):
+            values[name] = e
+    return values
 
 
-def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Floats,
+def _combine(parameter: str, i: int, results: Sequence[MethodResult], walk_variance: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """Return mean, unshared variance, shared effects, and reasons of parameter i: (T15), (T16)."""
+    """
+    Return the mean of a parameter, its variance by unshared errors, shared effects, and reasons.
+
+    It is row i of the sources; docs/method.md (T15), (T16). ``shared`` has an effect on the mean
+    for each shared source, by name.
+    """
     is_scale = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x
@@ -93,16 +98,16 @@ def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Fl
                           for r in results])
     unshared = np.diag(np.maximum(variances, 1e-18))
     if is_scale:    # from the last leg back, two legs share the random walk up to the nearer one
-        unshared += np.minimum.outer(walked, walked)
-    by_leg = _shared_effects(i, results)
-    weight = _weights(unshared + sum(g @ g.T for g in by_leg.values()))
+        unshared += np.minimum.outer(walk_variance, walk_variance)
+    effects_by_leg = _shared_effects(i, results)
+    weight = _weights(unshared + sum(e @ e.T for e in effects_by_leg.values()))
     mean = weight @ y
-    shared = {n: weight @ g for n, g in by_leg.items()}
+    shared = {name: weight @ e for name, e in effects_by_leg.items()}
     variance = weight @ unshared @ weight
     # allowed differences: errors of the legs, and shared errors with different effects
     allowed = unshared + np.diag(sum((
-        ((g if n in DIFFERING_SOURCES else g - shared[n])**2).sum(axis=1)
-        for n, g in by_leg.items()), np.zeros(len(y))))
+        ((e if name in DIFFERING_SOURCES else e - shared[name])**2).sum(axis=1)
+        for name, e in effects_by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
     chi2 = float((y - mean) @ np.linalg.solve(allowed, y - mean)) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
@@ -117,43 +122,47 @@ def _combine(parameter: str, i: int, results: Sequence[MethodResult], walked: Fl
 
 def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats]:
     """Return the effects of each shared source on parameter i in J legs, by name: (J, k)."""
-    by_leg = {}
+    effects_by_leg = {}
     for name in sorted({s.name for r in results for s in r.sources if s.shared}):
         effects = [next((s.effects[i] for s in r.sources if s.shared and s.name == name), None)
                    for r in results]
         width = max(len(e) for e in effects if e is not None)
-        by_leg[name] = np.stack([np.zeros(width) if e is None else e for e in effects])
-    return by_leg
+        effects_by_leg[name] = np.stack([np.zeros(width) if e is None else e for e in effects])
+    return effects_by_leg
 
 
 def _weights(covariance: Floats) -> Floats:
-    """Return the weights, none below zero, of the mean with the least variance: (T15)."""
+    """
+    Return the weights, none below zero, of the mean with the least variance: (J,), (T15).
+
+    covariance : (J, J) with shared errors; without them, a leg that a shared error dominates would
+    make the mean worse.
+    """
     from scipy.optimize import nnls
-    # by unshared errors alone, a leg that a shared error dominates would make the mean worse
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
-    out: Floats = weight / weight.sum()
-    return out
+    normalised: Floats = weight / weight.sum()
+    return normalised
 
 
 def _scale_ratio(results: Sequence[MethodResult],
                  estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Return the ratio of the combined scale to the nominal one of the first leg."""
-    first, scale = results[0].estimates, estimates['scale_factor']
-    ratio = first['scale_ratio'].value
-    first_scale = first['scale_factor'].value
-    if ratio is None or first_scale is None or scale.value is None or scale.sigma is None:
+    scale = estimates['scale_factor']
+    first_ratio, first_scale = (
+        results[0].estimates[name].value for name in ('scale_ratio', 'scale_factor'))
+    if first_ratio is None or first_scale is None or scale.value is None or scale.sigma is None:
         return {'scale_ratio': Estimate(None, None, '1')}
-    nominal = first_scale / ratio
+    nominal = first_scale / first_ratio
     return {'scale_ratio': Estimate(scale.value / nominal, scale.sigma / nominal, '1')}
 
 
-def _stacked(sources: Mapping[str, list[tuple[int, Floats]]], p: int) -> tuple[Source, ...]:
-    """Return the sources from their effects by (row, effects) of each of p parameters."""
-    out = []
-    for name, rows in sources.items():
-        effects = np.zeros((p, max(len(e) for _, e in rows)))
-        for i, e in rows:
-            effects[i, :len(e)] = e
-        out.append(Source(name, effects, name != 'legs'))
-    return tuple(out)
+def _make_sources(effects: Mapping[str, Mapping[int, Floats]], p: int) -> tuple[Source, ...]:
+    """Return the error sources of p parameters from their effects, by name and row."""
+    sources = []
+    for name, by_row in effects.items():
+        matrix = np.zeros((p, max(map(len, by_row.values()))))
+        for i, effect in by_row.items():
+            matrix[i, :len(effect)] = effect
+        sources.append(Source(name, matrix, name != 'legs'))
+    return tuple(sources)

@@ -23,7 +23,11 @@ MIN_UNCOUNTED_SHARE = 0.01   # judgement: share of the path without counts that 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """Return as ``check_path_and_speed``, with a reason if the leg is not straight."""
+    """
+    Return the path length between the marks, m, and reasons of a leg that must be straight.
+
+    Reasons and arguments are those of ``check_path_and_speed``, and LEG_NOT_STRAIGHT.
+    """
     distance, reasons = check_path_and_speed(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -73,8 +77,8 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
     if len(t) < 2:
         return np.zeros(len(t))
     low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
-    out: Floats = (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
-    return out
+    rate: Floats = (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
+    return rate
 
 
 def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
@@ -95,10 +99,12 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
     """
     Return the reason if wheels or fixes do not move between the marks.
 
-    min_motion : of the fixes, m.
+    t_fix, fixes_n : (k,) s, (k, 3) m.   fix_sigma : stated, m.   t_stop : stop mark, s.
+    min_motion : distance between fixes that is motion, m.
     """
-    # judgement: with slow fixes a mark is between two of them; three before it give the position
-    mark_margin, count_before = 0.5, 3      # s
+    # judgement, s and fixes: with slow fixes a mark is between two of them; those before it are
+    # needed for the position
+    mark_margin, count_before = 0.5, 3
     rows = slice(max(0, np.searchsorted(t_fix, -mark_margin) - count_before),
                  np.searchsorted(t_fix, t_stop + mark_margin))
     t, fixes = t_fix[rows], fixes_n[rows, :2]
@@ -168,21 +174,23 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
         if end >= travel.t[-1]:
             continue
-        t, p, count = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
+        t, p = t_fix[rows], fixes_n[rows, :2]
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
-        has_left, is_before_end = (np.hypot(*(p - np.median(end_fixes, axis=0)).T) > limit
-                                   for end_fixes in (p[:count], p[-count:]))
-        spans.append((t[np.argmax(has_left)], t[len(t) - 1 - np.argmax(is_before_end[::-1])]))
+        # the places are medians of three fixes, of which one may be an outlier
+        is_after_start, is_before_end = (np.hypot(*(p - np.median(place, axis=0)).T) > limit
+                                         for place in (p[:3], p[-3:]))
+        last = len(t) - 1 - np.argmax(is_before_end[::-1])
+        spans.append((t[np.argmax(is_after_start)], t[last]))
     return np.reshape(np.array(spans, float), (-1, 2))
 
 
 def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:
     """Return the motion of (k, 2) fixes without jumps and noise, m, 0 below ``motion_limit``."""
-    count = 20      # of parts, enough that motion extends over more than two of them
-    if len(fixes) < count:
+    part_count = 20      # so many that motion extends over more than two of them
+    if len(fixes) < part_count:
         return 0.0
-    parts = np.array_split(fixes, count)
+    parts = np.array_split(fixes, part_count)
     if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < motion_limit:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in parts])
@@ -215,14 +223,13 @@ def find_reachable(t_fix: Floats, fixes_n: Floats) -> Bools:
     if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + error_limit).all():
         return np.ones(len(p), bool)
     first = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
-    reachable, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
-    for order in (range(first, len(p)), range(first, -1, -1)):
-        t, x, y = rows[first]
+    reachable = np.zeros(len(p), bool)
+    for order in (range(first, len(p)), range(first, -1, -1)):    # forwards and backwards in time
+        last = first
         for k in order:
-            distance = np.hypot(rows[k][1] - x, rows[k][2] - y)
-            if distance <= FASTEST * abs(rows[k][0] - t) + error_limit:
-                reachable[k] = True
-                t, x, y = rows[k]
+            distance = np.hypot(p[k, 0] - p[last, 0], p[k, 1] - p[last, 1])
+            if distance <= FASTEST * abs(t_fix[k] - t_fix[last]) + error_limit:
+                reachable[k], last = True, k
     return reachable
 
 
@@ -230,19 +237,19 @@ def fix_white_noise(fixes_n: Floats) -> float:
     """Return the white noise of fixes, m, by the median of their second differences."""
     if len(fixes_n) < 5:
         return 2.5      # m, of a receiver without corrections
-    bend = np.diff(fixes_n[:, :2], n=2, axis=0)
-    return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
+    second_difference = np.diff(fixes_n[:, :2], n=2, axis=0)     # with 1 + 4 + 1 variances
+    return float(np.median(np.abs(second_difference)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 
 def separated_fixes(fixes_n: Floats, min_distance: float) -> list[int]:
     """Return indices of fixes, (k, 2 or more), from the first, at least min_distance, m, apart."""
     knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
-    begin, ahead = 1, 64       # fixes searched at a time: the next knot is usually among them
+    begin, block_size = 1, 64     # fixes searched at a time: the next knot is usually among them
     while begin < len(p):
-        is_distant = np.hypot(*(p[begin:begin + ahead] - p[knots[-1]]).T) >= min_distance
+        is_distant = np.hypot(*(p[begin:begin + block_size] - p[knots[-1]]).T) >= min_distance
         if is_distant.any():
             knots.append(begin + int(np.argmax(is_distant)))
             begin = knots[-1] + 1
         else:
-            begin += ahead
+            begin += block_size
     return knots

@@ -58,9 +58,9 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     weight = 1 / np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2)
     weight = weight / weight.sum()
     mean = weight @ position_n
-    of_one = np.einsum('n,nij->ij', weight, covariance_n)
-    share = _variance_share(t, position_n - mean, of_one, weight, correlation_time)
-    return mean, of_one * share, int(keep.sum())
+    fix_covariance = np.einsum('n,nij->ij', weight, covariance_n)      # of a single fix
+    share = _variance_share(t, position_n - mean, fix_covariance, weight, correlation_time)
+    return mean, fix_covariance * share, int(keep.sum())
 
 
 def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
@@ -75,9 +75,14 @@ def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
     return inliers
 
 
-def _variance_share(t: Floats, residual: Floats, of_one: Floats, weight: Floats,
+def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight: Floats,
                     correlation_time: float) -> float:
-    """Return the variance of the mean over that of a single fix: docs/method.md (T7)."""
+    """
+    Return the variance of the mean over that of a single fix: docs/method.md (T7).
+
+    Without a known correlation time, the scatter and the steps from fix to fix show whether the
+    errors are white, or how large their fast and their slow part are.
+    """
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
@@ -86,33 +91,37 @@ def _variance_share(t: Floats, residual: Floats, of_one: Floats, weight: Floats,
         return _mean_variance_share(t, weight, correlation_time)
     if n < MIN_SCATTERED_FIXES:
         return 1.0
-    sigma = np.sqrt(np.diag(of_one))
-    z = residual[:, :2] / sigma[:2]
+    # of white errors, both of these are 1, within 3 sigma of their own noise
+    z = residual[:, :2] / np.sqrt(np.diag(fix_covariance))[:2]
     scatter = (z**2).sum() / (2 * (n - 1))
-    step = (np.diff(z, axis=0)**2).mean() / 2
-    # white fixes: scatter and half the squared steps are both 1, within 3 sigma of their own noise
-    slack = 3 * np.sqrt(1 / n)
-    if scatter > 1 - slack and step > scatter * (1 - slack):
-        return white * (scatter if scatter > 1 + slack else 1.0)
-    fast = min(step, 1.0)
+    half_square_step = (np.diff(z, axis=0)**2).mean() / 2
+    tolerance = 3 * np.sqrt(1 / n)
+    if scatter > 1 - tolerance and half_square_step > scatter * (1 - tolerance):
+        return white * (scatter if scatter > 1 + tolerance else 1.0)
+    fast = min(half_square_step, 1.0)
     slow = max(1.0, scatter) - fast
-    out: float = fast * white + slow * _mean_variance_share(t, weight,
-                                                            _correlation_time(t, z, fast, slow))
-    return out
+    tau = _correlation_time(t, z, fast, slow)
+    share: float = fast * white + slow * _mean_variance_share(t, weight, tau)
+    return share
 
 
 def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
     """Return the variance share of a mean of Gauss-Markov errors with correlation time tau, s."""
     if tau == np.inf:
         return 1.0
-    pick = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).round().astype(int))
-    w = weight[pick] / weight[pick].sum()
-    correlation = np.exp(-np.abs(t[pick][:, None] - t[pick]) / tau)
+    max_rows = 400      # limits the size of the correlation matrix
+    rows = np.unique(np.linspace(0, len(t) - 1, min(len(t), max_rows)).round().astype(int))
+    w = weight[rows] / weight[rows].sum()
+    correlation = np.exp(-np.abs(t[rows][:, None] - t[rows]) / tau)
     return float(max(w @ correlation @ w, weight @ weight))
 
 
 def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
-    """Return the correlation time of the slow part: structure function at a quarter window."""
+    """
+    Return the correlation time of the slow part, s, by the structure function at a quarter window.
+
+    z : (n, 2) residuals over stated sigmas.   fast, slow : variances of the two parts of z.
+    """
     lag = max(1, len(t) // 4)
     growth = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast      # slow (1 - correlation)
     decorrelated = np.clip(growth / slow, 0.0, 0.95) if slow > 0 else 0.95
@@ -140,26 +149,26 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
     """
     t, position_n, covariance_n = fixes
     low, high = span if span else (t_mark - window, t_mark + window)
-    pick = np.flatnonzero((t >= low) & (t <= high))
-    if not len(pick):
+    rows = np.flatnonzero((t >= low) & (t <= high))
+    if not len(rows):
         if not len(t) or span is None:
             return None
         nearest = np.argmin(np.abs(t - t_mark))
         if abs(t[nearest] - t_mark) > window:
             return None
-        pick = np.array([nearest])
-    at_mark = position_n[pick] - displacement_n(t[pick])
+        rows = np.array([nearest])
+    at_mark = position_n[rows] - displacement_n(t[rows])
     height_known = bool(np.isfinite(at_mark[:, 2]).all())
     at_mark = np.where(np.isfinite(at_mark), at_mark, 0.0)
-    mean, covariance, used = mean_fix(t[pick], at_mark, covariance_n[pick], correlation_time)
+    mean, covariance, used = mean_fix(t[rows], at_mark, covariance_n[rows], correlation_time)
     return MarkFix(t_mark, mean, covariance, span is not None, used, height_known)
 
 
 def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:
     """
-    Return counts, numbers and column means, (k,) each, of windows of SLOW_WINDOW with enough rows.
+    Return number of rows, window number and column means, (k,) each, of windows with enough rows.
 
-    t : (n,) s; windows begin at the first.   columns : (n,) each.
+    t : (n,) s; windows of SLOW_WINDOW begin at the first.   columns : (n,) each.
     """
     window = ((t - t[0]) / SLOW_WINDOW).astype(int)
     count = np.bincount(window)
@@ -172,9 +181,10 @@ def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
     """
     Return the variance of slow fix errors over SLOW_WINDOW, m^2, and their correlation time, s.
 
-    It is by means of the residuals over windows, in which white errors average down. A slow part
-    of a fifth of the variance is not observable in the scatter at a mark, but dominates its mean.
-    A straight line over the path, the effect of the errors of the two marks, is removed.
+    It is the variance of the mean residuals of windows, less that by white errors, which average
+    down there. A slow part of a fifth of the variance is not observable in the scatter at a mark,
+    but dominates its mean. A straight line over the path, the effect of the errors of the two
+    marks, is removed.
 
     t, along, place : (n,) s, corrected track minus fixes along the chord, m, and position there,
     m.   variance : (n,) stated, m^2.   drift : possible track error by gyro drift along it, m.

@@ -52,18 +52,21 @@ SLIP_GRID = 0.1
 
 
 class Slips(NamedTuple):
-    """Slips of the mean of the wheels: (k,)."""
+    """The k slips of the mean of the wheels, and the delay of the odometer."""
 
-    t: Floats                                # s, middle of each slip
-    size: Floats                             # m, > 0 if the wheel spun, < 0 if it slid
+    t: Floats                                # (k,) s, middle of each slip
+    size: Floats                             # (k,) m, > 0 if the wheel spun, < 0 if it slid
     delay: float = 0.0                       # s, of the odometer; 0 if it does not look like slip
-    unforced_sign: Ints = np.empty(0, int)   # see ``unforced_sign``
+    unforced_sign: Ints = np.empty(0, int)   # (k,) see the function ``unforced_sign``
 
 
 def count_size(travel: Travel) -> float:
-    """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
+    """
+    Return the size of a count, scale units; for coarse speeds, that of an equivalent count.
+
+    The largest error of such speeds over a window acts as WINDOW_ROUNDING_COUNTS of these counts.
+    """
     coarse = travel.coarse
-    # coarse.max_error is the largest error of speeds at the ends of a window and within it
     return travel.quantum if coarse is None else (
         coarse.max_error * SPIN_WINDOW / WINDOW_ROUNDING_COUNTS)
 
@@ -94,8 +97,9 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     t, size = windows.events(delay)
     looks_like_slip = len(windows.events(0.0)[0]) > len(t)
     speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / SPIN_GRID
-    sign = [unforced_sign(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
-        speed, np.full(5, 0.2), 'valid')) for at, metres in zip(t, size, strict=True)]
+    mean_speed = np.convolve(speed, np.full(5, 0.2), 'valid')      # over a second
+    sign = [unforced_sign(middle - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], mean_speed)
+            for middle, metres in zip(t, size, strict=True)]
     return Slips(t, size, delay if looks_like_slip else 0.0, np.array(sign, int))
 
 
@@ -131,8 +135,8 @@ def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward
     along = map_rows(lambda f_b: f_b @ forward, f_b)
     force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
-    out: Floats = force - gravity(latitude, 0.0) * rise
-    return out
+    mean: Floats = force - gravity(latitude, 0.0) * rise
+    return mean
 
 
 def excess_path(span: int, a: Floats, path: Floats) -> Floats:
@@ -150,18 +154,22 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
     speed_offset = (difference[2 * END_STEPS:] - difference[:-2 * END_STEPS]) / (
         2 * END_STEPS * SPIN_GRID)
     difference = difference[END_STEPS:-END_STEPS]
-    by_line = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * SPIN_GRID
-    return difference[span:] - difference[:-span] - by_line
+    line_path = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * SPIN_GRID
+    return difference[span:] - difference[:-span] - line_path
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Return time and size of each event, by (m,) middles, s, and excess, m, of windows."""
-    # windows that contain an event are one group; those in its middle contain all of it
+    """
+    Return time, s, and size, m, of each slip, by windows with an excess beyond the limit.
+
+    middle, excess : (m,) s, m, of windows. Those that contain a slip are one group; the window in
+    the middle of the group contains all of it.
+    """
     rows = np.flatnonzero(np.abs(excess) > limit)
     groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SPIN_WINDOW / 2) + 1)
-    centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
-    k = np.array([c for c in centres if abs(excess[c]) > limit], int)
-    return middle[k], excess[k]
+    centres = [(group[0] + group[-1]) // 2 for group in groups if len(group)]
+    windows = np.array([centre for centre in centres if abs(excess[centre]) > limit], int)
+    return middle[windows], excess[windows]
 
 
 def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, speed: Floats) -> int:
@@ -174,37 +182,43 @@ def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, spe
     t, duration : s, of the slip.   metres : wheel travel minus vehicle travel.   t_speed, speed :
     (n,) s, m/s, of the vehicle, < 0 backwards.
     """
-    def within(beside: float) -> tuple[Floats, Floats, float]:
-        """Return the sizes of the speed, their changes, and a signed sum, near the slip."""
-        first, last = np.searchsorted(t_speed, (t - beside, t + duration + beside + 1e-9))
-        part = np.abs(speed[first:last])
-        return part, np.diff(part) / np.diff(t_speed[first:last]), speed[first:last].sum()
+    def near_slip(margin: float) -> tuple[Floats, Floats, float]:
+        """Return sizes of the speed, their rates, and the signed sum of speeds, near the slip."""
+        first, last = np.searchsorted(t_speed, (t - margin, t + duration + margin + 1e-9))
+        size = np.abs(speed[first:last])
+        return size, np.diff(size) / np.diff(t_speed[first:last]), speed[first:last].sum()
 
-    _, change, direction = within(BRAKES_BESIDE)
+    _, rate, direction = near_slip(BRAKES_BESIDE)
     if metres * direction < 0:
-        return -int(len(change) and change.min() > -WEAKEST_BRAKING)
-    size, change, _ = within(0.0)
-    stops = len(change) and ((change < -WEAKEST_BRAKING) | (size[1:] < STOPS)).all()
+        return -int(len(rate) and rate.min() > -WEAKEST_BRAKING)
+    size, rate, _ = near_slip(0.0)
+    stops = len(rate) and ((rate < -WEAKEST_BRAKING) | (size[1:] < STOPS)).all()
     return int(stops and size.min() < STOPS)
 
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
     """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : ``unforced_sign``."""
     reasons = []
-    for code, tested_sign, relation, where in (
+    for code, tested_sign, relation, circumstance in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
             (Code.TRAVEL_EXCESS, 1, 'more', 'while it brakes to a stop')):
-        size, at = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
-        if len(at):
+        size, times = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
+        several = len(times) > 1
+        if len(times):
             reasons.append(Reason(code, (
                 f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '
-                f'{len(at)} place{"s" * (len(at) > 1)} {where}, {"the largest " * (len(at) > 1)}'
-                f'at t = {at[np.argmax(size)]:.0f} s')))
+                f'{len(times)} place{"s" * several} {circumstance}, {"the largest " * several}'
+                f'at t = {times[np.argmax(size)]:.0f} s')))
     return reasons
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
-    """Return all slips as one source of error, since wheels spin in one direction."""
+    """
+    Return all slips as one source of error, since wheels spin in one direction.
+
+    f : (3,) scale times forward axis.   gradient : derivative of the parameters by a displacement,
+    m, in n.   t, size : (k,) s, m, of the slips.
+    """
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 
@@ -227,9 +241,9 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     return (*reasons, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
 
 
-def _column(kind: type = float) -> NDArray[Any]:
-    """Declare a column, empty by default."""
-    return field(default_factory=lambda: np.empty(0, kind))
+def _column(dtype: type = float) -> NDArray[Any]:
+    """Declare a field with an array that is empty by default."""
+    return field(default_factory=lambda: np.empty(0, dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,14 +282,15 @@ NO_SLIPS = WheelSlips()
 
 def join_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:
     """Return the slips of the wheels of several axles; count: number of wheels in the mean."""
-    columns = {name: np.concatenate([getattr(one, name) for one in axles]) for name in (
-        'begin', 'end', 'size', 'wheel')}
+    columns = {name: np.concatenate([getattr(slips, name) for slips in axles])
+               for name in ('begin', 'end', 'size', 'wheel')}
     order = np.argsort(columns['begin'], kind='stable')
     return WheelSlips(**{name: column[order] for name, column in columns.items()},
-                      change=math.hypot(*(one.change for one in axles)), count=count)
+                      change=math.hypot(*(slips.change for slips in axles)), count=count)
 
 
-def make_wheel_slips(events: list[tuple[float, float, float]], wheel: list[int]) -> WheelSlips:
+def make_wheel_slips(events: Sequence[tuple[float, float, float]],
+                     wheel: list[int]) -> WheelSlips:
     """Return slips by (begin s, end s, size m, right minus left) and by wheel, -1, 0 or +1."""
     begin, end, size = np.array(events).T
     which = np.array(wheel, np.int64)
@@ -285,15 +300,14 @@ def make_wheel_slips(events: list[tuple[float, float, float]], wheel: list[int])
 
 def wheel_slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason]:
     """Return the reason that names the wheel with the largest slip, its size and time."""
-    n = len(slips.size)
-    worst = int(np.argmax(np.abs(slips.size)))
-    left, right = (f'the {name} wheel' for name in names)
-    which = ('one of the wheels', right, left)[slips.wheel[worst]]
-    verb = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
-    other = ' from the other' * (not slips.wheel[worst])
-    return (Reason(Code.WHEEL_SLIP, f'{which} {verb}{other} by '
-                   f'{100 * abs(slips.size[worst]):.0f} cm relative to the gyro, from t = '
-                   f'{slips.begin[worst]:.1f} s for '
-                   f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
-                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total'
-                      if n > 1 else '')),)
+    n, worst = len(slips.size), int(np.argmax(np.abs(slips.size)))
+    size, begin = slips.size[worst], slips.begin[worst]
+    duration = max(slips.end[worst] - begin, SLIP_GRID)
+    if slips.wheel[worst] == 0:
+        event = 'one of the wheels deviates from the other'
+    else:
+        event = (f'the {names[int(slips.wheel[worst] > 0)]} wheel '
+                 f'{"spins" if size > 0 else "slides"}')
+    others = f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total' if n > 1 else ''
+    return (Reason(Code.WHEEL_SLIP, f'{event} by {100 * abs(size):.0f} cm relative to the gyro, '
+                   f'from t = {begin:.1f} s for {duration:.1f} s{others}'),)

@@ -8,12 +8,14 @@ The paths of the two wheels differ by the track width times the turn. The remain
 rounding and gyro noise, millimetres over seconds; a wheel that spins or slides alone exceeds it by
 centimetres. With the acceleration of the IMU alone the limit is half a metre.
 
-The residual is right path minus the regression of wheel_pair_regression.py on the left one, m. An
-event is a step of the residual: which wheel slipped is decided by the acceleration.
+The residual is the path of the right wheel minus its regression on that of the left one
+(wheel_pair_regression.py). A slip is a step of the residual; the acceleration shows which wheel
+slipped.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +28,6 @@ from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.wheel_faults import WheelPair, wheels_on_grid
 
-Event = tuple[float, float, float]      # begin, end, s, and size, m
 # steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s; others are detected too.
 # Judgement
 SLIP_SPANS = (10, 30, 80, 200, 500)
@@ -35,23 +36,39 @@ SLIP_SPANS = (10, 30, 80, 200, 500)
 GROUND_SIGMA, TURN_SHARE = 0.005, 0.01
 
 
+class Event(NamedTuple):
+    """A step of the residual."""
+
+    begin: float    # s
+    end: float      # s
+    size: float     # m, right minus left
+
+
+class Window(NamedTuple):
+    """Steps of the mean residual over windows of one length, which begin at each row: (n,)."""
+
+    span: int            # rows from the first to the last mean
+    jump: Floats         # (n,) m, last mean minus first mean
+    limit: Floats        # (n,) m, of jumps by chance
+    is_large: Bools      # (n,) True beyond the limit
+
+
 def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
-                 between: tuple[float, float], track: Track, latitude: float,
+                 marks: tuple[float, float], track: Track, latitude: float,
                  metres_per_unit: float, track_width: float = 0.0,
-                 uncertain_t: Floats | None = None,
-                 max_deviation: float = 0.35,
-                 count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
+                 uncertain_t: Floats | None = None, max_deviation: float = 0.35,
+                 wheel_count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
     """
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
     axle : travel of the left and the right wheel.   imu : (t, w_b, f_b) (n,) s, (n, 3) rad/s,
-    (n, 3) m/s^2, with their bias.   between : the marks, s.   track : dead reckoned with the mean
-    of both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the mean.
-    track_width : m, 0 unknown.   uncertain_t : (d,) s, times of travel that is uncertain for other
-    reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
-    count : number of wheels in the mean.
+    (n, 3) m/s^2, with their bias.   marks : start and stop, s.   track : dead reckoned with the
+    mean of both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the
+    mean.   track_width : m, 0 unknown.   uncertain_t : (d,) s, times of travel that is uncertain
+    for other reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
+    wheel_count : number of wheels in the mean.
     """
-    pair = wheels_on_grid(axle, imu, between, slip.SLIP_GRID,
+    pair = wheels_on_grid(axle, imu, marks, slip.SLIP_GRID,
                           np.empty(0) if uncertain_t is None else uncertain_t)
     if pair is None or not metres_per_unit:
         return (), slip.NO_SLIPS
@@ -69,46 +86,51 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     residual = (pair.right - regressors @ x) * per_right
     events, slow_events = _find_events(pair, residual, per_right * (1 + ratio) / 2, width)
     change_reasons, change = regression.find_ratio_change(
-        _without_slips(pair, events), regressors, metres_per_unit, count)
+        _without_slips(pair, events), regressors, metres_per_unit, wheel_count)
     reasons += change_reasons
     # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + slow_events)
     if change:
         steep = 2 * abs(change) * metres_per_unit
-        events = [e for e in events if abs(_slope(pair, e)) > steep]
+        events = [event for event in events if abs(_slope(pair, event)) > steep]
     if not events:
         return reasons, replace(slip.NO_SLIPS, change=change)
     mean = (pair.left * ratio + pair.right) / 2 * per_right
-    wheel = [_find_wheel(pair, mean, imu, track, latitude, e) for e in events]
+    wheel = [_find_wheel(pair, mean, imu, track, latitude, event) for event in events]
     slips = replace(slip.make_wheel_slips(events, wheel), change=change)
     return reasons + slip.wheel_slip_reason(slips, pair.names), slips
 
 
 def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Floats:
     """Return the residual, (n,) m, without its usual slope over the path."""
-    # slopes by rounding at a steady speed, at most two counts over a window, are not removed
     path, n = _mean_path(pair), 200     # steps of a slope, 20 s: longer than most slips
     distance, rise = path[n:] - path[:-n], residual[n:] - residual[:-n]
     if len(distance) < n:
         return residual
     moves = distance > max(np.median(distance) / 2, 2 * pair.quantum)
     slope = np.median(rise[moves] / distance[moves]) if moves.any() else 0.0
-    slope_uncertainty = 2 * quantum_m * (pair.quantum > 0) / max(np.median(distance), 1e-9)
-    out: Floats = residual - np.sign(slope) * max(abs(slope) - slope_uncertainty, 0.0) * path
-    return out
+    # a slope that rounding can cause at a steady speed, two counts over a window, is not removed
+    rounding_slope = 2 * quantum_m * (pair.quantum > 0) / max(np.median(distance), 1e-9)
+    corrected: Floats = residual - np.sign(slope) * max(abs(slope) - rounding_slope, 0.0) * path
+    return corrected
 
 
 def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
     """Return the wheels, with the cells of slips marked as unknown."""
     known, margin = pair.known.copy(), 2.0       # s each side, possibly part of the slip
-    for begin, end, _ in events:
-        known &= (pair.t[1:] < begin - margin) | (pair.t[:-1] > end + margin)
+    for event in events:
+        known &= (pair.t[1:] < event.begin - margin) | (pair.t[:-1] > event.end + margin)
     return replace(pair, known=known)
 
 
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
                  width: float) -> tuple[list[Event], list[Event]]:
-    """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
+    """
+    Return the steps of the residual, (n,) m: finished ones, and ones that may change the ratio.
+
+    quantum_m : size of a count, m.   width : track width, m. A step is found as a jump between two
+    means of the residual, for several distances of these, that is larger than by chance.
+    """
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
@@ -120,15 +142,15 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
         if len(jump) < span:
             continue
         limit = _jump_limits(pair, jump, span, quantum_m * (pair.quantum > 0), width)
-        is_large = np.abs(jump) > limit
-        is_large &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
+        has_gap = unknown[span + MEAN_STEPS - 1:][:len(jump)] != unknown[:len(jump)]
+        is_large = (np.abs(jump) > limit) & ~has_gap
         for k in np.flatnonzero(is_large):
             significant[k + MEAN_STEPS:k + span] = True
-        windows.append((span, jump, limit, is_large))
+        windows.append(Window(span, jump, limit, is_large))
     finished: list[Event] = []
     slow: list[Event] = []
-    for a, b in runs(significant):
-        event = _measure_jump(pair, residual, windows, a, b)
+    for begin, end in runs(significant):
+        event = _measure_event(pair, residual, windows, begin, end)
         (finished if _is_finished(pair, residual, event) else slow).append(event)
     return finished, slow
 
@@ -136,23 +158,25 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
 def _is_finished(pair: WheelPair, residual: Floats, event: Event) -> bool:
     """Return True if a slip ends: it is short, or its slope is absent before and after it."""
     path = _mean_path(pair)
-    begin, end = np.interp(event[:2], pair.t, path)
+    times = [event.begin, event.end]
+    begin, end = np.interp(times, pair.t, path)
     if end - begin < path[-1] / 16:      # half a step of ``find_ratio_change``
         return True
-    at = np.searchsorted(pair.t, event[:2]).clip(0, len(path) - 1)
-    for a, b in ((0, at[0]), (at[1], len(path) - 1)):
-        # rise at the slope of the event, and actual one
-        expected, rise = _slope(pair, event) * (path[b] - path[a]), residual[b] - residual[a]
-        if abs(expected) < 0.1 or abs(rise) > abs(expected) / 2:      # m, observable
+    begin_row, end_row = np.searchsorted(pair.t, times).clip(0, len(path) - 1)
+    min_rise = 0.1      # m, observable
+    for first, last in ((0, begin_row), (end_row, len(path) - 1)):
+        expected = _slope(pair, event) * (path[last] - path[first])
+        rise = residual[last] - residual[first]
+        if abs(expected) < min_rise or abs(rise) > abs(expected) / 2:
             return False
     return True
 
 
 def _slope(pair: WheelPair, event: Event) -> float:
     """Return the size of a slip per path length, from a tenth to nine tenths of its size."""
-    begin, end = np.interp(event[:2], pair.t, _mean_path(pair))
-    out: float = 0.8 * event[2] / max(end - begin, 1e-9)
-    return out
+    begin, end = np.interp([event.begin, event.end], pair.t, _mean_path(pair))
+    slope: float = 0.8 * event.size / max(end - begin, 1e-9)
+    return slope
 
 
 def _mean_path(pair: WheelPair) -> Floats:
@@ -162,7 +186,7 @@ def _mean_path(pair: WheelPair) -> Floats:
 
 def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
                  width: float) -> Floats:
-    """Return the limit of jumps between two means that occur by chance, m: (n,)."""
+    """Return the limit of jumps between two means of the residual by chance, m: (n,)."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     path = _mean_path(pair)
     total_turn = running_sum(np.abs(np.diff(pair.turn)))
@@ -181,34 +205,39 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
                    + rounding)
 
 
-def _measure_jump(pair: WheelPair, residual: Floats,
-                  windows: list[tuple[int, Floats, Floats, Bools]], a: int, b: int) -> Event:
-    """Return the event in steps a to b, by its best window: (span, jump, limit, significant)."""
-    best = (0.0, 0.0, 0, 0)      # jump, limit, first step and span of the best window
-    for span, jump, limit, is_large in windows:
-        low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
-        at = low + np.flatnonzero(is_large[low:high])
-        if len(at):
-            k = int(at[np.argmax(np.abs(jump[at]))])
+def _measure_event(pair: WheelPair, residual: Floats, windows: list[Window], begin: int,
+                   end: int) -> Event:
+    """Return the event in the rows from begin to end, by the window with the clearest jump."""
+    size, first, span = 0.0, 0, 0      # of this window
+    for window in windows:
+        low, high = max(0, begin - MEAN_STEPS), max(0, end - window.span + 1)
+        rows = low + np.flatnonzero(window.is_large[low:high])
+        if len(rows):
+            row = int(rows[np.argmax(np.abs(window.jump[rows]))])
             # a longer window is better only if its jump is larger by more than its noise
-            noise = limit[k] / WHOLE_DRIVE_SIGMAS
-            if abs(jump[k]) > abs(best[0]) + bool(best[1]) * noise:
-                best = (float(jump[k]), float(limit[k]), k, span)
-    size, _, k, span = best
-    inner = residual[k:k + span + MEAN_STEPS]
-    share = (inner - inner[:MEAN_STEPS].mean()) / size if size else inner
-    begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
-    reached = np.flatnonzero(share >= 0.9)
-    reached = reached[reached >= MEAN_STEPS // 2]
-    end = int(reached[0]) if len(reached) else len(inner) - 1
-    return float(pair.t[k + min(begin, end)]), float(pair.t[k + max(begin, end)]), size
+            noise = window.limit[row] / WHOLE_DRIVE_SIGMAS if span else 0.0
+            if abs(window.jump[row]) > abs(size) + noise:
+                size, first, span = float(window.jump[row]), row, window.span
+    # from a tenth to nine tenths of the jump
+    inside = residual[first:first + span + MEAN_STEPS]
+    share = (inside - inside[:MEAN_STEPS].mean()) / size if size else inside
+    last_low = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
+    high_rows = np.flatnonzero(share >= 0.9)
+    high_rows = high_rows[high_rows >= MEAN_STEPS // 2]
+    first_high = int(high_rows[0]) if len(high_rows) else len(inside) - 1
+    return Event(float(pair.t[first + min(last_low, first_high)]),
+                 float(pair.t[first + max(last_low, first_high)]), size)
 
 
 def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
                 latitude: float, event: Event) -> int:
-    """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
-    # a slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left
-    # by -x moves it by -x / 2; the noise is the difference of mean and IMU elsewhere
+    """
+    Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it.
+
+    A slip of the right wheel by x moves the mean of the wheels by x / 2 relative to the IMU, one
+    of the left wheel by -x moves it by -x / 2. The noise is the difference of mean and IMU
+    elsewhere.   mean : (n,) path of the mean, m, at the rows of ``pair``.
+    """
     begin, end, size = event
     grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.SPIN_GRID)
     margin = 1.0        # s each side of a slip, in which speeds are set equal
@@ -219,12 +248,12 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats
     excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean))
     turn = np.interp(grid, pair.t, pair.turn)[slip.END_STEPS:-slip.END_STEPS]
     straight = np.abs(turn[span:] - turn[:-span]) < slip.SPIN_TURN
-    at = int(np.searchsorted(grid, (begin + end) / 2)) - slip.END_STEPS - span // 2
-    if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
+    window = int(np.searchsorted(grid, (begin + end) / 2)) - slip.END_STEPS - span // 2
+    if not 0 <= window < len(excess) or not straight[window] or straight.sum() < 20:
         return 0
     sigma = robust_sigma(excess[straight]) + 1e-3
-    log_odds = excess[at] * size / sigma**2
+    log_odds = excess[window] * size / sigma**2
     # wrong wheel once in 150; if mean and IMU differ by less than a quarter of x / 2, the slip
     # begins or ends elsewhere
-    clear = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
-    return int(np.sign(log_odds)) if clear else 0
+    is_clear = abs(log_odds) > 5.0 and abs(excess[window]) > abs(size) / 8
+    return int(np.sign(log_odds)) if is_clear else 0

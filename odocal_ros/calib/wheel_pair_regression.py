@@ -34,14 +34,15 @@ def without_gyro_drift(pair: WheelPair) -> WheelPair:
     """Return the wheels with the turn rate of standstills, the gyro bias, removed in between."""
     still = pair.known & (np.diff(pair.left) == 0) & (np.diff(pair.right) == 0)
     # half a second after a stop and before a start the body rocks
-    rests = [(a + MEAN_STEPS // 2, b - MEAN_STEPS // 2) for a, b in runs(still)
-             if (b - a) * pair.step >= BIAS_REST]
+    rests = [(begin + MEAN_STEPS // 2, end - MEAN_STEPS // 2) for begin, end in runs(still)
+             if (end - begin) * pair.step >= BIAS_REST]
     if not rests:
         return pair
-    a, b = np.transpose(rests)
-    rate = (pair.turn[b] - pair.turn[a]) / (pair.t[b] - pair.t[a])
+    begin, end = np.transpose(rests)
+    rate = (pair.turn[end] - pair.turn[begin]) / (pair.t[end] - pair.t[begin])
     is_bias = np.abs(rate - np.median(rate)) < MAX_DRIFT
-    bias = np.interp(pair.t[:-1], ((pair.t[a] + pair.t[b]) / 2)[is_bias], rate[is_bias])
+    middle = (pair.t[begin] + pair.t[end]) / 2
+    bias = np.interp(pair.t[:-1], middle[is_bias], rate[is_bias])
     return replace(pair, turn=pair.turn - running_sum(bias * pair.step))
 
 
@@ -53,10 +54,9 @@ def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
     speed (delay between the wheels), turn rate (delay to the IMU) and the load that sideways
     acceleration moves from tyre to tyre.
     """
-    half = MEAN_STEPS // 2
     mean = (pair.left + pair.right) / 2
-    speed = _smooth(np.gradient(mean, pair.step), half)
-    rate = _smooth(np.gradient(pair.turn, pair.step), half)
+    speed, rate = (_smooth(np.gradient(x, pair.step), MEAN_STEPS // 2)
+                   for x in (mean, pair.turn))
     load = running_sum(metres_per_unit * (speed**2 * rate)[1:] * pair.step)
     return np.stack([pair.left, pair.turn, pair.t - pair.t[0], speed, rate, load], -1)
 
@@ -69,10 +69,14 @@ def _smooth(x: Floats, reach: int) -> Floats:
 
 def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
                    ) -> tuple[Floats, Floats] | tuple[None, None]:
-    """Return coefficients, (k,), of (n, k) regressors by cells of a second, and covariance."""
-    at = np.arange(0, len(pair.t), MEAN_STEPS)
-    design, y = np.diff(regressors[at], axis=0), np.diff(pair.right[at])
-    keep = np.logical_and.reduceat(pair.known, at[:-1])[:len(y)]
+    """
+    Return coefficients, (k,), of (n, k) regressors of the right path, and their covariance.
+
+    The regressors are those of ``right_path_regressors`` and any others. None with too few cells.
+    """
+    edges = np.arange(0, len(pair.t), MEAN_STEPS)      # of cells of a second
+    design, y = np.diff(regressors[edges], axis=0), np.diff(pair.right[edges])
+    keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)]
     keep &= np.abs(design[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < 20:
         return None, None
@@ -83,8 +87,8 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
     prior = np.array([np.inf, width_sigma, np.inf, delay_sigma,
                       delay_sigma * usual_width / metres_per_unit, load_sigma])
     prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
-    floor = 0.4 * pair.quantum + 1e-3 / metres_per_unit
-    x, covariance, _ = robust_fit(design[keep], y[keep], floor, prior)
+    min_sigma = 0.4 * pair.quantum + 1e-3 / metres_per_unit
+    x, covariance, _ = robust_fit(design[keep], y[keep], min_sigma, prior)
     return x, covariance
 
 
@@ -106,18 +110,18 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
 
 
 def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: float,
-                      count: int) -> tuple[tuple[Reason, ...], float]:
+                      wheel_count: int) -> tuple[tuple[Reason, ...], float]:
     """
     Return a reason if the ratio of the wheels changes at a place of the path, and the change.
 
     The change is converted to one at half the path, which sigmas must include; 0 for none.
-    count : number of wheels in the mean.
+    wheel_count : number of wheels in the mean.
     """
     path = running_sum(np.abs(np.diff(pair.left)))
     best = (0.0, 0.0, 0.0, 0)      # change in sigmas, change, share of the path, row
-    for share in np.arange(1, 8) / 8:       # of the path
-        at = int(np.searchsorted(path, share * path[-1]))
-        left_after = np.where(np.arange(len(path)) > at, pair.left - pair.left[at], 0.0)
+    for share in np.arange(1, 8) / 8:       # tested places, shares of the path
+        row = int(np.searchsorted(path, share * path[-1]))
+        left_after = np.where(np.arange(len(path)) > row, pair.left - pair.left[row], 0.0)
         x, covariance = fit_right_path(
             pair, np.column_stack([regressors, left_after]), metres_per_unit)
         if x is None or covariance is None or x[0] <= 0:
@@ -126,22 +130,22 @@ def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: floa
         # 2e-3: tyres that warm up differently change the ratio by less
         limit = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)
         if abs(change) > limit and abs(change) / sigma > best[0]:
-            best = (abs(change) / sigma, float(change), share, at)
-    sigmas, change, share, at = best
+            best = (abs(change) / sigma, float(change), share, row)
+    sigmas, change, share, row = best
     if not change:
         return (), 0.0
     # the ratio before or after may be correct: that of the fit is between, (1 - share) of the
     # change from that before. rms of both errors, so that it is the change for a share of half
     at_half = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
     left, right = pair.names
-    return (Reason(Code.WHEEL_SLIP, f'from t = {pair.t[at]:.0f} s on, after about '
+    return (Reason(Code.WHEEL_SLIP, f'from t = {pair.t[row]:.0f} s on, after about '
                    f'{100 * share:.0f} % of the path, the {right} wheel counts '
                    f'{100 * abs(change):.2f} ± {100 * abs(change) / sigmas:.2f} % '
                    f'{"more" if change > 0 else "less"} relative to the {left} wheel and the '
                    'gyro. Likely cause: continuous slip or a tyre that loses pressure. Which '
                    'section is correct cannot be decided from the data: '
-                   f'{50 / count * abs(at_half):.2f} % is added to the uncertainty of the scale, '
-                   f'{50 * abs(at_half):.2f} % to that of each wheel'),), at_half
+                   f'{50 / wheel_count * abs(at_half):.2f} % is added to the uncertainty of the '
+                   f'scale, {50 * abs(at_half):.2f} % to that of each wheel'),), at_half
 
 
 def counter_reasons(pair: WheelPair, ratio: float, width: float,

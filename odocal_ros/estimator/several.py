@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
-from odocal_ros.calib.combine import newest_leg_values
+from odocal_ros.calib.combine import last_leg_values
 from odocal_ros.calib.joint import fit_jointly, FREE_STEP, JointEstimate, scale_steps, ScaleStep
 from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.number_text import format_change
@@ -106,7 +106,7 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
         of_wheels, reasons = wheel_result.wheel_estimates(
             wheels, wheels, estimates['scale_factor'], config)
         estimates, refusals = estimates | of_wheels, refusals + reasons
-    estimates |= newest_leg_values(
+    estimates |= last_leg_values(
         legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if undetermined:

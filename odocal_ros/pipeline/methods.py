@@ -137,7 +137,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
-    computed = choice.deciding_methods(selected_method, shown=True)
+    computed = choice.deciding_methods(selected_method, compared=True)
     names = [name for name in METHODS if name in computed]
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS_EFFORT / _effort(names)))
