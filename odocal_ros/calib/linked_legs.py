@@ -61,9 +61,9 @@ class LinkedEquations:
         eigenvalues, V = eigenvalues[kept], V[:, kept]
         x = V @ (self.g @ V / eigenvalues)
         weight, prior_g, prior_cost = self.prior
-        of_prior = x @ (weight * x - 2 * prior_g) + prior_cost
+        prior_chi2 = x @ (weight * x - 2 * prior_g) + prior_cost
         fitted = len(eigenvalues) - float((weight @ V**2) @ (1 / eigenvalues))
-        return self.cost - float(self.g @ x + of_prior), self.rank - fitted
+        return self.cost - float(self.g @ x + prior_chi2), self.rank - fitted
 
     def solve(self) -> tuple[Floats, Floats]:
         """Return x and its covariance, with the drifting constant of each leg for its steps."""
@@ -94,31 +94,38 @@ class LinkedLegs:
         drifting : name of the constant with a random walk.   steps : (J - 1,) sigma of its change
         from leg to leg.   angles : names of constants with a period of one turn.
         """
-        self.names = tuple(dict.fromkeys(n for b in marginals for n in b.names))
-        self.replace_marginals([_with_names(b, self.names) for b in marginals])
+        self.names = tuple(dict.fromkeys(name for leg in marginals for name in leg.names))
+        self.replace_marginals([_with_names(leg, self.names) for leg in marginals])
         last = self.marginals[-1]
         for name in angles:
             reference = last.point[self.names.index(name)]
-            self.replace_marginals([b.with_angle_near(name, reference) for b in self.marginals])
+            self.replace_marginals([leg.with_angle_near(name, reference)
+                                    for leg in self.marginals])
         self.prior_mean = last.prior_mean
         self.prior_sigma, self.relaxed_sigma = (
-            np.max([getattr(b, which) for b in self.marginals], axis=0)
-            for which in ('prior_sigma', 'relaxed_sigma'))
+            np.max([getattr(leg, sigma) for leg in self.marginals], axis=0)
+            for sigma in ('prior_sigma', 'relaxed_sigma'))
         self.unit = np.where(np.isfinite(self.relaxed_sigma), self.relaxed_sigma, STEP_UNIT)
         self.drifting = self.names.index(drifting)
         # 0.1 ppm of ln K: any vehicle changes more; with smaller sigmas rounding is too large
         self.steps = np.maximum(steps, 1e-7)
 
-    def combine_sections(self, same: Sequence[bool]) -> 'LinkedLegs':
-        """Return these legs with sections added up; same: (J - 1,) True if of the leg before."""
-        is_new_leg = [not together for together in same] or [True] * len(self.steps)
-        if all(is_new_leg):
+    def combine_sections(self, same_drive: Sequence[bool]) -> 'LinkedLegs':
+        """
+        Return the drives, with the information of their sections added up.
+
+        same_drive : (J - 1,) True if a leg is of the same drive as the leg before.
+        """
+        is_new_drive = [not is_same for is_same in same_drive] or [True] * len(self.steps)
+        if all(is_new_drive):
             return self
         marginals = self.marginals[:1]
-        for marginal, is_new in zip(self.marginals[1:], is_new_leg, strict=True):
-            marginals = [*marginals, marginal] if is_new else [
-                *marginals[:-1], marginals[-1].plus(marginal)]
-        return LinkedLegs(marginals, self.names[self.drifting], self.steps[is_new_leg])
+        for marginal, is_new in zip(self.marginals[1:], is_new_drive, strict=True):
+            if is_new:
+                marginals.append(marginal)
+            else:
+                marginals[-1] = marginals[-1].plus(marginal)
+        return LinkedLegs(marginals, self.names[self.drifting], self.steps[is_new_drive])
 
     def replace_marginals(self, marginals: list[MarginalInformation]) -> None:
         """Set the marginals of the legs; each must have the names of all."""
@@ -157,23 +164,27 @@ class LinkedLegs:
         H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
         weight, offset = np.zeros((2, len(g)))
         if prior:
-            at = self.indices(steps)
-            weight[at] = np.isfinite(self.relaxed_sigma)
-            offset[at] = (self.prior_mean - self.marginals[-1].point) / self.unit
+            last = self.indices(steps)      # of the constants of the last leg
+            weight[last] = np.isfinite(self.relaxed_sigma)
+            offset[last] = (self.prior_mean - self.marginals[-1].point) / self.unit
         prior_cost = float(weight @ offset**2)
         return LinkedEquations(H + np.diag(weight), g + weight * offset, cost + prior_cost,
                                (weight, weight * offset, prior_cost), common, rank + steps)
 
     def _leg_equations(self, legs: 'LegInformation', scatter: dict[str, float] | None,
                        ) -> tuple[Floats, Floats, float, int]:
-        """Return H, g, the cost at x = 0 and the rank of the information of the legs alone."""
-        # with the scatter eliminated, a leg has the information D - T DA'. Its drifting constant
-        # is the sum of the steps from this leg on, so rows and columns of a step are sums over
-        # the legs up to it
+        """
+        Return H, g, the cost at x = 0 and the rank of the information of the legs alone.
+
+        With the scatter eliminated, a leg has the information D - T DA'. Its drifting constant is
+        the sum of the steps from this leg on, so rows and columns of a step are sums over the legs
+        up to it.
+        """
         J, k = len(legs.D), self.drifting
         common = np.delete(np.arange(len(self.names)), k)
         T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
-        offset = np.stack([b.point - self.marginals[-1].point for b in self.marginals]) / self.unit
+        last = self.marginals[-1].point
+        offset = np.stack([leg.point - last for leg in self.marginals]) / self.unit
         g_legs = gradient + (legs.D @ offset[:, :, None]
                              - T @ (np.swapaxes(DA, 1, 2) @ offset[:, :, None]))[:, :, 0]
         cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())
@@ -194,14 +205,14 @@ class LinkedLegs:
 
     def log_likelihood(self, scatter: dict[str, float]) -> float:
         """Return the restricted log likelihood of a scatter, up to a constant: (S38)."""
-        at, size = [self.names.index(n) for n in scatter], np.array(list(scatter.values()))
-        size = size / self.unit[at]
+        indices = [self.names.index(name) for name in scatter]
+        size = np.array(list(scatter.values())) / self.unit[indices]
         equations = self.equations(self.information(), scatter)
-        out = -(equations.minimum_cost() + equations.log_determinant) / 2
-        D = self.information().D[:, at][:, :, at][[not b.scatter_likelihood
-                                                   for b in self.marginals]]
-        return float(out - np.linalg.slogdet(
-            np.eye(len(at)) + D * np.multiply.outer(size, size))[1].sum() / 2)
+        likelihood = -(equations.minimum_cost() + equations.log_determinant) / 2
+        is_single = [not leg.scatter_likelihood for leg in self.marginals]   # not combined earlier
+        D = self.information().D[:, indices][:, :, indices][is_single]
+        return float(likelihood - np.linalg.slogdet(
+            np.eye(len(indices)) + D * np.multiply.outer(size, size))[1].sum() / 2)
 
     def combined_information(self, point: Floats, scatter: dict[str, float],
                              likelihood: dict[str, Floats]) -> MarginalInformation:
@@ -217,8 +228,8 @@ class LinkedLegs:
         """
         Return the chi-square of the legs with common constants, and its degrees of freedom: (S36).
 
-        Only of directions determined at least as well as by the priors, in which legs are linear.
-        Priors bound the others: two legs that each determine one half would always agree.
+        Only directions count that a leg determines at least as well as the priors do: in others
+        its equations are not linear, and two legs that each determine one half always agree.
         """
         return self.equations(self.information(1.0), scatter).misfit()
 
@@ -229,26 +240,29 @@ class LinkedLegs:
         The gradient of the leg at the joint estimate over its sigma (Baarda 1968), (S37).
         """
         x, C = self.solve()
-        out = np.zeros((len(self.marginals), len(self.names)))
+        residuals = np.zeros((len(self.marginals), len(self.names)))
         legs = self.information(1.0)
         for j, (D, gradient) in enumerate(zip(legs.D, legs.gradient, strict=True)):
-            at = self.indices(j)
-            gradient = gradient - D @ ((x[at] - self.marginals[j].point) / self.unit)
-            C_leg = C[np.ix_(at, at)] / np.multiply.outer(self.unit, self.unit)
+            indices = self.indices(j)
+            gradient = gradient - D @ ((x[indices] - self.marginals[j].point) / self.unit)
+            C_leg = C[np.ix_(indices, indices)] / np.multiply.outer(self.unit, self.unit)
             variance = np.diag(D - D @ C_leg @ D)
             # no test if the others have less than a millionth of the leg's information
             tested = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
-            out[j, tested] = gradient[tested] / np.sqrt(variance[tested])
-        return out
+            residuals[j, tested] = gradient[tested] / np.sqrt(variance[tested])
+        return residuals
 
     def _eliminate_scatter(self, legs: 'LegInformation', scatter: dict[str, float] | None
                            ) -> tuple[Floats, Floats, Floats, int]:
-        """Return T and DA of ``eliminate_leg_errors``, the gradient left, and the sum of ranks."""
-        # the information of combined legs already includes their scatter
-        at = [self.names.index(n) for n in scatter or ()]
-        sigmas = np.array(list((scatter or {}).values())) / self.unit[at]
-        T, DA, A = eliminate_leg_errors(legs.D, at, sigmas)
-        T[[bool(b.scatter_likelihood) for b in self.marginals]] = 0.0
+        """
+        Return T and DA of ``eliminate_leg_errors``, the remaining gradient, and the sum of ranks.
+
+        T is zero for legs combined earlier, whose information already includes their scatter.
+        """
+        indices = [self.names.index(name) for name in scatter or ()]
+        sigmas = np.array(list((scatter or {}).values())) / self.unit[indices]
+        T, DA, A = eliminate_leg_errors(legs.D, indices, sigmas)
+        T[[bool(leg.scatter_likelihood) for leg in self.marginals]] = 0.0
         unbounded = (np.isinf(sigmas) & T.any(axis=1)).sum()
         errors = np.swapaxes(A, 1, 2) @ legs.gradient[:, :, None]
         return T, DA, legs.gradient - (T @ errors)[:, :, 0], int(legs.rank.sum() - unbounded)
@@ -256,7 +270,7 @@ class LinkedLegs:
 
 @dataclass(frozen=True, eq=False)
 class LegInformation:
-    """Information of J legs, in units of their m constants, without what is rounding."""
+    """Information of J legs, in units of their m constants, without directions of rounding."""
 
     D: Floats         # (J, m, m), as ``MarginalInformation.information``
     gradient: Floats  # (J, m)
@@ -267,30 +281,29 @@ class LegInformation:
 def _in_units(marginals: Sequence[MarginalInformation], unit: Floats,
               min_information: float) -> LegInformation:
     """Return the information of legs in units (m,), in directions with ``min_information``."""
-    J, m = len(marginals), len(unit)
-    out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
-    for j, marginal in enumerate(marginals):
+    rows = []
+    for marginal in marginals:
         eigenvalues, V = np.linalg.eigh(marginal.information * np.multiply.outer(unit, unit))
         kept = eigenvalues > max(LEG_ROUNDING * eigenvalues[-1], min_information, 1e-300)
         eigenvalues, V = eigenvalues[kept], V[:, kept]
-        along = V.T @ (marginal.gradient * unit)
-        out.D[j], out.gradient[j] = V * eigenvalues @ V.T, V @ along
-        out.estimate[j], out.rank[j] = V @ (along / eigenvalues), len(eigenvalues)
-    return out
+        gradient = V.T @ (marginal.gradient * unit)      # along the eigenvectors
+        rows.append((V * eigenvalues @ V.T, V @ gradient, V @ (gradient / eigenvalues),
+                     len(eigenvalues)))
+    return LegInformation(*map(np.array, zip(*rows, strict=True)))
 
 
 def _with_names(marginal: MarginalInformation, names: tuple[str, ...]) -> MarginalInformation:
     """Return a marginal with more names, without information or prior on the new ones."""
     if marginal.names == names:
         return marginal
-    at = [names.index(n) for n in marginal.names]
+    indices = [names.index(name) for name in marginal.names]
     m = len(names)
     D = np.zeros((m, m))
-    D[np.ix_(at, at)] = marginal.information
+    D[np.ix_(indices, indices)] = marginal.information
 
     def expand(values: Floats) -> Floats:
         expanded = np.zeros(m)       # sigma 0: has no effect in the maximum over legs
-        expanded[at] = values
+        expanded[indices] = values
         return expanded
     return MarginalInformation(
         names, expand(marginal.point), D, expand(marginal.gradient), expand(marginal.prior_mean),

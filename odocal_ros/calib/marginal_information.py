@@ -63,8 +63,9 @@ class MarginalInformation:
 
         sigmas : of the deviation, by constant; inf: no information on the constant remains.
         """
-        at = [self.names.index(name) for name in sigmas]
-        T, DA, A = eliminate_leg_errors(self.information, at, np.array(list(sigmas.values())))
+        indices = [self.names.index(name) for name in sigmas]
+        T, DA, A = eliminate_leg_errors(self.information, indices,
+                                        np.array(list(sigmas.values())))
         remaining = self.information - T @ DA.T
         return replace(self, information=(remaining + remaining.T) / 2,
                        gradient=self.gradient - T @ (A.T @ self.gradient))
@@ -82,38 +83,39 @@ class MarginalInformation:
 
     def select(self, names: Sequence[str]) -> 'MarginalInformation':
         """Return the information on some constants, the others eliminated with their priors."""
-        at = np.isin(self.names, names)
-        reduced = self.with_leg_errors({n: s for n, s in zip(
-            self.names, self.relaxed_sigma, strict=True) if n not in names})
+        kept = np.isin(self.names, names)
+        reduced = self.with_leg_errors({name: sigma for name, sigma in zip(
+            self.names, self.relaxed_sigma, strict=True) if name not in names})
         D = reduced.information
         prior_step = np.where(np.isfinite(self.relaxed_sigma), self.prior_mean - self.point, 0.0)
         return MarginalInformation(
-            tuple(n for n in self.names if n in names), self.point[at], D[np.ix_(at, at)],
-            reduced.gradient[at] - D[np.ix_(at, ~at)] @ prior_step[~at], self.prior_mean[at],
-            self.prior_sigma[at], self.relaxed_sigma[at],
-            {n: x for n, x in self.scatter_likelihood.items() if n in names})
+            tuple(name for name in self.names if name in names), self.point[kept],
+            D[np.ix_(kept, kept)],
+            reduced.gradient[kept] - D[np.ix_(kept, ~kept)] @ prior_step[~kept],
+            self.prior_mean[kept], self.prior_sigma[kept], self.relaxed_sigma[kept],
+            {name: x for name, x in self.scatter_likelihood.items() if name in names})
 
     def with_angle_near(self, name: str, reference: float) -> 'MarginalInformation':
-        """Return it with the point of an angle, rad, within half a turn of a reference."""
+        """Return the information with an angle, rad, at most half a turn from a reference."""
         point, i = self.point.copy(), self.names.index(name)
         point[i] = reference + wrap(point[i] - reference)
         return replace(self, point=point)
 
 
-def eliminate_leg_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats,
-                                                                            Floats]:
+def eliminate_leg_errors(D: Floats, indices: list[int],
+                         sigmas: Floats) -> tuple[Floats, Floats, Floats]:
     """
     Return T, DA and A, (..., m, k), that eliminate errors of k constants in each leg: (S34).
 
     The information D is reduced by T DA', the gradient h by T A' h.   D : (..., m, m).
-    at, sigmas : (k,) indices of the constants and sigmas of their errors; inf: unbounded.
+    indices, sigmas : (k,) of the constants, and sigmas of their errors; inf: unbounded.
     """
-    bounded, diagonal = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., at]
+    bounded, diagonal = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., indices]
     # the column of an unbounded error may have any length
     size = np.where(bounded, sigmas,
                     np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0))
-    A = np.eye(D.shape[-1])[:, at] * size[..., None, :]
-    DA = D[..., at] * size[..., None, :]
+    A = np.eye(D.shape[-1])[:, indices] * size[..., None, :]
+    DA = D[..., indices] * size[..., None, :]
     return DA @ np.linalg.pinv(np.diag(bounded * 1.0) + np.swapaxes(A, -1, -2) @ DA), DA, A
 
 
@@ -143,10 +145,11 @@ class CarriedInformation:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for calibration.json."""
-        one = self.marginal
-        entry = {key: np.asarray(getattr(one, name)).tolist() for name, key in JSON_KEYS.items()}
-        entry |= {'names': list(one.names),
-                  'evidence': {n: x.tolist() for n, x in one.scatter_likelihood.items()}}
+        marginal = self.marginal
+        entry = {key: np.asarray(getattr(marginal, name)).tolist()
+                 for name, key in JSON_KEYS.items()}
+        entry |= {'names': list(marginal.names), 'evidence': {
+            name: x.tolist() for name, x in marginal.scatter_likelihood.items()}}
         return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
                 'legs': self.legs, 'border': entry}
 

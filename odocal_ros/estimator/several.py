@@ -150,8 +150,8 @@ def _leg_name(number: int) -> str:
 def _disagreement_reasons(joint: JointEstimate, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
     J, reasons = len(joint.deviation), list[Reason]()      # J : number of legs
-    unexplained = {name: joint.deviation[:, joint.names.index(name)] for name in joint.disputed}
-    # parameters correlated with a disputed one differ as well
+    unexplained = {name: joint.deviation[:, joint.names.index(name)] for name in joint.differing}
+    # parameters correlated with such a constant differ as well
     worst = max((np.abs(z).max() for n, z in unexplained.items() if n in PARAMETERS), default=0.0)
     for name, z in unexplained.items():
         k = int(np.argmax(np.abs(z)))

@@ -17,7 +17,7 @@ USUAL = {'z3': 0.05}
 
 
 def of(marginals, steps=STEPS, usual=None):
-    return fit_jointly(marginals, steps, 'k', usual=usual)
+    return fit_jointly(marginals, steps, 'k', usual_scatter=usual)
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def toy():
 
 def test_joint_estimate_equals_one_fit_of_all_rows(toy):
     found, (value, covariance) = of(toy.marginals()), toy.batch()
-    assert not found.disputed
+    assert not found.differing
     assert largest_deviation(found.value, value, covariance) < 1e-9
     assert np.abs(found.covariance / covariance - 1).max() < 1e-6      # small beside large values
     sigma = np.sqrt(np.diag(covariance))
@@ -85,7 +85,8 @@ def test_sections_of_one_leg_count_as_one_leg(toy):
     """The scatter between legs does not apply to sections: the result is as without scatter."""
     still = np.zeros(LEGS - 1)
     whole = of(toy.marginals(), still)
-    found = fit_jointly(toy.marginals(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
+    found = fit_jointly(toy.marginals(), still, 'k', usual_scatter=USUAL,
+                        same_drive=[True] * (LEGS - 1))
     assert largest_deviation(found.value, whole.value, whole.covariance) < 1e-6
     assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
     assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
@@ -104,7 +105,7 @@ def test_chi_square_has_its_expected_mean_and_variance():
     assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
     assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
     # each of five constants in one of 300 draws, all together in one of 20
-    assert np.mean([bool(f.disputed) for f in found]) < 0.035
+    assert np.mean([bool(f.differing) for f in found]) < 0.035
     assert 0.03 < np.mean([f.factor > 1 for f in found]) < 0.07
     z = np.concatenate([f.deviation.ravel() for f in found])
     assert z[z != 0].std() == pytest.approx(1.0, abs=0.03)
@@ -119,7 +120,7 @@ def test_leg_and_constant_that_differ_are_named():
     # the prior of that leg is relaxed, as in a leg where the data contradict it
     marginals[3] = replace(marginals[3], relaxed_sigma=np.where(PRIOR == 1.0, 5.0, PRIOR))
     found = of(marginals, usual=USUAL)
-    assert found.disputed == ('z3',)
+    assert found.differing == ('z3',)
     assert np.argmax(np.abs(found.deviation[:, 4])) == 3
     # one of five legs deviates by 5: scatter 5 / sqrt(5), mean shifted by 1
     assert found.scatter['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
@@ -132,7 +133,7 @@ def test_disagreement_without_a_single_cause_widens_all_constants():
     small = Toy(rng, states=6, rows=40)
     constants = TRUTH + 3.0 * rng.standard_normal((LEGS, 5))
     found = of(small.draw(rng, constants).marginals(), usual=USUAL)
-    assert found.disputed[0] == 'z3'
+    assert found.differing[0] == 'z3'
     assert found.factor > 1.5
 
 
@@ -156,4 +157,4 @@ def test_angles_near_half_a_turn_are_combined_without_a_jump():
     legs = [scale_and_yaw(yaw, 1e6, 1e6) for yaw in (np.pi - 1e-3, 1e-3 - np.pi)]
     found = fit_jointly(legs, [0.0], 'k', ('yaw',), ('yaw',))
     assert abs(found.value[1]) == pytest.approx(np.pi, abs=1e-9)
-    assert not found.disputed
+    assert not found.differing

@@ -102,7 +102,7 @@ def test_quantised_sensor_is_named_beside_another_cause():
 
 @pytest.mark.parametrize(('name', 'tyres'), [('odometer_delay', False), ('scale_factor', True)])
 def test_legs_that_differ_in_a_delay_are_not_attributed_to_a_tyre(name, tyres):
-    found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], disputed=[name],
+    found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], differing=[name],
                             factor=1.0)
     reason, = _disagreement_reasons(found, [1, 2])
     assert ('tyre' in reason.remedy) == tyres
