@@ -106,8 +106,8 @@ def root_of(covariance: Floats) -> Floats:
 def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                            end: MarkFix) -> Floats:
     """Return the chord error per odometer delay, (3,) m/s."""
-    # travel is combined with later attitudes: the integral of dC/dt f ds; minus
-    # v(end) - v(start), because the travel between the marks is shifted by the delay
+    # travel is combined with later attitudes: the integral of dC/dt f ds. The travel between the
+    # marks is shifted by the delay: minus v(end) - v(start)
     def middle_and_change(q_nb: Floats) -> Floats:
         C_nb = matrix_from_quat(q_nb)
         return np.stack([(C_nb[:-1] + C_nb[1:]) @ f / 2, np.diff(C_nb, axis=0) @ f], axis=1)

@@ -23,7 +23,7 @@ from odocal_ros.screening.fix_screen import sigma_limit
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-KEPT_ROWS = 5000       # kept of each series in a result, more than a screen has columns: judgement
+KEPT_ROWS = 5000       # judgement: of each series, more than a screen has columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Evidence:
     Residuals are dead-reckoned minus fixed positions, along the vehicle's forward axis and left.
     """
 
-    t: Floats                          # (m,) of the track
+    t: Floats                          # (m,) of the track, at most KEPT_ROWS of its epochs
     distance: Floats                   # (m,) m driven since the start mark
     speed: Floats                      # (m,) m/s, below zero when reversing
     yaw_rate: Floats                   # (m,) rad/s, counter-clockwise
@@ -51,7 +51,7 @@ class Evidence:
     t_excluded: Floats                 # (x,) fixes not used
     excluded_because: tuple[str, ...]  # (x,)
     fixes: int                         # their number before decimation
-    excluded: int                      # the same
+    excluded: int                      # number of fixes not used, before decimation
     gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
     t_fit: float = np.inf              # later data are held out of the fit
     by_speed: SpeedScale = SpeedScale(scale_variation.NO_ROWS)  # of the uncorrected odometer
@@ -61,16 +61,16 @@ class Evidence:
 
 def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,
                   pin: MarkFix, paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
-                  covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
+                  odometer_span: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
     Return the plot data of a leg, at most KEPT_ROWS of each series.
 
     leg, inputs : raw and screened.   fixes_n : (k, 3) m, at inputs.t_fix.   kept : (k,) fixes
     without gross errors; those within the time of the track are shown.   pin : mark whose position
     the paths are set to.   paths : as configured and as calibrated.   t_fit : end of the fitted
-    data, s.   covered : begin and end of the time with an odometer, s.
+    data, s.   odometer_span : begin and end of the time with an odometer, s.
     """
-    inside = (track.t >= covered[0]) & (track.t <= min(inputs.t_stop, covered[1]))
+    inside = (track.t >= odometer_span[0]) & (track.t <= min(inputs.t_stop, odometer_span[1]))
     t = track.t[inside]
     span = (t[0], t[-1]) if len(t) else (0.0, -1.0)
     kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
@@ -111,15 +111,15 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
 
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:
-    """Return a path shifted to the position of a mark."""
+    """Return a path shifted so that it has the position of a mark at the time of the mark."""
     at_mark = path(np.array(pin.t))
 
-    def at(t: Floats) -> Floats:
-        out = np.empty((len(t), 3))
-        for rows in chunks(len(t)):       # the sums behind a path are 3 x 3 a row
-            out[rows] = pin.position_n + path(t[rows]) - at_mark
-        return out
-    return at
+    def pinned(t: Floats) -> Floats:
+        positions = np.empty((len(t), 3))
+        for rows in chunks(len(t)):       # a path needs a 3 x 3 matrix for each row
+            positions[rows] = pin.position_n + path(t[rows]) - at_mark
+        return positions
+    return pinned
 
 
 def _fix_states(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
@@ -130,39 +130,40 @@ def _fix_states(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float]
     offset = gnss.time_offset - config.imu.time_offset
     t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + offset
     is_excluded = (t >= span[0]) & (t <= span[1])
-    row_at = {when: i for i, when in enumerate(t.tolist())}
-    rows = np.array([row_at[when] for when in inputs.t_fix[kept].tolist()], int)
+    row_at = {time: row for row, time in enumerate(t.tolist())}
+    rows = np.array([row_at[time] for time in inputs.t_fix[kept].tolist()], int)
     is_excluded[rows] = False
     usable = np.isin(t, inputs.t_fix)
     sigma = np.sqrt(fix.covariance_n[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1, initial=0))
     limit = sigma_limit(sigma[fix.status >= gnss.min_status], gnss.max_sigma)
     excluded = np.flatnonzero(is_excluded)
     causes = [
-        f'status below {gnss.min_status}' if fix.status[i] < gnss.min_status else
-        f'sigma above {limit:.3g} m' if limit < sigma[i] else
-        'far off the track' if usable[i] and row_at[t[i]] == i else
-        'implausible stamp or position' for i in excluded]
+        f'status below {gnss.min_status}' if fix.status[row] < gnss.min_status else
+        f'sigma above {limit:.3g} m' if limit < sigma[row] else
+        'far off the track' if usable[row] and row_at[t[row]] == row else
+        'implausible stamp or position' for row in excluded]
     status: Ints = fix.status[rows]
     return status, t[excluded], causes
 
 
 def _forward_directions(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
     """Return the forward direction at times t_new as complex numbers; at rest the last: (k,)."""
-    z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
+    velocity = (rate_over_second(t, track_n[:, 0])
+                + 1j * rate_over_second(t, track_n[:, 1])) * sign
     # below 0.2 m/s noise of the track (rounding to counts) dominates the direction
-    moving = np.flatnonzero(np.abs(z) > 0.2)
+    moving = np.flatnonzero(np.abs(velocity) > 0.2)
     if not len(moving):
         return np.ones(len(t_new), complex)
-    before = np.searchsorted(moving, np.arange(len(t)), side='right') - 1
-    angle = np.unwrap(np.angle(z[moving[np.maximum(before, 0)]]))
-    out: Complexes = np.exp(1j * np.interp(t_new, t, angle))
-    return out
+    last_moving = np.searchsorted(moving, np.arange(len(t)), side='right') - 1
+    angle = np.unwrap(np.angle(velocity[moving[np.maximum(last_moving, 0)]]))
+    directions: Complexes = np.exp(1j * np.interp(t_new, t, angle))
+    return directions
 
 
-def _along_and_across(off_n: Floats, forward: Complexes) -> Floats:
+def _along_and_across(offset_n: Floats, forward: Complexes) -> Floats:
     """Return horizontal offsets, (k, 3) in n, as components forward and left: (k, 2)."""
-    z = (off_n[:, 0] + 1j * off_n[:, 1]) * np.conj(forward)
-    return np.stack([z.real, z.imag], -1)
+    rotated = (offset_n[:, 0] + 1j * offset_n[:, 1]) * np.conj(forward)
+    return np.stack([rotated.real, rotated.imag], -1)
 
 
 def _decimated_rows(n: int) -> Ints:

@@ -8,7 +8,7 @@ The ratio of turns by the gyro to turns of the course shows a wrong sign or unit
 gravity in the IMU shows gyro axes with a wrong sign or swapped: imu.mounting_rpy cannot correct
 these, because it rotates gyro and accelerometer together. If the first level axis of the
 accelerometer has the wrong sign, the second level axis and the upright axis of the gyro appear to
-have it, because turn rates in mirrored axes have these signs.
+have the wrong sign: turn rates in mirrored axes have these signs.
 """
 
 from typing import NamedTuple
@@ -33,8 +33,9 @@ WRONG = np.array([1.0, -1.0, 1j, -1j])
 # statistical: largest chance of a correct axis, and distance from a wrong one; both must hold.
 # False alarms in 0 of 384 zoo drives (lowest chance 1.9e-4); zoo.md
 LARGEST_CHANCE, NEAR_WRONG = 5e-5, 0.4
-FAR_SIGMAS = 5.0    # statistical: a sign of the accelerations in turns
-INVERTED = -0.5     # judgement: 1 is expected; a vehicle that leans into its turns has 0
+# the ratio ``ImuOrientation.centripetal``, 1 if correct: statistical, sigmas of a certain sign;
+# judgement, limit of an inverted one (a vehicle that leans into its turns has 0)
+FAR_SIGMAS, INVERTED = 5.0, -0.5
 # statistical: least correlation of the same turns by gyro and by course, and least sigmas of the
 # slope, since a few courses may be correlated by chance
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
@@ -54,15 +55,18 @@ class WrongAxis(NamedTuple):
 
 
 def level_axes(up: Floats) -> tuple[Floats, list[str]]:
-    """Return level e1, e2 and up as rows, (3, 3), and the sensor axis nearest to each, as "-y"."""
-    k = int(np.argmax(np.abs(up)))
-    first, second = np.eye(3)[(k + 1) % 3], np.sign(up[k]) * np.eye(3)[(k + 2) % 3]
-    e1 = first - (first @ up) * up
+    """
+    Return level e1, e2 and up as rows, (3, 3), and the name of the sensor axis nearest to each.
+
+    up : (3,) unit vector in the sensor's frame. A name has its sign, such as "-y".
+    """
+    upright = int(np.argmax(np.abs(up)))
+    first, second = (upright + 1) % 3, (upright + 2) % 3
+    e1 = np.eye(3)[first] - up[first] * up
     e1 /= np.linalg.norm(e1)
-    axes = np.stack([e1, np.cross(up, e1), up])
-    nearest = (first, second, np.sign(up[k]) * np.eye(3)[k])
-    return axes, ['-' * bool(axis.sum() < 0) + 'xyz'[int(np.argmax(np.abs(axis)))]
-                  for axis in nearest]
+    sign = '-' * bool(up[upright] < 0)
+    names = ['xyz'[first], sign + 'xyz'[second], sign + 'xyz'[upright]]
+    return np.stack([e1, np.cross(up, e1), up]), names
 
 
 def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
@@ -71,8 +75,8 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
     ratio = turn_ratio(inputs.t_imu, map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.min_motion)
     reasons = gyro_reasons(ratio, gyro_scale)
-    if not any(one.code is Code.GYRO_SIGN for one in reasons):
-        return ratio, gyro_axes(inputs, located, orientation) or reasons
+    if not any(reason.code is Code.GYRO_SIGN for reason in reasons):
+        return ratio, wrong_axis_reasons(inputs, located, orientation) or reasons
     text = reasons[0].text
     if orientation and abs(orientation.centripetal) > max(
             -INVERTED, FAR_SIGMAS * orientation.centripetal_sigma):
@@ -83,8 +87,8 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
 
-def gyro_axes(inputs: Inputs, located: LocatedFixes,
-              orientation: ImuOrientation | None) -> tuple[Reason, ...]:
+def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,
+                       orientation: ImuOrientation | None) -> tuple[Reason, ...]:
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
@@ -94,24 +98,24 @@ def gyro_axes(inputs: Inputs, located: LocatedFixes,
     w_i, f_i = (map_rows(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.median_f_b @ inputs.C_bi
     axes, names = level_axes(up / np.linalg.norm(up))
-    wrong_axes = by_course(inputs, located, w_i, axes, names)
+    wrong_axes = wrong_axes_by_course(inputs, located, w_i, axes, names)
     if not wrong_axes and inputs.has_accelerometer:
         inverted = orientation and orientation.centripetal < min(
             INVERTED, -FAR_SIGMAS * orientation.centripetal_sigma)
         if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
-        wrong_axes = by_gravity(inputs, located, w_i, f_i, axes, names)
+        wrong_axes = wrong_axes_by_gravity(inputs, located, w_i, f_i, axes, names)
         if orientation and inverted:
             return _inverted_turns(orientation, wrong_axes, names)
     if not wrong_axes:
         return ()
     action = ', '.join(
-        f'negate angular_velocity.{sent}' if sent == true[-1] else
-        f'publish angular_velocity.{sent} as {true[:-1]}angular_velocity.{true[-1]}'
-        for sent, true, _ in wrong_axes)
+        f'negate angular_velocity.{published}' if published == true[-1] else
+        f'publish angular_velocity.{published} as {true[:-1]}angular_velocity.{true[-1]}'
+        for published, true, _ in wrong_axes)
     if len(wrong_axes) == 1 and wrong_axes[0].published != wrong_axes[0].true[-1]:
         action += ', and check the other axes'
-    return (Reason(Code.GYRO_AXES, '; '.join(one.text for one in wrong_axes),
+    return (Reason(Code.GYRO_AXES, '; '.join(axis.text for axis in wrong_axes),
                    f'Correct the IMU driver: {action}. {NO_ROTATION}'),)
 
 
@@ -121,6 +125,7 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
             f'{orientation.centripetal:.2f} ± {orientation.centripetal_sigma:.1g} instead of 1)')
     level = [name[-1] for name in names[:2]]
+    # a mirrored level axis of the accelerometer makes the other level axis of the gyro look wrong
     wrong = [axis for axis in level
              if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
@@ -135,54 +140,64 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
                    'and accelerometer together.'),)
 
 
-def by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
-              names: list[str]) -> list[WrongAxis]:
-    """Return the level gyro axes that measure the yaw rate instead of the upright one."""
-    def ratio(axis: Floats) -> float | None:
-        return turn_ratio(inputs.t_imu, map_rows(lambda w: w @ axis, w_i), inputs.t_fix,
-                          located.fixes_n, located.fix_sigma, inputs.min_motion)
+def wrong_axes_by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
+                         names: list[str]) -> list[WrongAxis]:
+    """
+    Return the level gyro axes that measure the yaw rate instead of the upright axis.
 
-    def one_motion(ratio: float | None) -> bool:
-        return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
-    if one_motion(ratio(axes[2])):
+    w_i : (n, 3) rad/s, in the sensor's frame.   axes, names : of ``level_axes``.
+    """
+    def yaw_ratio(axis: Floats) -> float | None:
+        """Return the turn ratio of an axis, None if it is not that of the yaw rate."""
+        ratio = turn_ratio(inputs.t_imu, map_rows(lambda w: w @ axis, w_i), inputs.t_fix,
+                           located.fixes_n, located.fix_sigma, inputs.min_motion)
+        is_yaw = ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
+        return ratio if is_yaw else None
+    if yaw_ratio(axes[2]) is not None:
         return []
     wrong_axes = []
     for name, axis in zip(names[:2], axes[:2], strict=True):
-        turns = ratio(axis)
-        if turns is not None and one_motion(turns):
-            sent, true = _measured(name, names[2], turns)
+        ratio = yaw_ratio(axis)
+        if ratio is not None:
+            published, true = _published_and_true(name, names[2], ratio)
             wrong_axes.append(WrongAxis(
-                sent, true, f'angular_velocity.{sent} turns with the course of the fixes (ratio '
-                f'{turns:.2f}), angular_velocity.{names[2][-1]} does not'))
+                published, true, f'angular_velocity.{published} turns with the course of the '
+                f'fixes (ratio {ratio:.2f}), angular_velocity.{names[2][-1]} does not'))
     return wrong_axes
 
 
-def by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats, axes: Floats,
-               names: list[str]) -> list[WrongAxis]:
-    """Return the gyro axes that measure the rotation of gravity about another axis."""
+def wrong_axes_by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats,
+                          axes: Floats, names: list[str]) -> list[WrongAxis]:
+    """
+    Return the gyro axes that measure the rotation of gravity about another axis.
+
+    w_i, f_i : (n, 3) rad/s, m/s^2, in the sensor's frame.   axes, names : of ``level_axes``.
+    """
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough_scale)
     if fit is None:
         return []
     wrong_axes = []
     nearest = WRONG[np.abs(WRONG - fit.coefficient[:, None]).argmin(axis=1)]
-    close, first = np.abs(nearest - fit.coefficient) < NEAR_WRONG, nearest.imag == 0
+    is_close = np.abs(nearest - fit.coefficient) < NEAR_WRONG
+    about_e1 = nearest.imag == 0      # else about e2
     for k, c in enumerate(fit.coefficient):
         # two gyro axes that measure one axis are no mirrored or swapped ones
-        if (nearest[k] == CORRECT[k] or not close[k] or (close & (first == first[k])).sum() > 1
+        if (nearest[k] == CORRECT[k] or not is_close[k]
+                or (is_close & (about_e1 == about_e1[k])).sum() > 1
                 or fit.chance(k, CORRECT[k]) > LARGEST_CHANCE):
             continue
-        along, part = (names[0], c.real) if first[k] else (names[1], c.imag)
-        sent, true = _measured(names[k], along, float(part))
+        measured, part = (names[0], c.real) if about_e1[k] else (names[1], c.imag)
+        published, true = _published_and_true(names[k], measured, float(part))
         wrong_axes.append(WrongAxis(
-            sent, true, f'angular_velocity.{sent} measures the rotation of gravity about {true} '
-            f'(coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
+            published, true, f'angular_velocity.{published} measures the rotation of gravity '
+            f'about {true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
     return wrong_axes
 
 
-def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
-    """Return a published axis without sign, and the axis that it measures, with its sign."""
-    minus = (part < 0) ^ sent.startswith('-') ^ true.startswith('-')
-    return sent[-1], '-' * minus + true[-1]
+def _published_and_true(published: str, measured: str, ratio: float) -> tuple[str, str]:
+    """Return an axis without its sign, and the measured axis with the sign that it has then."""
+    minus = (ratio < 0) ^ published.startswith('-') ^ measured.startswith('-')
+    return published[-1], '-' * minus + measured[-1]
 
 
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
@@ -190,24 +205,27 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     """
     Return turns by the gyro over turns of the course by fixes, None without correlation.
 
+    Mean yaws over chords between fixes are fitted to their courses.
+
     t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
     2 or more), float s, m, and m horizontally.   min_motion : of the fixes, m.
     """
-    covered = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
-    t_fix, fixes_n = t_fix[covered], fixes_n[covered]
+    inside = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
+    t_fix, fixes_n = t_fix[inside], fixes_n[inside]
     # m: the sigma of a course is then 0.14 rad
     knots = separated_fixes(fixes_n, max(min(5.0, min_motion), 10 * sigma))
     if len(knots) < 5:
         return None
     ends = t_fix[knots]
     gaps = gaps_longer(t_imu, LONGEST_GAP)
-    since, until = (np.searchsorted(edge, ends) for edge in gaps.T)     # gaps before each end
+    # number of gaps that begin, and that end, before each end of a chord
+    begun, ended = (np.searchsorted(edge, ends) for edge in gaps.T)
     # chords in which a vehicle stops and turns: the mean over time is not that over path. Ratio to
     # the median duration, and rad: judgement
-    lasts = np.diff(ends)
-    pivots = (lasts > 3.0 * np.median(lasts)) & (
+    duration = np.diff(ends)
+    pivots = (duration > 3.0 * np.median(duration)) & (
         np.abs(np.diff(integral_at(ends, t_imu, w_up))) > 0.5)
-    keep = ~pivots & (until[1:] == since[:-1]) & (since[1:] == since[:-1])
+    keep = ~pivots & (ended[1:] == begun[:-1]) & (begun[1:] == begun[:-1])
     step = np.diff(fixes_n[knots, :2], axis=0)[keep]
     t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
@@ -215,7 +233,7 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
     # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
     # IMU is unknown: a free step is fitted there
-    restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(until[1:][keep]) > 0))
+    restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(ended[1:][keep]) > 0))
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > restarts])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)

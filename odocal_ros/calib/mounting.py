@@ -37,7 +37,7 @@ class Mounting:
     up_i: Floats              # (3,) unit vector, measured
     forward_i: Floats | None  # (3,) the same; None: not observable
     forward_sigma: float      # rad
-    assumed: bool             # forward is assumed to be x, not measured
+    assumed: bool             # True: forward is assumed to be x, not measured
     deviation: float          # rad, angle between the measured axes and the quarter turns
 
     @property
@@ -61,26 +61,28 @@ class Mounting:
 def remedy(estimate: Mounting) -> str:
     """Return the setting to make; the possible ones if the drive does not determine it."""
     if estimate.C_bi is not None:
-        return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_listed(estimate.C_bi)}'"
+        return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_rpy_text(estimate.C_bi)}'"
                 + ", if the IMU's x axis points forward" * estimate.assumed + '.')
-    why = estimate.unclear[0].upper() + estimate.unclear[1:]
+    cause = estimate.unclear[0].upper() + estimate.unclear[1:]
     if estimate.forward_i is not None:
         left_i = np.cross(estimate.up_i, estimate.forward_i)
         C = np.stack([estimate.forward_i, left_i, estimate.up_i])
-        return f'{why}. Set imu.mounting_rpy to its angles, about {_listed(C, 2)} rad.'
+        return f'{cause}. Set imu.mounting_rpy to its angles, about {_rpy_text(C, 2)} rad.'
     upright = [C for C in _quarter_turns()
                if C[2] @ estimate.up_i > np.abs(estimate.up_i).max() - 1e-9]
-    by_axis = '; '.join(f'{"-+"[int(C[0].sum() > 0)]}{AXES[int(np.argmax(np.abs(C[0])))]}: '
-                        f'{_listed(C)}' for C in upright)
-    return (f'{why}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
-            f'({by_axis}).')
+    by_forward_axis = '; '.join(
+        f'{"+" if C[0].sum() > 0 else "-"}{AXES[int(np.argmax(np.abs(C[0])))]}: {_rpy_text(C)}'
+        for C in upright)
+    return (f'{cause}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
+            f'({by_forward_axis}).')
 
 
 def _rpy(C_bi: Floats) -> list[float]:
+    """Return roll, pitch, yaw, rad, without rounding errors and -0."""
     return [float(x) for x in np.round(rpy_from_matrix(C_bi), 12) + 0.0]
 
 
-def _listed(C_bi: Floats, digits: int = 10) -> str:
+def _rpy_text(C_bi: Floats, digits: int = 10) -> str:
     return f'[{",".join(f"{x:.{digits}g}" for x in _rpy(C_bi))}]'
 
 
@@ -123,9 +125,12 @@ def estimate_mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
 
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
-    """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
-    # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
-    # accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later)
+    """
+    Return the forward axis (level, unit) and its sigma, rad; None if not observable.
+
+    In the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, with one angle for both
+    accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later).
+    """
     binned = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if binned is None:
         return None, np.pi
@@ -154,7 +159,7 @@ def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
 
 
 def _quarter_turns() -> Iterator[Floats]:
-    """Yield the 24 rotations that take axes to axes."""
+    """Yield the 24 rotations whose axes are those of the other frame, with any sign."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             C = np.zeros((3, 3))

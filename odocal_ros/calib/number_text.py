@@ -35,9 +35,7 @@ def format_change(change: float) -> str:
 
 def differing(value: float, limit: float) -> str:
     """Return a value with two digits, or with those that show it differs from its limit."""
-    digits = range(2, 7)
-    limits = [significant(limit, n) for n in digits]
-    texts = [significant(value, n) for n in digits]
+    texts, limits = ([significant(x, digits) for digits in range(2, 7)] for x in (value, limit))
     return next((text for text in texts if text not in limits), texts[-1])
 
 

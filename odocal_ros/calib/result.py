@@ -21,8 +21,8 @@ NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                            'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                            'pitch_mounting_angle_housing_sigma'})
 AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps
-FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
-TRACE = 'trace'      # key of the details of a method that raised: its traceback
+FACTOR = 'scale_factor_'      # format: prefix of the name of a wheel in the name of its factor
+TRACE = 'trace'      # key in the details of a method that raised an exception: its traceback
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class LegResult:
     cut_from_ns: int | None = None        # start mark of the leg of which this is a section
 
     @property
-    def driven_ns(self) -> int:
+    def drive_start_ns(self) -> int:
         """Return the start of the drive, ns, common to its sections: no scale drift in between."""
         return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
@@ -146,8 +146,8 @@ class LegResult:
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
 
-    def numbers(self) -> 'LegResult':
-        """Return the data for a combination and its tables, without plot data."""
+    def without_plot_data(self) -> 'LegResult':
+        """Return the data for a combination and its tables."""
         methods = {name: replace(method, details={
             key: value for key, value in method.details.items()
             if not isinstance(value, np.ndarray)}) for name, method in self.methods.items()}

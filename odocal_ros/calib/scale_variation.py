@@ -76,16 +76,17 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
     edges = path[0] + total * np.linspace(0.0, 1.0, count + 1)
-    part = np.clip(np.searchsorted(edges, path, side='right') - 1, 0, count - 1)
+    section = np.clip(np.searchsorted(edges, path, side='right') - 1, 0, count - 1)
     reckoned, fixed = (p[:, 0] + 1j * p[:, 1] for p in (reckoned_n, fix_n))
     ratio, ratio_sigma = np.full(count, np.nan), np.full(count, np.nan)
     fits = {}
     for i in range(count):
-        rows = np.flatnonzero(part == i)
+        rows = np.flatnonzero(section == i)
         if len(rows) >= min_fixes and np.ptp(path[rows]) > 0:
             # means of fixes: 24 of them, with little noise from fix to fix
             blocks = np.array_split(rows, min(len(rows), 24))
-            source, target = (np.array([x[b].mean() for b in blocks]) for x in (reckoned, fixed))
+            source, target = (np.array([positions[block].mean() for block in blocks])
+                              for positions in (reckoned, fixed))
             if (source != source[0]).any():      # else the path stays where it is
                 fits[i] = _similarity(source, target)
     scale_sigmas = _scale_sigmas(list(fits.values()), float(np.median(sigma)))
@@ -104,24 +105,29 @@ def _similarity(source: Complexes, target: Complexes) -> Similarity:
 
 
 def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
-    """Return the sigma of each scale; stated : sigma of a fix, m."""
+    """
+    Return the sigma of the scale of each fit; stated : sigma of a fix, m.
+
+    Variance and correlation of the errors are those of the first-order process whose residuals
+    have the observed power and correlation.
+    """
     if not fits:
         return []
-    residuals = [one.residual for one in fits]
+    residuals = [fit.residual for fit in fits]
     n = int(np.median([len(r) for r in residuals]))
     residual_power, slope_variance, *correlations = _residual_properties(n)
     power = np.array([np.vdot(r, r).real / len(r) for r in residuals]) / 2
     square = sum(np.vdot(r, r).real for r in residuals)
-    # of CORRELATIONS, with a fraction. Additional white noise hides the correlation at the next
-    # block, not at the longer lag: the larger one counts; the longer lag needs enough blocks
+    # index in CORRELATIONS, with a fraction. Additional white noise hides the correlation at the
+    # next block, not at the longer lag, which needs enough blocks: the larger index is used
     grid = np.arange(len(CORRELATIONS))
     index = max(np.interp(sum(np.vdot(r[:-lag], r[lag:]).real for r in residuals)
                           / square if square else 0.0, row, grid)
                 for lag, row in zip(BLOCK_LAGS, correlations, strict=True) if lag == 1 or n >= 16)
     variance = np.maximum(power, np.median(power)) / np.interp(index, grid, residual_power)
     variance = np.maximum(variance, (0.01 * stated)**2)    # lower limit from fix to fix
-    return [float(np.sqrt(v * np.interp(index, grid, slope_variance) / one.spread))
-            for v, one in zip(variance, fits, strict=True)]
+    return [float(np.sqrt(v * np.interp(index, grid, slope_variance) / fit.spread))
+            for v, fit in zip(variance, fits, strict=True)]
 
 
 @lru_cache(maxsize=32)
@@ -144,19 +150,19 @@ def _residual_properties(n: int) -> Floats:
     return np.array(table).T
 
 
-def counter_change_reasons(parts: Sections, t_fix: Floats,
+def counter_change_reasons(scales: Sections, t_fix: Floats,
                            distance: Floats) -> tuple[Reason, ...]:
     """
     Return TRACK_MISMATCH if the scale of sections changes once and is constant otherwise.
 
-    parts : scale by section.   t_fix, distance : (k,) times of the fixes, s, and path length
-    there, m. The section with the change may have any scale.
+    scales : by section.   t_fix, distance : (k,) times of the fixes, s, and path length there, m.
+    The section with the change may have any scale.
     """
-    known = np.flatnonzero(np.isfinite(parts.ratio) & (parts.ratio > 0))
-    log, sigma = np.log(parts.ratio[known]), parts.sigma[known]
+    known = np.flatnonzero(np.isfinite(scales.ratio) & (scales.ratio > 0))
+    log_scale, sigma = np.log(scales.ratio[known]), scales.sigma[known]
     candidates = []      # (scatter over change, section of the change, factor)
     for k in range(1, len(known) - 1):
-        sides = [log[:k], log[k + 1:]]
+        sides = [log_scale[:k], log_scale[k + 1:]]
         before, after = (np.median(side) for side in sides)
         scatter = max(np.ptp(side) for side in sides)
         sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
@@ -166,7 +172,7 @@ def counter_change_reasons(parts: Sections, t_fix: Floats,
     if not candidates:
         return ()
     _, k, factor = min(candidates)
-    begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], distance, t_fix)
+    begin, end = np.interp([scales.begin[known[k]], scales.end[known[k]]], distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
     if not 1 / MAX_DECODING < factor < MAX_DECODING:
         return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
@@ -197,26 +203,29 @@ def _window_ratio(t: Floats, fix: Floats, dead: Floats,
     """Return scale - 1, its sigma and the number of windows of a length, half a length apart."""
     begin = np.arange(t[0], t[-1] - length, length / 2) if len(t) else np.empty(0)
     # without the last fix: by rounding, the end of the last window may be after it
-    i, j = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
-    has_fixes = np.abs(t[j] - t[i] - length) < length / 4     # judgement: else some are missing
-    i, j = i[has_fixes], j[has_fixes]
-    chord = dead[j] - dead[i]
+    first, last = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
+    # judgement: else some fixes are missing
+    has_fixes = np.abs(t[last] - t[first] - length) < length / 4
+    first, last = first[has_fixes], last[has_fixes]
+    chord = dead[last] - dead[first]
     size = np.hypot(*chord.T)
-    i, j, chord, size = (x[size > 0] for x in (i, j, chord, size))
-    if len(i) < MIN_WINDOWS:
+    first, last, chord, size = (x[size > 0] for x in (first, last, chord, size))
+    if len(first) < MIN_WINDOWS:
         return None
-    excess = (chord * (fix[j] - fix[i] - chord)).sum(axis=1) / size     # of the fixes' chord, m
+    # of the chord of the fixes along that of the dead reckoning, m
+    excess = (chord * (fix[last] - fix[first] - chord)).sum(axis=1) / size
     limit = 4 * max(robust_sigma(excess), 1e-9)       # statistical: one in 16,000
     excess = np.clip(excess, -limit, limit)
     # least squares of excess = (scale - 1) size, in total and without each part of the leg
-    part = np.minimum((LEG_PARTS * (t[i] - t[0]) / (t[-1] - t[0])).astype(int), LEG_PARTS - 1)
-    top, bottom = (np.bincount(part, x, LEG_PARTS) for x in (size * excess, size**2))
+    part = np.minimum((LEG_PARTS * (t[first] - t[0]) / (t[-1] - t[0])).astype(int), LEG_PARTS - 1)
+    product, square = (np.bincount(part, x, LEG_PARTS) for x in (size * excess, size**2))
     # no part may have more than half of the weight
-    if (bottom > 0).sum() < LEG_PARTS / 2 or bottom.max() > bottom.sum() / 2:
+    if (square > 0).sum() < LEG_PARTS / 2 or square.max() > square.sum() / 2:
         return None
-    without = (top.sum() - top) / (bottom.sum() - bottom)
-    sigma = np.sqrt((LEG_PARTS - 1) / LEG_PARTS * ((without - without.mean())**2).sum())
-    return float(top.sum() / bottom.sum()), float(sigma), len(i)
+    without_part = (product.sum() - product) / (square.sum() - square)
+    scatter = ((without_part - without_part.mean())**2).sum()
+    sigma = np.sqrt((LEG_PARTS - 1) / LEG_PARTS * scatter)
+    return float(product.sum() / square.sum()), float(sigma), len(first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,20 +265,25 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     fine = travel.at(t[:-1, None] + duration[:, None] * np.arange(0.0, 1.0, 0.1))
     step = np.diff(fine, axis=1)
     same_direction = (step > 0).all(axis=1) | (step < 0).all(axis=1)
-    good = (2 * cell > duration) & straight & (rolled != 0) & same_direction
+    usable = (2 * cell > duration) & straight & (rolled != 0) & same_direction
     top_speed = float(np.percentile(path / duration, 90))      # robust to outliers
-    good &= path / duration > SLOWEST_CELL * top_speed
-    if good.sum() < MIN_CELLS:
+    usable &= path / duration > SLOWEST_CELL * top_speed
+    if usable.sum() < MIN_CELLS:
         return SpeedScale(NO_ROWS)
-    length = chord[good] * path[good] / dead[good]
-    rolled, change, duration = np.abs(rolled[good]), np.diff(np.abs(speed))[good], duration[good]
+    length, change = chord[usable] * path[usable] / dead[usable], np.diff(np.abs(speed))[usable]
+    rolled, duration = np.abs(rolled[usable]), duration[usable]
     fit, used = _fit_cells(length, rolled, duration, change)
     return SpeedScale(_bins(length[used], rolled[used], duration[used]), *fit)
 
 
 def _fit_cells(length: Floats, rolled: Floats, duration: Floats, change: Floats
                ) -> tuple[tuple[tuple[float, float], ...], Bools]:
-    """Return factor, offset and lag of cells, () if not determined, and a mask of used ones."""
+    """
+    Return factor, offset and lag of ``SpeedScale``, () if not determined, and mask of used cells.
+
+    length, rolled, duration, change : (k,) by the fixes, m, by the odometer, units, time, s, and
+    change of the odometer speed, units/s.
+    """
     used: Bools = np.ones(len(length), bool)
     mean_speed, scale = length / duration, length.sum() / rolled.sum()
     X = np.stack([rolled, duration, scale * change], -1)
@@ -282,8 +296,8 @@ def _fit_cells(length: Floats, rolled: Floats, duration: Floats, change: Floats
     if used.sum() < MIN_CELLS or spread < MIN_SPREAD:
         return (), used
     variance = float(np.sum((length - X @ x)[used]**2)) / max(int(used.sum()) - 3, 1)
-    root = np.sqrt(np.diag(np.linalg.pinv(X[used].T @ X[used])) * variance)
-    return tuple((float(a), float(s)) for a, s in zip(x, root, strict=True)), used
+    sigmas = np.sqrt(np.diag(np.linalg.pinv(X[used].T @ X[used])) * variance)
+    return tuple((float(value), float(s)) for value, s in zip(x, sigmas, strict=True)), used
 
 
 def _bins(length: Floats, rolled: Floats, duration: Floats) -> Floats:

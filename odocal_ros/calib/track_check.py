@@ -18,7 +18,7 @@ import numpy as np
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.marks import MarkFix, Path, window_means
 from odocal_ros.calib.result import PerDistance, TrackCheck
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints, runs
 from odocal_ros.nav.rotations import arctan2, wrap
 from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Code, Reason
@@ -51,8 +51,8 @@ def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> F
 
 
 def track_statistics(residual: Floats, distance: float) -> TrackCheck:
-    """Return the statistics of horizontal residuals, m: the patent's (max, mean) and others."""
-    d = np.hypot(*residual.T[:2])
+    """Return the statistics of (n, 3) residuals, m; distance: path length of the leg, m."""
+    d = np.hypot(*residual.T[:2])      # horizontal
     return TrackCheck(float(np.sqrt((d**2).mean())), float(d.max()), float(d.mean()),
                       float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
 
@@ -75,7 +75,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     up = robust_sigma(residual[:, 2] - np.median(residual[:, 2]))**2
     observed_variance = np.array([horizontal, horizontal, up]) - drift**2
     stated_horizontal = stated[0] + stated[1] + sum(
-        np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
+        np.trace(mark.covariance_n[:2, :2]) for mark in marks) / 3
     stated_variance = np.array([stated_horizontal, stated_horizontal, stated[2]])
     factors = np.sqrt(np.maximum(np.nan_to_num(observed_variance), 0.0)
                       / np.maximum(stated_variance, 1e-12))
@@ -157,22 +157,23 @@ def _squared_errors(path: Floats, before: Floats,
                     after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
     """Yield the length of pieces, path over length, squared errors before and after, (p,) m^2."""
     for length in PIECE_LENGTHS_M:
-        a, b = _piece_ends(path, length)
-        if len(a):
-            squares = [((x[b] - x[a])[:, :2]**2).sum(axis=1) for x in (before, after)]
-            yield length, len(a) / PIECE_STARTS, squares
+        first, last = _piece_ends(path, length)
+        if len(first):
+            squares = [((residual[last] - residual[first])[:, :2]**2).sum(axis=1)
+                       for residual in (before, after)]
+            yield length, len(first) / PIECE_STARTS, squares
 
 
 def _piece_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
-    """Return first and last rows of pieces of a length, whose begins are a tenth of it apart."""
+    """Return first and last rows of pieces of a length, which begin every tenth of the length."""
     begin = np.arange(path[0], path[-1] - length,
                       length / PIECE_STARTS) if len(path) else np.empty(0)
-    a = np.searchsorted(path, begin)
-    b = np.searchsorted(path, path[a] + length)
-    is_complete = b < len(path)
-    a, b = a[is_complete], b[is_complete]
-    has_fixes = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
-    return a[has_fixes], b[has_fixes]
+    first = np.searchsorted(path, begin)
+    last = np.searchsorted(path, path[first] + length)
+    is_complete = last < len(path)
+    first, last = first[is_complete], last[is_complete]
+    has_fixes = path[last] - path[first] <= 1.2 * length      # in longer pieces fixes are missing
+    return first[has_fixes], last[has_fixes]
 
 
 def worse_check_reasons(path: Floats, before: Floats, after: Floats,
@@ -216,11 +217,11 @@ def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> P
     knots = np.array(separated_fixes(fixes_2d, max(10.0, 20 * sigma)), int)
     if len(knots) < 2:
         return Pieces(*(np.empty(0),) * 5)
-    a, b = knots[:-1], knots[1:]
-    track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
+    track, fix = np.diff(track_2d[knots], axis=0), np.diff(fixes_2d[knots], axis=0)
     length, course = np.hypot(*fix.T), arctan2(*fix.T[::-1])
     ratio = np.hypot(*track.T) / length
-    return Pieces((t[a] + t[b]) / 2, wrap(arctan2(*track.T[::-1]) - course), length,
+    middle = (t[knots[:-1]] + t[knots[1:]]) / 2
+    return Pieces(middle, wrap(arctan2(*track.T[::-1]) - course), length,
                   ratio / (np.median(ratio) or 1.0), course)
 
 
@@ -251,10 +252,10 @@ def find_reversed(pieces: Pieces) -> Bools:
     opposite = _is_opposite(error)
     for part in np.split(np.arange(len(moves)), divisions):
         flipped = opposite[part] != (np.mean(opposite[part]) > 0.5)
-        for run in np.split(np.arange(len(part)), np.flatnonzero(np.diff(flipped)) + 1):
-            if len(run) and flipped[run[0]] and _fixes_stay_behind(
-                    pieces, moves[part[run]], moves[part[~flipped]]):
-                is_reversed[moves[part[run]]] = True
+        for begin, end in runs(flipped):
+            run = moves[part[begin:end]]
+            if _fixes_stay_behind(pieces, run, moves[part[~flipped]]):
+                is_reversed[run] = True
     return is_reversed
 
 
@@ -269,18 +270,20 @@ def _is_opposite(heading_error: Floats) -> Bools:
 
 def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
     """
-    Return True if the fixes stay behind after a run of pieces (indices), as after a reversal.
+    Return True if the fixes stay behind the track after a run of pieces, as after a reversal.
 
     Over FIX_ERROR_DURATION to each side, the displacement of the fixes is then nearer to that of
     the track with the run reversed; after a fix error, which disappears, to that of the track.
+    run, forward : indices of the pieces that may be reversed, and of forward ones.
     """
     t, error = pieces.t, pieces.heading_error
     nearby = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)
                             & (t <= t[run[-1]] + FIX_ERROR_DURATION))
-    # the heading by most forward pieces: that of single ones contains the error
-    of_forward = error[forward[np.isin(forward, nearby)]]
+    # the median heading error of forward pieces: that of a single one contains a fix error
+    forward_errors = error[forward[np.isin(forward, nearby)]]
     nearest = float(error[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
-    usual = nearest + (float(np.median(wrap(of_forward - nearest))) if len(of_forward) else 0.0)
+    usual = nearest + (float(np.median(wrap(forward_errors - nearest)))
+                       if len(forward_errors) else 0.0)
     track = pieces.length_ratio[nearby] * pieces.length[nearby] * np.exp(
         1j * (pieces.course[nearby] + error[nearby] - usual))
     behind = np.sum(pieces.length[nearby] * np.exp(1j * pieces.course[nearby])) - track.sum()
@@ -292,8 +295,8 @@ def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:
     is_reversed = find_reversed(pieces)
     if not is_reversed.any():
         return ()
-    how = 'odometer.signed is false' if not signed else 'the counter does not count down'
+    cause = 'the counter does not count down' if signed else 'odometer.signed is false'
     return (Reason(Code.TRACK_MISMATCH, f'in {int(is_reversed.sum())} of {len(is_reversed)} '
                    'sections the track runs opposite to the fixes. Likely cause: the vehicle '
-                   f'reversed and {how}',
+                   f'reversed and {cause}',
                    Code.REVERSING_UNSIGNED.remedy),)

@@ -97,9 +97,9 @@ def _C_bv(yaw: float, pitch: float) -> Floats:
 
 
 def refusal_reasons(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
-    """Return the reasons against the method on the leg's chord, empty if there are none."""
-    between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
-    path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
+    """Return the reason against the method if the chord is short; scale_guess: m per unit."""
+    inside = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
+    path = np.abs(np.diff(chord.track.s[inside])).sum() * scale_guess
     length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])
     # the length of the track's own chord, independent of yaw: M is a rotation times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
@@ -166,16 +166,16 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
     track = chord.track
     # gyro errors accumulate from the alignment, with a fixed heading from the start mark
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
-    keep = budget.epochs_between(track, min(first, chord.start.t), chord.end.t)
-    t = track.t[keep]
-    D = budget.displacement(track, keep, chord.start.t, f) * (t >= chord.start.t)[:, None]
+    rows = budget.epochs_between(track, min(first, chord.start.t), chord.end.t)
+    t = track.t[rows]
+    D = budget.displacement(track, rows, chord.start.t, f) * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the prior of the pitch replaces the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
         start, end = _with_height_sigma(start, 0.0), _with_height_sigma(end, rise)
     K = float(np.linalg.norm(f))
-    return budget.budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
+    return budget.budget(f, M, start, end, t, D, track.q_nb[rows], chord.alignment,
                          quantum=quantum * K, fix_scale=fix_scale,
                          time_sigma=config.gnss.time_sigma,
                          velocity_change=chord.velocity_change @ f,
@@ -214,9 +214,9 @@ def _without_heights(chord: Chord, up_scale: float) -> Reason:
                       f'{np.rad2deg(float(pitch)):+z.0f} deg; the limit is '
                       f'{np.rad2deg(PITCH_LIMIT):.0f} deg', 'Set imu.mounting_rpy to the '
                       'approximate pitch of the IMU, or check the heights and their unit.')
-    why = ('are too inaccurate for the pitch' if chord.start.height_known
-           and chord.end.height_known else 'are unknown')
-    return Reason(Code.PITCH_NOT_DETERMINED, f'the heights of the marks {why}; '
+    cause = ('are too inaccurate for the pitch' if chord.start.height_known
+             and chord.end.height_known else 'are unknown')
+    return Reason(Code.PITCH_NOT_DETERMINED, f'the heights of the marks {cause}; '
                   f'0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is assumed')
 
 
@@ -252,7 +252,8 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
 def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
     """Return K and yaw by eq. (6)-(10) of Shi et al. in the plane and by the geodesic: (T14)."""
-    # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark
+    # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark.
+    # As in the paper, o is the start, b the end by the fixes, b_dr the end of the track
     K = np.linalg.norm(f)
     yaw, pitch = map(float, mounting_from_forward(f / K))
     turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)

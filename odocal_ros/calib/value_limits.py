@@ -42,10 +42,10 @@ def _likely_cause(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
 
 
 def speed_unit(scale: float) -> tuple[float, str]:
-    """Return the nearest unit of a speed, in m/s, and its name; ``scale`` and '' if none is."""
-    near_unit = 0.2    # judgement: relative error of a speedometer and of a rough scale
-    factor = min(SPEED_UNITS, key=lambda one: abs(scale / one - 1))
-    return (factor, SPEED_UNITS[factor]) if abs(scale / factor - 1) < near_unit else (scale, '')
+    """Return the unit of a speed nearest to ``scale``, m/s, and its name; scale and '' if none."""
+    max_error = 0.2    # judgement: relative, of a speedometer and of a rough scale
+    factor = min(SPEED_UNITS, key=lambda unit: abs(scale / unit - 1))
+    return (factor, SPEED_UNITS[factor]) if abs(scale / factor - 1) < max_error else (scale, '')
 
 
 def check_limits(estimates: Mapping[str, Estimate], nominal_scale: float,

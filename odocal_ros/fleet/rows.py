@@ -171,7 +171,7 @@ TYPE_KEY = '~'      # the key of an object's type
 
 def text_of_legs(legs: list[result.LegResult]) -> str:
     """Return legs as JSON, without the rows that only a report draws."""
-    return json.dumps([_to_json(leg.numbers()) for leg in legs], separators=(',', ':'))
+    return json.dumps([_to_json(leg.without_plot_data()) for leg in legs], separators=(',', ':'))
 
 
 def legs_from_text(text: str) -> list[result.LegResult]:

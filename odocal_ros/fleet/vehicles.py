@@ -89,7 +89,7 @@ def history_of(name: str, legs: Sequence[DrivenLeg], config: Config) -> ValueHis
     y = np.log(value / value[0]) if is_scale else np.asarray(wrap(value - value[0]))
     independent, shared = _errors(name, [legs[k].leg.methods[estimates[k].method]
                                          for k in numbers])
-    days = np.array([legs[k].leg.driven_ns for k in numbers]) / DAY_NS
+    days = np.array([legs[k].leg.drive_start_ns for k in numbers]) / DAY_NS
     days -= days[0]
     V = covariance(independent, shared, days,
                    config.verdict.scale_drift_per_day if is_scale else 0.0)

@@ -158,7 +158,7 @@ class Session:
         if len(self.legs) > LEGS_HELD:
             old = self.legs[-LEGS_HELD - 1]
             self.legs[-LEGS_HELD - 1] = replace(
-                old, results=tuple(result.numbers() for result in old.results))     # no track
+                old, results=tuple(result.without_plot_data() for result in old.results))
         self.unused_reason = None
         self.settle(calibration)
 

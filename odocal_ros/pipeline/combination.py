@@ -58,7 +58,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     earlier = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
     methods = {name: _combine_method(name, [
-        (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
+        (leg.methods[name], leg.drive_start_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and name in leg.methods], config, earlier, has_local_positions(used))
         for name in method_names}
     with_marginal = {name for leg in used for name, method in leg.methods.items()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from odocal_ros.calib.gyro_axes import by_gravity, level_axes
+from odocal_ros.calib.gyro_axes import level_axes, wrong_axes_by_gravity
 from odocal_ros.calib.mounting import estimate_mounting
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -106,7 +106,8 @@ def test_two_gyro_axes_with_the_same_signal_are_not_an_axis_fault(monkeypatch, x
     fit = GravityFit(np.array([x, y, 0.0]), np.array([0.1, 0.05, 0.02]), np.full(3, 12.0))
     monkeypatch.setattr('odocal_ros.calib.gyro_axes.gravity_fit', lambda *_: fit)
     inputs = SimpleNamespace(t_imu=None, travel=None)
-    found = by_gravity(inputs, SimpleNamespace(rough_scale=1.0), None, None, None, ['x', 'y', 'z'])
+    found = wrong_axes_by_gravity(inputs, SimpleNamespace(rough_scale=1.0), None, None, None,
+                                  ['x', 'y', 'z'])
     assert [sent for sent, *_ in found] == named
 
 
