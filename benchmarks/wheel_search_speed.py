@@ -16,7 +16,7 @@ import time
 from harness import parsed
 import numpy as np
 
-from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
+from odocal_ros.calib.wheel_search.parameter_sets import search_ranges
 from odocal_ros.calib.wheel_search.planar import course_pieces, PlanarLeg, score
 from odocal_ros.calib.wheel_search.search import search
 from odocal_ros.settings.config import WheelsConfig
@@ -78,7 +78,7 @@ def main():
     print(f'  from the pulses: {slow * share:7.2f} s (from {LOOPED} sets)')
     parted = max(np.abs(scores.mean[:LOOPED] - way).max() for way in (alone, pulses))
     print(f'  mean distances part by {parted:.1e} m')
-    whole, found = timed(lambda: search(leg, ranges_of(WheelsConfig())))
+    whole, found = timed(lambda: search(leg, search_ranges(WheelsConfig())))
     print(f'  whole search ({len(found.sets)} rows, {found.refined.iterations} surfaces): '
           f'{whole:.2f} s')
 

@@ -13,7 +13,7 @@ import numpy as np
 from odocal_ros.calib.marks import Path
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.wheel_search.parameter_sets import ranges_of
+from odocal_ros.calib.wheel_search.parameter_sets import search_ranges
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
 from odocal_ros.calib.wheel_search.search import search
 from odocal_ros.data.arrays import Floats, release_mapped_memory
@@ -75,7 +75,7 @@ def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     alignment, wheels = prepared.alignment, prepared.config.wheels
     # the sigma of a course includes the mounting angle
     course_sigma = None if alignment.heading_separable else alignment.heading_sigma
-    search_result = search(leg, ranges_of(wheels, course_sigma), wheels.robust)
+    search_result = search(leg, search_ranges(wheels, course_sigma), wheels.robust)
     if search_result is None:
         return method
     # left and right may be separable by the gyro: the smoother reports that itself

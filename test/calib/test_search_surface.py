@@ -17,7 +17,7 @@ from odocal_ros.calib.wheel_search.minimisation import (
     minimum_in_box,
     refine,
 )
-from odocal_ros.calib.wheel_search.parameter_sets import ranges_of, sets_of, Space
+from odocal_ros.calib.wheel_search.parameter_sets import parameter_sets, search_ranges, Space
 from odocal_ros.calib.wheel_search.planar import (
     course_pieces,
     HUBER,
@@ -31,7 +31,7 @@ from odocal_ros.settings.config import WheelsConfig
 FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
 # on straight drives, left against right is not observable: nothing to compare
 TURNING = ['town', 'another town', 'noisy town', 'out and back']
-RANGES = ranges_of(WheelsConfig())
+RANGES = search_ranges(WheelsConfig())
 
 
 def test_distances_equal_those_of_the_source_summed_step_by_step(monkeypatch):
@@ -153,14 +153,14 @@ def test_surface_and_least_squares_agree(name, space, robust):
     assert direct.converged
 
     def surface_of(x, half, robust):
-        return refine(lambda x: score(leg, sets_of(leg, x), robust, course=False).loss, x,
+        return refine(lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss, x,
                       replace(RANGES, half=half).step, half, space)
 
-    begin = surface_of(np.zeros(3), RANGES.half, False)
-    found = surface_of(begin.x, begin.half, robust)
+    begin = surface_of(np.zeros(3), RANGES.half_range, False)
+    found = surface_of(begin.x, begin.half_range, robust)
     assert found.converged
     assert not found.on_edge
-    assert (np.abs(found.x - direct.x) <= 1e-4 * 2 * RANGES.half).all()
+    assert (np.abs(found.x - direct.x) <= 1e-4 * 2 * RANGES.half_range).all()
     # kinks of the Huber function within a box over which it changes by 1e-6 (DROWNED)
     assert found.value == pytest.approx(direct.value, rel=1e-5 if robust else 1e-9)
 
@@ -170,7 +170,7 @@ def test_surface_and_least_squares_agree(name, space, robust):
 def test_range_is_kept_if_it_may_not_be_widened(space, beyond):
     def cone(x):       # a ridge between wheels that differ, with its peak outside the range
         return np.abs(x[:, 0] - beyond) + 3 * np.abs(x[:, 1] - beyond) + np.abs(x[:, 2])**0.5
-    found = refine(cone, np.array([0.03, 0.02, 0.01]), RANGES.step, RANGES.half, space,
+    found = refine(cone, np.array([0.03, 0.02, 0.01]), RANGES.step, RANGES.half_range, space,
                    widen=False)
-    assert (np.abs(found.x) <= RANGES.half * (1 + 1e-12)).all()
+    assert (np.abs(found.x) <= RANGES.half_range * (1 + 1e-12)).all()
     assert not found.widened

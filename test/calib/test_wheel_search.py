@@ -14,7 +14,7 @@ import pytest
 
 from odocal_ros.calib.wheel_search import parameter_sets
 from odocal_ros.calib.wheel_search.minimisation import least_squares
-from odocal_ros.calib.wheel_search.parameter_sets import Ranges, ranges_of, Space
+from odocal_ros.calib.wheel_search.parameter_sets import Ranges, search_ranges, Space
 from odocal_ros.calib.wheel_search.planar import inflation
 from odocal_ros.calib.wheel_search.search import MAX_ROWS, search
 from odocal_ros.errors import BadUsage
@@ -22,7 +22,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import WheelsConfig
 
 FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
-RANGES = ranges_of(WheelsConfig())
+RANGES = search_ranges(WheelsConfig())
 
 
 @pytest.mark.parametrize('name', ['town', 'out and back', 'straight', 'paper'])
@@ -56,10 +56,10 @@ def test_small_lawn_separates_left_and_right():
     assert found.after.rms[0] <= found.scores.rms.min()
     assert_allclose(found.refined_set, found.direct_set, atol=1e-5)
     # levels have equal steps and include zero
-    for k, half in enumerate(RANGES.half):
+    for k, half in enumerate(RANGES.half_range):
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
         assert_allclose(x, np.linspace(-half, half, 7), atol=1e-11)
-    assert set(search(leg, Ranges(RANGES.half, RANGES.why, 1)).sets[:, 0]) == {1.0}
+    assert set(search(leg, Ranges(RANGES.half_range, RANGES.sources, 1)).sets[:, 0]) == {1.0}
 
 
 def test_range_is_widened_if_the_minimum_is_on_its_edge():
@@ -84,7 +84,7 @@ def test_unknown_heading_is_found(heading):
     leg = on_a_plane()
     away = replace(leg, left_n=leg.left_n @ turned(-heading),
                    right_n=leg.right_n @ turned(-heading))
-    found = search(away, ranges_of(WheelsConfig(heading_range=np.pi)))
+    found = search(away, search_ranges(WheelsConfig(heading_range=np.pi)))
     off = found.refined_set[2] - TRUE[2] - np.deg2rad(heading)
     assert np.angle(np.exp(1j * off)) == pytest.approx(0.0, abs=1e-3)
     assert abs(found.refined_set[2]) <= np.pi
@@ -96,7 +96,7 @@ def test_search_without_convergence_stops_and_is_reported():
     texts = {r.code: r.text for r in found.reasons}
     assert 'widest range' in texts[Code.SEARCH_NOT_SETTLED]
     assert found.refined.on_edge
-    assert_allclose(found.refined.half[:2], 0.9)
+    assert_allclose(found.refined.half_range[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)
     blind = search(nothing, RANGES)
     assert blind.fixed_difference
@@ -118,7 +118,7 @@ def test_robust_fit_is_not_shifted_by_outliers():
 @pytest.mark.parametrize('levels', [2, 7, 15])
 def test_values_for_json_are_finite_and_short(levels):
     _, leg = simulated(**DRIVES['straight'])
-    found = search(leg, ranges_of(WheelsConfig(levels=levels)))
+    found = search(leg, search_ranges(WheelsConfig(levels=levels)))
     entry = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert entry['array']['rows'] == len(found.sets) == {2: 8, 7: 49, 15: 289}[levels]
     assert len(entry['array']['shown']) == min(MAX_ROWS, len(found.sets))
@@ -128,14 +128,14 @@ def test_values_for_json_are_finite_and_short(levels):
 
 
 def test_ranges_follow_the_settings():
-    assert_allclose(RANGES.half, [0.05, 0.05, np.deg2rad(10.0)])
+    assert_allclose(RANGES.half_range, [0.05, 0.05, np.deg2rad(10.0)])
     assert RANGES.levels == 7
-    required = ranges_of(WheelsConfig(radius_range=0.1, heading_range=0.2, levels=4))
-    assert_allclose(required.half, [0.1, 0.1, 0.2])
+    required = search_ranges(WheelsConfig(radius_range=0.1, heading_range=0.2, levels=4))
+    assert_allclose(required.half_range, [0.1, 0.1, 0.2])
     assert required.levels == 5            # zero is a level
-    assert_allclose(ranges_of(WheelsConfig(), heading_sigma=0.01).half[2], 0.02)
-    assert ranges_of(WheelsConfig(), heading_sigma=3.0).half[2] == np.pi
-    assert ranges_of(WheelsConfig(levels=2)).levels == 2
+    assert_allclose(search_ranges(WheelsConfig(), heading_sigma=0.01).half_range[2], 0.02)
+    assert search_ranges(WheelsConfig(), heading_sigma=3.0).half_range[2] == np.pi
+    assert search_ranges(WheelsConfig(levels=2)).levels == 2
 
 
 def test_formal_sigma_holds_for_white_fixes():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.wheel_search.parameter_sets import sets_of, Space
+from odocal_ros.calib.wheel_search.parameter_sets import parameter_sets, Space
 from odocal_ros.calib.wheel_search.planar import coefficients, inflation, loss, PlanarLeg, weights
 from odocal_ros.data.arrays import Bools, Floats
 
@@ -42,13 +42,13 @@ class Surface:
 class Refined:
     """Minimum of a criterion by response surfaces."""
 
-    x: Floats        # (3,) left, right (relative), heading (rad)
-    value: float     # of the criterion there
-    iterations: int  # number of surfaces
+    x: Floats           # (3,) left, right (relative), heading (rad)
+    value: float        # of the criterion there
+    iterations: int     # number of surfaces
     converged: bool
-    half: Floats     # (3,) last half range
-    widened: bool    # the range was increased
-    on_edge: bool    # the minimum is still on its edge
+    half_range: Floats  # (3,) of the last search range
+    widened: bool       # the range was increased
+    on_edge: bool       # the minimum is still on its edge
     first: Surface
     last: Surface
 
@@ -92,17 +92,17 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
     return best
 
 
-def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, space: Space,
-           widen: bool = True) -> Refined:
+def refine(criterion: Callable[..., Any], x: Floats, width: Floats, half_range: Floats,
+           space: Space, widen: bool = True) -> Refined:
     """
-    Minimise a criterion by response surfaces.
+    Return the minimum of a criterion by response surfaces.
 
-    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) first values: the best row of an
-    array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
-    half of the search range about zero.   space : free parameters.   widen : double the range if
-    the minimum is on its edge.
+    criterion : function of (m, 3) parameters x with (m,) values.   x : (3,) first values: the best
+    row of an array.   width : (3,) half width of the first box in x: a step between levels.
+    half_range : (3,) half of the search range about zero.   space : free parameters.   widen :
+    double the range if the minimum is on its edge.
     """
-    search = _BoxSearch(value, space, np.asarray(half, dtype=float),
+    search = _BoxSearch(criterion, space, np.asarray(half_range, dtype=float),
                         np.asarray(width, dtype=float), x)
     first = last = search.surface()
     iterations, max_iterations = 1, 300    # surfaces; with the widest range a hundred are needed
@@ -116,23 +116,24 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
             break
         last = search.surface()
         iterations += 1
-    return Refined(space.T @ search.q, search.least, iterations, converged, search.half,
-                   bool((search.half > search.first_half).any()), bool(search.on_edge.any()),
-                   first, last)
+    return Refined(space.T @ search.q, search.least, iterations, converged, search.half_range,
+                   bool((search.half_range > search.first_half_range).any()),
+                   bool(search.on_edge.any()), first, last)
 
 
 class _BoxSearch:
     """
     State of a search: the box around the best point so far, within a range about zero.
 
-    q, w : (n,) middle and half width of the box, in the coordinates of ``space``.   half : (3,)
-    half of the range of x.   least : criterion at the middle.
+    q, w : (n,) middle and half width of the box, in the coordinates of ``space``.   half_range :
+    (3,) half of the range of x.   least : criterion at the middle.   grid : (3^n, n) points of the
+    box, in half widths from its middle.
     """
 
-    def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
-                 x: Floats) -> None:
-        self.value, self.space = value, space
-        self.first_half = self.half = half
+    def __init__(self, criterion: Callable[..., Any], space: Space, half_range: Floats,
+                 width: Floats, x: Floats) -> None:
+        self.criterion, self.space = criterion, space
+        self.first_half_range = self.half_range = half_range
         self.first_width = np.abs(space.q_of(width) if space.fixed_difference else
                                   np.array([width[:2].mean(), width[:2].sum(), width[2]]))
         self.w = self.first_width
@@ -143,13 +144,13 @@ class _BoxSearch:
 
     def surface(self) -> Surface:
         """Return the polynomial fitted to the criterion at 3^n points of the box."""
-        self.values = self.value((self.q + self.grid * self.w) @ self.space.T.T)
+        self.values = self.criterion((self.q + self.grid * self.w) @ self.space.T.T)
         self.least = float(self.values[len(self.grid) // 2])
         return fit_surface(self.grid, self.values)
 
     def step(self, surface: Surface) -> bool:
         """Move to the surface's minimum in the range, shrink the box; return True if converged."""
-        S, bound = self.space.S, self.space.bounds(self.half)
+        S, bound = self.space.S, self.space.bounds(self.half_range)
         v = S @ self.q
         # y = (q - q0) / w; the range bounds v = S q, here in half ranges
         to_y = np.linalg.inv(S) / self.w[:, None] * bound
@@ -157,9 +158,9 @@ class _BoxSearch:
         u = minimum_in_box(to_y.T @ surface.gradient, to_y.T @ surface.hessian @ to_y, low, high)
         self.on_edge = (u <= low) | (u >= high)
         move = np.linalg.solve(S, u * bound)
-        value_there = float(self.value((self.space.T @ (self.q + move))[None])[0])
+        value_there = float(self.criterion((self.space.T @ (self.q + move))[None])[0])
         step_limit = 1e-6    # share of the first half range, largest last step
-        small = np.abs(S @ move) <= step_limit * self.space.bounds(self.first_half)
+        small = np.abs(S @ move) <= step_limit * self.space.bounds(self.first_half_range)
         # share of the criterion: the box is not shrunk if its curvature contributes less
         min_curvature = 1e-6
         shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < min_curvature * self.least)
@@ -189,10 +190,10 @@ class _BoxSearch:
 
     def widen(self) -> bool:
         """Double the range where the minimum is on its edge; return False at the widest range."""
-        wider = self.space.widened(self.half, self.on_edge)
-        if np.array_equal(wider, self.half):
+        wider = self.space.widened(self.half_range, self.on_edge)
+        if np.array_equal(wider, self.half_range):
             return False
-        self.half, self.w = wider, self.first_width
+        self.half_range, self.w = wider, self.first_width
         return True
 
 
@@ -229,26 +230,27 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     q = space.q_of(x)
     iterations, converged = 0, False
     r, J = _linearise(leg, space.T @ q)
-    value = _value(leg, r, robust)
+    value = _criterion(leg, r, robust)
     max_iterations = 200    # iterations; with reweighting a few are needed for each digit
     while not converged and iterations < max_iterations:
         iterations += 1
-        root = np.sqrt(np.tile(weights(_d2(r), leg.sigma, robust), 2))
+        root = np.sqrt(np.tile(weights(_squared_distances(r), leg.sigma, robust), 2))
         step = _solve(root[:, None] * (J @ space.T), -root * r)
         for _ in range(HALVINGS):
             r_new, J_new = _linearise(leg, space.T @ (q + step))
-            lower = _value(leg, r_new, robust)
-            if lower <= value:
+            new_value = _criterion(leg, r_new, robust)
+            if new_value <= value:
                 break
             step = step / 2
         else:
             converged = bool(np.abs(step).max() < STEP_LIMIT)
             break
         largest = np.abs(step).max()
-        converged = bool(largest < STEP_LIMIT or (largest < 1e3 * STEP_LIMIT and lower == value))
-        q, r, J, value = q + step, r_new, J_new, lower
+        converged = bool(largest < STEP_LIMIT
+                         or (largest < 1e3 * STEP_LIMIT and new_value == value))
+        q, r, J, value = q + step, r_new, J_new, new_value
     covariance, condition = _covariance(leg, r, J, space, robust)
-    # of right minus left: by scatter, and by the bend of any track
+    # sigma of right minus left: by scatter, and by the bend of any track
     by_heading = np.linalg.norm(J[:, 2])
     by_difference = float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
     by_bend = TRACK_BEND * by_heading / max(by_difference, 1e-12)
@@ -260,21 +262,21 @@ def _linearise(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return residuals rotated by -heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
     heading = x[2]
     by_x = np.zeros((4, 5))
-    by_x[0] = coefficients(sets_of(leg, x))[0]
+    by_x[0] = coefficients(parameter_sets(leg, x))[0]
     by_x[1, 0], by_x[2, 1] = leg.scale_left / 2, leg.scale_right / 2
     by_x[3, 3:] = np.sin(heading), -np.cos(heading)
     rows = np.hstack([by_x @ axis for axis in leg.basis])
     return rows[0], rows[1:].T
 
 
-def _d2(r: Floats) -> Floats:
-    """Return squared distances of track and fixes, m^2: (2k,) to (k,)."""
+def _squared_distances(r: Floats) -> Floats:
+    """Return squared distances of track and fixes, m^2, by residuals: (2k,) to (k,)."""
     east, north = r.reshape(2, -1)
     return east**2 + north**2
 
 
-def _value(leg: PlanarLeg, r: Floats, robust: bool) -> float:
-    return float(loss(_d2(r)[None], leg.sigma, robust)[0])
+def _criterion(leg: PlanarLeg, r: Floats, robust: bool) -> float:
+    return float(loss(_squared_distances(r)[None], leg.sigma, robust)[0])
 
 
 def _solve(A: Floats, b: Floats) -> Floats:
@@ -287,7 +289,7 @@ def _solve(A: Floats, b: Floats) -> Floats:
 def _covariance(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
                 robust: bool) -> tuple[Floats, float]:
     """Return the covariance of x, (3, 3), and the condition number of the Jacobian."""
-    w = np.tile(weights(_d2(r), leg.sigma, robust), 2)
+    w = np.tile(weights(_squared_distances(r), leg.sigma, robust), 2)
     s = np.linalg.svd(J @ space.T if space.fixed_difference else J, compute_uv=False)
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
     root = np.sqrt(w)

@@ -85,7 +85,11 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
 
 
 def irreducible(p: int, m: int) -> tuple[int, ...]:
-    """Return the first monic polynomial of degree m over 0..p-1 that has no factor, low first."""
+    """
+    Return the first monic polynomial of degree m, over the numbers 0..p-1, that has no factor.
+
+    A polynomial is the tuple of its coefficients, that of the lowest power first.
+    """
     factors = [(*low, 1) for d in range(1, m // 2 + 1) for low in product(range(p), repeat=d)]
     for low in product(range(p), repeat=m):
         candidate = (*low, 1)
@@ -95,13 +99,13 @@ def irreducible(p: int, m: int) -> tuple[int, ...]:
 
 
 def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bool:
-    """Return True if a monic factor divides a polynomial, both low first."""
-    rest, d = list(polynomial), len(factor) - 1
-    for k in range(len(rest) - 1, d - 1, -1):
-        head = rest[k]
-        for i, f in enumerate(factor):
-            rest[k - d + i] = (rest[k - d + i] - head * f) % p
-    return not any(rest[:d])
+    """Return True if a monic factor divides a polynomial over 0..p-1, by long division."""
+    remainder, degree = list(polynomial), len(factor) - 1
+    for k in range(len(remainder) - 1, degree - 1, -1):
+        quotient = remainder[k]
+        for i, coefficient in enumerate(factor):
+            remainder[k - degree + i] = (remainder[k - degree + i] - quotient * coefficient) % p
+    return not any(remainder[:degree])
 
 
 def bose(q: int, columns: int) -> Ints:
@@ -159,19 +163,20 @@ class Space:
         return np.array([mean, heading] if self.fixed_difference else
                         [mean, right - left, heading])
 
-    def bounds(self, half: Floats) -> Floats:
+    def bounds(self, half_range: Floats) -> Floats:
         """Return the half range of v from that of x: (n,)."""
-        return np.array([min(half[:2]), half[2]]) if self.fixed_difference else np.array(half)
+        return np.array([min(half_range[:2]), half_range[2]]) if self.fixed_difference \
+            else np.array(half_range)
 
-    def widened(self, half: Floats, on_edge: Bools) -> Floats:
+    def widened(self, half_range: Floats, on_edge: Bools) -> Floats:
         """Return the half range of x, doubled where v is on its edge, with positive scales."""
         edge = np.array([on_edge[0], *on_edge]) if self.fixed_difference else np.asarray(on_edge)
-        widest = np.array([0.9, 0.9, 1.5 * np.pi])    # of a half range
-        return np.where(edge, np.minimum(2 * np.asarray(half), widest), half)
+        widest = np.array([0.9, 0.9, 1.5 * np.pi])
+        return np.where(edge, np.minimum(2 * np.asarray(half_range), widest), half_range)
 
 
-def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
-    """Return parameter sets (scales in m per unit, heading in rad) of (m, 3) x."""
+def parameter_sets(leg: PlanarLeg, x: Floats) -> Floats:
+    """Return parameter sets (scales in m per unit, heading in rad) of (m, 3) x: (m, 3)."""
     x = np.atleast_2d(np.asarray(x, dtype=float))
     return np.stack([leg.scale_left * (1 + x[:, 0]), leg.scale_right * (1 + x[:, 1]), x[:, 2]], -1)
 
@@ -180,23 +185,23 @@ def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
 class Ranges:
     """Search ranges about the start values."""
 
-    half: Floats               # (3,) of left and right (relative) and heading (rad)
-    why: tuple[str, str, str]  # the source of each
-    levels: int                # number of levels of each
+    half_range: Floats             # (3,) of left and right (relative) and heading (rad)
+    sources: tuple[str, str, str]  # setting or reason of each
+    levels: int                    # number of levels of each
 
     def values(self, rows: Ints) -> Floats:
-        """Return x of the rows of an array: equal steps from -half to half."""
+        """Return x of the rows of an array: equal steps from -half_range to half_range."""
         if self.levels == 1:
             return np.zeros(rows.shape)
-        return (2 * rows / (self.levels - 1) - 1) * self.half
+        return (2 * rows / (self.levels - 1) - 1) * self.half_range
 
     @property
     def step(self) -> Floats:
         """Return the step between levels; for one or two levels the half range."""
-        return 2 * self.half / max(self.levels - 1, 2)
+        return 2 * self.half_range / max(self.levels - 1, 2)
 
 
-def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Ranges:
+def search_ranges(wheels: WheelsConfig, heading_sigma: float | None = None) -> Ranges:
     """
     Return the ranges by the settings.
 
@@ -204,18 +209,20 @@ def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Range
     mounting angle together, rad; None: unknown.
     """
     if wheels.radius_range > 0:
-        scale, why = wheels.radius_range, 'wheels.radius_range'
+        scale, scale_source = wheels.radius_range, 'wheels.radius_range'
     else:
-        scale_range = 0.05    # if no error is stated
-        scale, why = scale_range, 'no error of the wheels is stated: 5 %'
+        default_scale = 0.05
+        scale, scale_source = default_scale, 'no error of the wheels is stated: 5 %'
     if wheels.heading_range > 0:
-        heading, reason = wheels.heading_range, 'wheels.heading_range'
+        heading, heading_source = wheels.heading_range, 'wheels.heading_range'
     elif heading_sigma:
-        heading, reason = min(2 * heading_sigma, np.pi), 'twice the sigma of the heading'
+        heading, heading_source = min(2 * heading_sigma, np.pi), 'twice the sigma of the heading'
     else:
-        heading_range = np.deg2rad(10.0)    # if no error is stated
-        heading, reason = heading_range, ('heading and mounting angle rotate the track in the '
-                                          'same way, and no error of them is stated: 10 deg')
+        default_heading = np.deg2rad(10.0)
+        heading, heading_source = default_heading, (
+            'heading and mounting angle rotate the track in the same way, and no error of them is '
+            'stated: 10 deg')
     # an odd number has zero among its levels
     n = wheels.levels if wheels.levels < 3 else next_prime_power(wheels.levels, odd=True)
-    return Ranges(np.array([scale, scale, heading]), (why, why, reason), n)
+    return Ranges(np.array([scale, scale, heading]),
+                  (scale_source, scale_source, heading_source), n)

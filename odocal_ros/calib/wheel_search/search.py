@@ -19,8 +19,8 @@ from odocal_ros.calib.wheel_search.parameter_sets import (
     Design,
     design_for,
     NAMES,
+    parameter_sets,
     Ranges,
-    sets_of,
     Space,
 )
 from odocal_ros.calib.wheel_search.planar import PlanarLeg, score, Scores
@@ -56,15 +56,18 @@ class SearchResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for calibration.json, angles in deg."""
-        r, d = self.refined, self.direct
+        refined, direct = self.refined, self.direct
+        ranges = [{'parameter': name, 'half': _in_degrees(name, half),
+                   'at_the_end': _in_degrees(name, last_half),
+                   'unit': 'deg' if name == 'heading' else '1', 'why': source}
+                  for name, half, last_half, source in zip(
+                      NAMES, self.ranges.half_range, refined.half_range, self.ranges.sources,
+                      strict=True)]
         shown = np.arange(len(self.sets))
         if len(shown) > MAX_ROWS:      # the best ones, in the order of the array
             shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MAX_ROWS])
         return {
-            'ranges': [{'parameter': n, 'half': float(_deg(k, h)), 'at_the_end': float(
-                _deg(k, w)), 'unit': 'deg' if n == 'heading' else '1', 'why': y}
-                for k, (n, h, w, y) in enumerate(zip(
-                    NAMES, self.ranges.half, r.half, self.ranges.why, strict=True))],
+            'ranges': ranges,
             'array': {'name': self.design.name, 'rows': len(self.sets),
                       'imbalance': 0.0,
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
@@ -73,21 +76,22 @@ class SearchResult:
             'left_and_right_held_together': self.fixed_difference,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
-                'iterations': r.iterations, 'settled': r.converged, 'widened': r.widened,
-                'on_edge': r.on_edge} | {
+                'iterations': refined.iterations, 'settled': refined.converged,
+                'widened': refined.widened, 'on_edge': refined.on_edge} | {
                 f'{name}_{place}': getattr(surface, name) for name in ('r_squared', 'lack_of_fit')
-                for place, surface in (('first', r.first), ('last', r.last))},
+                for place, surface in (('first', refined.first), ('last', refined.last))},
             'least_squares': _set(self.direct_set) | {
-                'iterations': d.iterations, 'settled': d.converged,
-                'formal_sigma': _set(d.sigma * [*self.start, 1.0])},
+                'iterations': direct.iterations, 'settled': direct.converged,
+                'formal_sigma': _set(direct.sigma * [*self.start, 1.0])},
             'condition_number': _finite(self.free.condition),
             'correlation': [[float(c) for c in row] for row in self.free.correlation],
             'sigma_right_less_left': _finite(self.free.sigma_difference),
             'before': self.before.row(0), 'after': self.after.row(0)}
 
 
-def _deg(k: int, value: float) -> float:
-    return np.rad2deg(value) if NAMES[k] == 'heading' else value
+def _in_degrees(name: str, value: float) -> float:
+    """Return a heading in deg, a relative scale unchanged."""
+    return float(np.rad2deg(value) if name == 'heading' else value)
 
 
 def _finite(value: float) -> float | None:
@@ -110,17 +114,17 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
         return None
     design = design_for(ranges.levels)
     x = ranges.values(design.rows)
-    sets = sets_of(leg, x)
+    sets = parameter_sets(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
     free = direct = least_squares(leg, x[best], Space(fixed_difference=False), robust)
     # twice the stated error of each wheel: the sigma of their difference
-    fixed_difference = not free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
+    fixed_difference = not free.sigma_difference <= float(np.hypot(*ranges.half_range[:2])) / 2
     space = Space(fixed_difference)
     if fixed_difference:
         direct = least_squares(leg, x[best], space, robust)
     refined = _refine(leg, x[best], ranges, space, robust)
-    refined_set, direct_set = (sets_of(leg, fit.x)[0] for fit in (refined, direct))
+    refined_set, direct_set = (parameter_sets(leg, fit.x)[0] for fit in (refined, direct))
     refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
     return SearchResult(
         (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, fixed_difference,
@@ -129,16 +133,17 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
 
 
 def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
-    """Minimise the mean square; robust: then Huber's mean, a cone far from its minimum."""
-    def by(robust: bool) -> Callable[..., Any]:
-        return lambda x: score(leg, sets_of(leg, x), robust, course=False).loss
+    """Return the minimum of the mean square; robust: then of Huber's mean, a cone far from it."""
+    def criterion(robust: bool) -> Callable[..., Any]:
+        return lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss
 
-    refined = refine(by(False), x, ranges.step, ranges.half, space)
+    by_squares = refine(criterion(False), x, ranges.step, ranges.half_range, space)
     if not robust:
-        return refined
-    again = refine(by(True), refined.x, ranges.step / 10, refined.half, space)
-    return replace(again, widened=refined.widened or again.widened, first=refined.first,
-                   iterations=refined.iterations + again.iterations)
+        return by_squares
+    by_huber = refine(criterion(True), by_squares.x, ranges.step / 10, by_squares.half_range,
+                      space)
+    return replace(by_huber, widened=by_squares.widened or by_huber.widened,
+                   first=by_squares.first, iterations=by_squares.iterations + by_huber.iterations)
 
 
 def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
@@ -146,32 +151,33 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
     reasons = []
     if fixed_difference:
         sigma = 100 * free.sigma_difference
-        how = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
-               'do not separate left and right wheel')
-        reasons.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {how} (condition number '
+        text = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
+                'do not separate left and right wheel')
+        reasons.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {text} (condition number '
                               f'{free.condition:.2g}, correlation '
                               f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
                               'together'))
     if refined.widened:
-        changes = [f'{name} ± {_amount(k, before)} to ± {_amount(k, after)}'
-                   for k, (name, before, after) in enumerate(zip(
-                     NAMES, ranges.half, refined.half, strict=True)) if after > before]
+        changes = [f'{name} ± {_amount(name, before)} to ± {_amount(name, after)}'
+                   for name, before, after in zip(
+                       NAMES, ranges.half_range, refined.half_range, strict=True)
+                   if after > before]
         reasons.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
                               f'range, which was widened: {", ".join(changes)}'))
     if not refined.converged or refined.on_edge:
-        where = 'ends on the edge of the widest range' if refined.on_edge else \
+        text = 'ends on the edge of the widest range' if refined.on_edge else \
             f'has not converged after {refined.iterations} response surfaces'
-        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
+        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {text}'))
     else:
         difference = np.abs(refined.x - direct.x)
         difference[2] = abs(wrap(difference[2]))
-        share = float((difference / ranges.half).max())
-        agree = 1e-3    # of the range: largest difference of surface and least squares
-        if share > agree or not direct.converged:
+        share = float((difference / ranges.half_range).max())
+        max_share = 1e-3    # of the range
+        if share > max_share or not direct.converged:
             reasons.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
                                   f'differ by {100 * share:.2g} % of the range'))
     return tuple(reasons)
 
 
-def _amount(k: int, value: float) -> str:
-    return f'{np.rad2deg(value):.3g} deg' if NAMES[k] == 'heading' else f'{100 * value:.3g} %'
+def _amount(name: str, value: float) -> str:
+    return f'{np.rad2deg(value):.3g} deg' if name == 'heading' else f'{100 * value:.3g} %'

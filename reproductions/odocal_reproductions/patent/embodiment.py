@@ -24,7 +24,7 @@ from odocal_ros.calib.wheel_search.parameter_sets import (
     bose,
     full_factorial,
     next_prime_power,
-    sets_of,
+    parameter_sets,
     Space,
 )
 from odocal_ros.calib.wheel_search.planar import PlanarLeg, score
@@ -137,12 +137,12 @@ def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
     step = 2 * half_range / (np.array(LEVELS) - 1)
     spaces = Space(fixed_difference=False), Space(fixed_difference=True)
     surface, surface_together = (
-        refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, best_x, step, half_range,
-               space, widen=False) for space in spaces)
+        refine(lambda x: score(leg, parameter_sets(leg, x), course=False).loss, best_x, step,
+               half_range, space, widen=False) for space in spaces)
     squares, squares_together = (least_squares(leg, best_x, space) for space in spaces)
 
     def row(name: str, x: Floats) -> Row:
-        criteria = score(leg, sets_of(leg, x)).row(0)
+        criteria = score(leg, parameter_sets(leg, x)).row(0)
         left, right = (float(r) for r in x[:2] * radius)
         return Row(name, left, right, float(np.rad2deg(x[2])), criteria)
 
@@ -170,5 +170,5 @@ def _errors_of(level_numbers: Ints, half_range: Floats) -> Floats:
 
 def _best(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return the row with the least mean distance, ties by the largest; and all mean distances."""
-    scores = score(leg, sets_of(leg, x), course=False)
+    scores = score(leg, parameter_sets(leg, x), course=False)
     return x[np.lexsort((scores.max, scores.mean))[0]], scores.mean
