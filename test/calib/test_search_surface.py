@@ -154,7 +154,7 @@ def test_surface_and_least_squares_agree(name, space, robust):
 
     def surface_of(x, half, robust):
         return refine(lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss, x,
-                      replace(RANGES, half=half).step, half, space)
+                      replace(RANGES, half_range=half).step, half, space)
 
     begin = surface_of(np.zeros(3), RANGES.half_range, False)
     found = surface_of(begin.x, begin.half_range, robust)

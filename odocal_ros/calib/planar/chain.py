@@ -81,9 +81,9 @@ class Solution:
                  prior_gradient: Floats) -> None:
         """Solve; weight : 1 / level of each of the equations; prior : information, (m, m)."""
         def weighted_sum(name: str) -> Floats:
-            out: Floats = sum(w * getattr(one, name)
-                              for w, one in zip(weight, equations, strict=True))
-            return out
+            total: Floats = sum(w * getattr(level, name)
+                                for w, level in zip(weight, equations, strict=True))
+            return total
         n, s = weighted_sum('gradient').shape
         self._band = cholesky_banded(_banded(
             weighted_sum('diagonal'), weighted_sum('off_diagonal')))
@@ -100,14 +100,14 @@ class Solution:
     @property
     def covariance(self) -> Floats:
         """Return the covariance of the constants: (m, m)."""
-        out: Floats = cho_solve(self._root, np.eye(len(self.constants)))
-        return (out + out.T) / 2
+        inverse: Floats = cho_solve(self._root, np.eye(len(self.constants)))
+        return (inverse + inverse.T) / 2
 
     def log_determinant(self) -> float:
         """Return the log determinant of the matrix of all equations."""
         # a copy: the last bits of logarithms of a strided array depend on its place in memory
-        of_states = np.log(self._band[-1].copy()).sum()
-        return float(2 * (of_states + np.log(np.diag(self._root[0])).sum()))
+        states_part = np.log(self._band[-1].copy()).sum()
+        return float(2 * (states_part + np.log(np.diag(self._root[0])).sum()))
 
 
 def _banded(diagonal: Floats, off_diagonal: Floats) -> Floats:

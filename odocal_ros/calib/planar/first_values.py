@@ -39,7 +39,7 @@ class FirstValues(NamedTuple):
 
 def first_values(run: Run, width: float) -> FirstValues:
     """
-    Return the first values of a run; width : m, as configured, 0 unknown.
+    Return the first values of a run; width : track width, m, as configured, 0 unknown.
 
     Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW or WINDOW_STEPS steps
     between positions, are rotated and scaled onto the positions. Turns on the spot by 90 deg and
@@ -52,23 +52,27 @@ def first_values(run: Run, width: float) -> FirstValues:
     path = running_sum(run.wheels.path)[run.node]
     scale_guess = _scale_guess(position, path)
     windows = _windows(path * scale_guess)
-    align = _Alignment(run, position, windows, scale_guess)
+    alignment = _Alignment(run, position, windows, scale_guess)
     # cost of the positions and of their mirror image for each width and ratio
-    costs, mirrored = np.stack([align(w, RATIOS)[0] for w in np.log(WIDTHS)], axis=1)
+    costs, mirrored = np.stack([alignment.fit(log_width, RATIOS)[0]
+                                for log_width in np.log(WIDTHS)], axis=1)
+
+    def cost(x: Floats) -> float:
+        """Return the cost of x: log width, and ratio - 1."""
+        return float(alignment.fit(x[0], x[1:])[0][0, 0])
     lowest = costs.min(axis=1)
     padded = np.pad(lowest, 1, constant_values=np.inf)
     minima = np.flatnonzero((lowest <= padded[:-2]) & (lowest <= padded[2:]))
-    refined = []      # (cost, (log width, ratio - 1))
+    refined = []      # cost and x of minima
     for k in minima[np.argsort(lowest[minima])][:MAX_MINIMA]:
         guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
-        better = minimize(lambda x: align(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
-                          options={'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]],
-                                   'maxfev': 80})
-        refined.append((better.fun, better.x))
-    limit = SAME_COST * min(cost for cost, _ in refined) + len(position) * 1e-6    # (1 mm)^2 each
+        minimum = minimize(cost, guess, method='Nelder-Mead', options={
+            'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]], 'maxfev': 80})
+        refined.append((minimum.fun, minimum.x))
+    limit = SAME_COST * min(value for value, _ in refined) + len(position) * 1e-6   # (1 mm)^2 each
     expected = np.log(width or WIDTHS[-1])
-    x = min((x for cost, x in refined if cost <= limit), key=lambda x: abs(x[0] - expected))
-    _, (factor,), (turn,) = align(x[0], x[1:])
+    x = min((x for value, x in refined if value <= limit), key=lambda x: abs(x[0] - expected))
+    _, (factor,), (turn,) = alignment.fit(x[0], x[1:])
     middle = run.node[windows.sum(axis=1) // 2]
     heading = turn + np.interp(np.arange(len(turn)), middle, np.unwrap(np.angle(factor)))
     scale = float(np.median(np.abs(factor)))
@@ -78,10 +82,10 @@ def first_values(run: Run, width: float) -> FirstValues:
 
 
 def _scale_guess(position: Complexes, path: Floats) -> float:
-    """Return metres per unit of wheel path: 75th percentile of lines between positions."""
+    """Return metres per unit of wheel path: 75th percentile of lines between positions over it."""
     step = max(float(path[-1] - path[0]) / 200, 1e-12)
-    at = np.unique(np.searchsorted(path[:-1], np.arange(path[0], path[-1], step)))
-    ratio = np.abs(np.diff(position[at])) / np.diff(path[at])
+    ends = np.unique(np.searchsorted(path[:-1], np.arange(path[0], path[-1], step)))
+    ratio = np.abs(np.diff(position[ends])) / np.diff(path[ends])
     return float(np.percentile(ratio, 75))
 
 
@@ -101,7 +105,7 @@ class _Alignment:
     """Fit of dead-reckoned paths to positions in w windows: rotation, scale and shift."""
 
     def __init__(self, run: Run, position: Complexes, windows: Ints, scale_guess: float) -> None:
-        forward, side, wheel_difference = run.wheels.body(run.wheels.count).T
+        forward, side, wheel_difference = run.wheels.body_motion(run.wheels.count).T
         self.node, self.windows, self.scale_guess = run.node, windows, scale_guess
         self.left, self.right = forward - wheel_difference / 2, forward + wheel_difference / 2
         self.moved = forward + 1j * side
@@ -112,7 +116,7 @@ class _Alignment:
         self.power_y = (self._sums(np.abs(centred)**2)
                         - np.abs(self.sum_y[0, 0])**2 / self.count).real
 
-    def __call__(self, log_width: float, ratios: Floats) -> tuple[Floats, Complexes, Floats]:
+    def fit(self, log_width: float, ratios: Floats) -> tuple[Floats, Complexes, Floats]:
         """
         Return costs, (2, r) m^2, complex factors, (r, w), and headings, (r, n + 1) rad.
 

@@ -41,9 +41,13 @@ MAX_PASSES = 80
 LARGEST_LAST_STEP = 0.02
 
 
-def fit_run(run: Run, known: PriorKnowledge, after_pass: Callable[[int, float], None] = lambda
-            *_: None) -> Fit:
-    """Return the estimate of a run; after_pass gets the pass and the largest step in sigmas."""
+def fit_run(run: Run, known: PriorKnowledge,
+            after_pass: Callable[[int, float], None] = lambda *_: None) -> Fit:
+    """
+    Return the estimate of a run.
+
+    after_pass : is called with the number of the pass and its largest step, in sigmas.
+    """
     initial = first_values(run, known.width)
     scale = (initial.left + initial.right) / 2
     prior_mean, prior = priors(run, known, initial.left, initial.right, initial.width)
@@ -102,14 +106,14 @@ def fit_at(run: Run, known: PriorKnowledge, state: Floats, c: Floats, levels: di
 def priors(run: Run, known: PriorKnowledge, left: float, right: float, width: float,
            ) -> tuple[Floats, Floats]:
     """Return first values (m,) and prior information (m, m) of the constants."""
-    of_wheels, covariance = run.wheels.prior(left, right, width)
+    wheel_values, covariance = run.wheels.prior(left, right, width)
     others = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
               (0.0, known.delay_sigma)]
     others += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
-    m = len(of_wheels)
+    m = len(wheel_values)
     information = np.diag(np.append(np.ones(m), [sigma**-2.0 for _, sigma in others]))
     information[:m, :m] = np.linalg.inv(covariance)
-    return np.append(of_wheels, [value for value, _ in others]), information
+    return np.append(wheel_values, [value for value, _ in others]), information
 
 
 def noise_path(run: Run, scale: float) -> Floats:
@@ -127,10 +131,10 @@ def _solve(equations: dict[str, Equations], levels: dict[str, float], prior: Flo
 def _residuals_after_step(rows: Rows, solution: Solution) -> Floats:
     """Return the linearised residuals after a step: (n, q)."""
     step = np.append(solution.states, np.zeros((1, solution.states.shape[1])), axis=0)
-    out: Floats = (rows.value + (rows.by_state @ step[rows.node][:, :, None])[:, :, 0]
-                   + (rows.by_next @ step[rows.node + 1][:, :, None])[:, :, 0]
-                   + np.einsum('kqm,m->kq', rows.by_constants, solution.constants))
-    return out
+    residuals: Floats = (rows.value + (rows.by_state @ step[rows.node][:, :, None])[:, :, 0]
+                         + (rows.by_next @ step[rows.node + 1][:, :, None])[:, :, 0]
+                         + np.einsum('kqm,m->kq', rows.by_constants, solution.constants))
+    return residuals
 
 
 def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
@@ -196,10 +200,10 @@ def _wheel_rows(run: Run, state: Floats, c: Floats, path: Floats, first_gains: F
     weight = np.stack([1 / path, 1 / path, 1 / (path * turn_per_metre**2)], -1)
     # intervals with more turn than travel have a separate level of the turn
     turns_on_spot = run.wheels.turns_on_spot
-    return {name: Rows(at, *(x[at, i:i + 1] for x in (value, by_state, by_next, by_constants,
-                                                      weight)))
-            for name, i, at in (('along', 0, k), ('side', 1, k), ('turn', 2, k[~turns_on_spot]),
-                                ('spin', 2, k[turns_on_spot]))}
+    levels = (('along', 0, k), ('side', 1, k), ('turn', 2, k[~turns_on_spot]),
+              ('spin', 2, k[turns_on_spot]))      # name, component, intervals
+    return {name: Rows(nodes, *(x[nodes, i:i + 1] for x in (
+        value, by_state, by_next, by_constants, weight))) for name, i, nodes in levels}
 
 
 def _gyro_rows(run: Run, known: PriorKnowledge, state: Floats, c: Floats) -> Rows:

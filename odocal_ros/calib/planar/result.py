@@ -35,11 +35,11 @@ Constants = dict[str, float]
 class Quantity(NamedTuple):
     """Definition of an estimate by the constants of a fit."""
 
-    needs: str              # constant without which the quantity does not exist
+    constant: str           # constant of the fit without which the quantity does not exist
     value: Callable[[Constants], float]
-    limit: float            # of the relative sigma
+    max_sigma: float        # relative
     code: Code              # of the reason, if the sigma is larger
-    required_motion: str    # that would determine it, for the remedy
+    required_motion: str    # motion that determines the quantity, for the remedy
 
 
 QUANTITIES = {
@@ -73,7 +73,7 @@ def _select_quantities(constants: tuple[str, ...], config: Config) -> dict[str, 
     # omni and mecanum wheels have half of the width: the lever
     other_width = 'track_width' if 'wheel_1' in constants else 'rotation_lever'
     quantities = {name: quantity for name, quantity in QUANTITIES.items()
-                  if quantity.needs in constants and name != other_width}
+                  if quantity.constant in constants and name != other_width}
     wheels = [name for name in constants if name.startswith('wheel_')]
     for constant, wheel in zip(wheels, config.odometer.names(len(wheels)), strict=False):
         quantities[f'scale_factor_{wheel}'] = Quantity(
@@ -88,12 +88,12 @@ class Value(NamedTuple):
 
     value: float
     effects: Floats      # (m,) of independent unit errors of the constants
-    law_sigma: float     # by the assumed dependence of the width on the radius, or by slopes
+    model_sigma: float   # by the assumed dependence of the width on the radius, or by slopes
 
     @property
     def sigma(self) -> float:
         """Return the sigma of the value."""
-        return float(np.hypot(np.linalg.norm(self.effects), self.law_sigma))
+        return float(np.hypot(np.linalg.norm(self.effects), self.model_sigma))
 
 
 def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
@@ -109,13 +109,13 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
     for name, quantity in quantities.items():
         value, sigma, value_unit = values[name].value, values[name].sigma, (
             unit if 'scale' in name else 'm')
-        if value > 0 and sigma < quantity.limit * value:
+        if value > 0 and sigma < quantity.max_sigma * value:
             estimates[name] = Estimate(value, sigma, value_unit)
         else:
             estimates[name] = Estimate(None, None, value_unit)
             reasons.append(Reason(
                 quantity.code, f'{name.replace("_", " ")}: the uncertainty is '
-                f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.limit:.0f} %',
+                f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.max_sigma:.0f} %',
                 f'Repeat the run with {quantity.required_motion}.'))
     sources = _error_sources(values, estimates)
     scale = estimates['scale_factor']
@@ -139,23 +139,23 @@ def _compute_values(fit: Fit, quantities: dict[str, Quantity], slopes: float) ->
     values = {}
     for name, quantity in quantities.items():
         value = quantity.value(constants)
-        law_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
-            value - 1 / constants['inverse_track_width']) * (quantity.needs == 'arc')
-        values[name] = Value(value, _gradient(quantity, fit) @ root, law_sigma)
+        model_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
+            value - 1 / constants['inverse_track_width']) * (quantity.constant == 'arc')
+        values[name] = Value(value, _gradient(quantity, fit) @ root, model_sigma)
     return values
 
 
 def _error_sources(values: dict[str, Value], estimates: dict[str, Estimate]) -> list[Source]:
-    """Return the error sources of the quantities, of ln K for scale factors; 0 of unknown ones."""
-    known = {name: one for name, one in values.items() if estimates[name].value is not None}
-    divisors = {name: one.value if name.startswith('scale_factor') else 1.0
-                for name, one in known.items()}
+    """Return the error sources of the quantities."""
+    # errors over the divisor are those of ln K for scale factors, and 0 for unknown quantities
+    divisors = {name: np.inf if estimates[name].value is None else
+                quantity.value if name.startswith('scale_factor') else 1.0
+                for name, quantity in values.items()}
     sources = [Source(FIT_SOURCE, np.array([
-        known[name].effects / divisors[name] if name in known else 0 * one.effects
-        for name, one in values.items()]))]
-    for source, of_scales in ((LAW_SOURCE, False), (SLOPES, True)):
-        sigmas = [known[name].law_sigma / divisors[name]
-                  if name in known and ('scale' in name) == of_scales else 0.0 for name in values]
+        quantity.effects / divisors[name] for name, quantity in values.items()]))]
+    for source, is_of_scales in ((LAW_SOURCE, False), (SLOPES, True)):
+        sigmas = [quantity.model_sigma / divisors[name] * (('scale' in name) == is_of_scales)
+                  for name, quantity in values.items()]
         if any(sigmas):
             sources.append(Source(source, np.array(sigmas)[:, None], True))
     return sources
@@ -187,13 +187,14 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
 
 def _gradient(quantity: Quantity, fit: Fit) -> Floats:
     """Return derivatives of a quantity by the constants: (m,)."""
-    out, step = np.zeros(len(fit.value)), 1e-6
+    gradient, step = np.zeros(len(fit.value)), 1e-6
     for i, value in enumerate(fit.value):
         h = step * max(abs(value), step)
-        ends = [quantity.value(dict(zip(fit.names, fit.value + sign * h * (
-            np.arange(len(out)) == i), strict=True))) for sign in (-1, 1)]
-        out[i] = (ends[1] - ends[0]) / (2 * h)
-    return out
+        change = h * np.eye(len(gradient))[i]
+        below, above = (quantity.value(dict(zip(fit.names, constants, strict=True)))
+                        for constants in (fit.value - change, fit.value + change))
+        gradient[i] = (above - below) / (2 * h)
+    return gradient
 
 
 def _details(fit: Fit, estimates: dict[str, Estimate], names: tuple[str, ...],

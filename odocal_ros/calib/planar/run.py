@@ -61,33 +61,33 @@ class Wheels:
     def body_by_wheel(self) -> Floats:
         """Return forward, left, and width times turn per metre of each wheel: (3, w)."""
         shares: Floats = self.rows / np.maximum((self.rows**2).sum(0), 1e-12)
-        out: Floats = (shares * np.array([1.0, 1.0, 2.0])).T
-        return out
+        by_wheel: Floats = (shares * np.array([1.0, 1.0, 2.0])).T
+        return by_wheel
 
-    def body(self, metres: Floats) -> Floats:
+    def body_motion(self, metres: Floats) -> Floats:
         """Return forward, left, and width times turn by metres of the wheels, (n, w): (n, 3)."""
         # not by BLAS: its last bits depend on the number of rows
-        out: Floats = np.einsum('kw,iw->ki', metres, self.body_by_wheel)
-        return out
+        motion: Floats = np.einsum('kw,iw->ki', metres, self.body_by_wheel)
+        return motion
 
     @property
     def path(self) -> Floats:
         """Return the path of a wheel, mean of both sides, plus sideways motion: (n,)."""
-        forward, side, wheel_difference = self.body(self.count).T
+        forward, side, wheel_difference = self.body_motion(self.count).T
         path: Floats = np.maximum(np.abs(forward), np.abs(wheel_difference) / 2) + np.abs(side)
         return path
 
     @property
     def turns_on_spot(self) -> Bools:
         """Return True for intervals with more turn than travel: (n,)."""
-        forward, side, wheel_difference = np.abs(self.body(self.count)).T
+        forward, side, wheel_difference = np.abs(self.body_motion(self.count)).T
         turns_on_spot: Bools = wheel_difference > 2 * (forward + side)
         return turns_on_spot
 
     @property
     def straightness(self) -> Floats:
         """Return 0 for a turn on the spot, 1 - width / (2 radius) on an arc: (n,)."""
-        forward, _, wheel_difference = np.abs(self.body(self.count)).T
+        forward, _, wheel_difference = np.abs(self.body_motion(self.count)).T
         larger = np.maximum(2 * forward, wheel_difference)
         return 1 - np.where(larger > 0, wheel_difference / np.maximum(larger, 1e-30), 1.0)
 
@@ -96,12 +96,12 @@ class Wheels:
         Return forward, left and turn of each interval, (n, 3) m, m, rad, and derivatives by c.
 
         c : (m,) scale of each wheel, one over the track width (twice the lever); for skid steering
-        the increase of the latter from turns on the spot to a straight line; for mecanum wheels
-        the ratio of motion to rolling sideways.
+        the increase of one over the width from turns on the spot to a straight line; for mecanum
+        wheels the ratio of motion to rolling sideways.
         """
         w, body_by_wheel = self.count.shape[1], self.body_by_wheel
         scale, inverse_width, side = self._split_constants(c)
-        forward, rolled, wheel_difference = self.body(self.count * scale).T
+        forward, rolled, wheel_difference = self.body_motion(self.count * scale).T
         J = np.zeros((len(self.count), 3, len(self.names)))
         J[:, 0, :w] = self.count * body_by_wheel[0]
         J[:, 1, :w] = self.count * body_by_wheel[1] * side
@@ -143,16 +143,16 @@ class Wheels:
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
         """Return prior values (m,) and covariance (m, m) from the first values of a run."""
-        wide = 0.35     # relative, judgement: too wide to affect any run with a result
+        wide_sigma = 0.35     # relative, judgement: too wide to affect any run with a result
         w, scale = self.count.shape[1], (left + right) / 2
         scales = [left, right] if w == len(SIDE_ROWS) else [scale] * w
-        # value and sigma of the constant after the inverse width
-        last = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
-        covariance = np.diag([(wide * scale)**2] * w + [
-            width**-2.0, *(sigma**2 for _, sigma in last)])
+        # value and sigma of the constant of the kind of drive, if it has one
+        additional = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
+        covariance = np.diag([(wide_sigma * scale)**2] * w + [
+            width**-2.0, *(sigma**2 for _, sigma in additional)])
         if w > len(SIDE_ROWS):
-            covariance[:w, :w] = scale**2 * (wide**2 + WHEEL_DIFFERENCE**2 * np.eye(w))
-        return np.array([*scales, 1 / width, *(value for value, _ in last)]), covariance
+            covariance[:w, :w] = scale**2 * (wide_sigma**2 + WHEEL_DIFFERENCE**2 * np.eye(w))
+        return np.array([*scales, 1 / width, *(value for value, _ in additional)]), covariance
 
 
 def make_side_wheels(left: Floats, right: Floats, kind: str) -> Wheels:
